@@ -1,0 +1,1 @@
+"""Where measured data departs from the simulation: numbers only."""

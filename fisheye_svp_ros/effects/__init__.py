@@ -1,0 +1,1 @@
+"""The catalogue of effects: how measured data can depart from the simulation."""

@@ -1,0 +1,1 @@
+"""What the approximation costs: numbers only."""

@@ -1,0 +1,102 @@
+"""Landmarks and environments: known 3-D points with ids, in the paper's world frame."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.files import read_yaml
+from fisheye_svp_ros.share import config_path
+
+SPREADS = ('whole', 'inner', 'outer')
+RADII = (2.0, 0.5, 0.2)
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """ids (N,), unique; points (N, 3), m, in the world (or target) frame."""
+
+    ids: Index
+    points: Array
+
+    def lookup(self, ids: Index) -> tuple[Array, Mask]:
+        """Return the points (..., 3) of `ids` (...), and which of them are known."""
+        order = np.argsort(self.ids)
+        slot = np.clip(np.searchsorted(self.ids, ids, sorter=order), 0, len(order) - 1)
+        known = self.ids[order[slot]] == ids
+        return np.where(known[..., None], self.points[order[slot]], np.nan), known
+
+
+def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:
+    """Return Kita's environment: `spread` whole, inner or outer, `radius` in m (section 3).
+
+    layout: YAML with the `directions` of the landmarks, default `config/environments/kita.yaml`.
+    Directions are given by incidence angle and azimuth around -z, degrees.
+    Raises ObservationError for an unknown spread or an impossible radius.
+    """
+    if spread not in SPREADS:
+        known = ', '.join(SPREADS)
+        raise ObservationError(f'environment {spread!r} is unknown; known are {known}')
+    if not (np.isfinite(radius) and radius > 0):
+        raise ObservationError(f'environment radius is {radius} m; it must be above 0')
+    path = config_path('environments/kita.yaml') if layout is None else Path(layout)
+    document = read_yaml(path, ObservationError)
+    try:
+        groups = {name: np.array(document[name], dtype=float) for name in ('inner', 'outer')}
+        counts = [len(groups['inner']), len(groups['outer'])]
+        angles = np.radians(np.concatenate(list(groups.values()))[:, :2])
+    except (KeyError, ValueError, IndexError, TypeError) as cause:
+        raise ObservationError(
+            f'{path}: inner and outer must each be a list of [incidence_deg, azimuth_deg]'
+        ) from cause
+    incidence, azimuth = angles.T
+    directions = np.stack([
+        np.sin(incidence) * np.cos(azimuth),
+        np.sin(incidence) * np.sin(azimuth),
+        -np.cos(incidence),
+    ], axis=-1)
+    chosen = np.repeat([spread in ('whole', 'inner'), spread in ('whole', 'outer')], counts)
+    return Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
+
+
+def load_landmarks(path: str | Path) -> Landmarks:
+    """Read landmarks from a CSV with the columns landmark, x, y, z (m).
+
+    Raises ObservationError naming file, line and column.
+    """
+    ids, points = [], []
+    try:
+        with Path(path).open(newline='', encoding='utf-8') as stream:
+            reader = csv.DictReader(stream)
+            missing = {'landmark', 'x', 'y', 'z'} - set(reader.fieldnames or [])
+            if missing:
+                raise ObservationError(f'{path}: column {sorted(missing)[0]!r} is missing')
+            for row in reader:
+                try:
+                    ids.append(int(row['landmark']))
+                    points.append([float(row[axis]) for axis in 'xyz'])
+                except (TypeError, ValueError) as cause:
+                    raise ObservationError(f'{path}, line {reader.line_num}: {cause}') from cause
+    except (OSError, UnicodeDecodeError, csv.Error) as cause:
+        raise ObservationError(f'{path}: cannot be read ({cause})') from cause
+    landmarks = Landmarks(np.array(ids, dtype=np.int64), np.array(points).reshape(-1, 3))
+    return check_landmarks(landmarks, str(path))
+
+
+def check_landmarks(landmarks: Landmarks, where: str) -> Landmarks:
+    """Return the landmarks; raise ObservationError for none, a repeated id or a bad point."""
+    if not len(landmarks.ids):
+        raise ObservationError(f'{where}: no landmark in it; at least one is needed')
+    values, counts = np.unique(landmarks.ids, return_counts=True)
+    if np.any(counts > 1):
+        raise ObservationError(f'{where}: landmark {values[counts > 1][0]} stands there twice')
+    bad = ~np.isfinite(landmarks.points).all(axis=-1)
+    if np.any(bad):
+        raise ObservationError(f'{where}: landmark {landmarks.ids[bad][0]} has a coordinate '
+                               'that is not a finite number')
+    return landmarks

@@ -1,0 +1,138 @@
+"""Rigid transforms, batch first.
+
+A Pose holds the camera (or board, or rig) in its reference frame: x_ref = R x_body + p.  Small
+changes are six-vectors (dp, dphi): p + dp, exp(dphi) R, both in the reference frame, in the order
+of geometry_msgs/PoseWithCovariance.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fisheye_svp_ros.arrays import Array
+
+# Kita's camera at the origin gazes along -z with x right, y up; the optical frame has y down.
+PAPER_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
+
+
+class Pose(NamedTuple):
+    """Rotation (..., 3, 3) and position (..., 3), m, of a body in its reference frame."""
+
+    rotation: Array
+    position: Array
+
+    def inverse(self) -> Pose:
+        """Return the reference frame in the body."""
+        rotation = np.swapaxes(self.rotation, -1, -2)
+        return Pose(rotation, -(rotation @ self.position[..., None])[..., 0])
+
+    def compose(self, other: Pose) -> Pose:
+        """Return the pose of `other`'s body, given in this body's frame, in this reference."""
+        return Pose(self.rotation @ other.rotation, self.transform(other.position))
+
+    def transform(self, points: Array) -> Array:
+        """Map points (..., 3) from the body to the reference frame, one a pose."""
+        return (self.rotation @ points[..., None])[..., 0] + self.position
+
+    def into_body(self, points: Array) -> Array:
+        """Map points (..., N, 3) from the reference to the body frame, N a pose."""
+        return (points - self.position[..., None, :]) @ self.rotation
+
+    def retract(self, change: Array) -> Pose:
+        """Apply small changes (..., 6): m, rad."""
+        rotation = rotation_from_vector(change[..., 3:]) @ self.rotation
+        return Pose(rotation, self.position + change[..., :3])
+
+    def difference(self, true: Pose) -> Array:
+        """Return the change (..., 6) that leads from `true` to this pose."""
+        turn = vector_from_rotation(self.rotation @ np.swapaxes(true.rotation, -1, -2))
+        return np.concatenate([self.position - true.position, turn], axis=-1)
+
+    def take(self, index: Any) -> Pose:
+        """Return the poses at `index` of the leading axes."""
+        return Pose(self.rotation[index], self.position[index])
+
+
+def identity(*shape: int) -> Pose:
+    """Return identity poses of the given batch shape."""
+    return Pose(np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy(), np.zeros((*shape, 3)))
+
+
+def rotation_from_vector(vector: Array) -> Array:
+    """Exponential map: rotation vectors (..., 3), rad, to matrices (..., 3, 3)."""
+    angle2 = np.sum(vector * vector, axis=-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    small = angle2 < 1e-12
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / (safe * safe))
+    k = cross_matrix(vector)
+    rotation: Array = np.eye(3) + a * k + b * (k @ k)
+    return rotation
+
+
+def vector_from_rotation(rotation: Array) -> Array:
+    """Logarithm: rotation matrices (..., 3, 3) to rotation vectors (..., 3), rad."""
+    quaternion = quaternion_from_rotation(rotation)
+    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, quaternion[..., 3:])
+    scale = np.where(sine < 1e-9, 2.0, angle / np.where(sine < 1e-9, 1.0, sine))
+    vector: Array = quaternion[..., :3] * scale
+    return vector
+
+
+def cross_matrix(vector: Array) -> Array:
+    """Return [v]x (..., 3, 3) of vectors (..., 3)."""
+    x, y, z = np.moveaxis(vector, -1, 0)
+    zero = np.zeros_like(x)
+    rows = [np.stack(row, axis=-1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])]
+    return np.stack(rows, axis=-2)
+
+
+def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Unit quaternions (..., 4) in ROS order x, y, z, w to matrices; the norm is divided out."""
+    q = np.asarray(quaternion, dtype=float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    k = cross_matrix(q[..., :3])
+    w = q[..., 3, None, None]
+    rotation: Array = np.eye(3) + 2 * w * k + 2 * (k @ k)
+    return rotation
+
+
+def quaternion_from_rotation(rotation: Array) -> Array:
+    """Matrices (..., 3, 3) to unit quaternions (..., 4), x, y, z, w with w >= 0."""
+    m = rotation
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    diagonal = np.diagonal(m, axis1=-2, axis2=-1)
+    # The four candidates of Shepperd (1978); the largest diagonal term conditions best.
+    q = np.empty((*m.shape[:-2], 4, 4))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[..., i, i] = 1 + 2 * diagonal[..., i] - trace
+        q[..., i, j] = q[..., j, i] = m[..., i, j] + m[..., j, i]
+        q[..., i, 3] = q[..., 3, i] = m[..., k, j] - m[..., j, k]
+    q[..., 3, 3] = 1 + trace
+    best = np.argmax(np.diagonal(q, axis1=-2, axis2=-1), axis=-1)
+    chosen = np.take_along_axis(q, best[..., None, None], axis=-2)[..., 0, :]
+    unit: Array = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
+    return np.where(unit[..., 3:] < 0, -unit, unit)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """Project matrices (..., 3, 3) onto the rotations, in the Frobenius norm."""
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.linalg.det(u @ vt)
+    rotation: Array = (u * sign[..., None, :]) @ vt
+    return rotation
+
+
+def axis_angle_between(a: Pose, b: Pose) -> Array:
+    """Angle between the viewing axes (z) of two poses, rad, (...)."""
+    first, second = a.rotation[..., 2], b.rotation[..., 2]
+    cross = np.linalg.norm(np.cross(first, second), axis=-1)
+    angle: Array = np.arctan2(cross, np.sum(first * second, axis=-1))
+    return angle

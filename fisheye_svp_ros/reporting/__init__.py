@@ -1,0 +1,1 @@
+"""Tables, plots and pages: all that a person looks at."""

@@ -1,0 +1,50 @@
+"""Stereo rigs: the three styles of Kita's figure 7 and the ten poses a rig is calibrated from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose, rotation_from_vector
+
+BASELINE = 0.15
+# Turn of the left camera towards the right one, rad (section 4 of the paper).
+STYLES = {'parallel': 0.0, 'vergent': np.radians(10.0), 'divergent': -np.radians(10.0)}
+
+
+def rig(style: str, baseline: float = BASELINE) -> Pose:
+    """Return the pose of the left camera in the right one (optical frames), baseline in m.
+
+    Raises ParameterError for an unknown style or an impossible baseline.
+    """
+    if style not in STYLES:
+        raise ParameterError(f'style {style!r} is unknown; known are {", ".join(STYLES)}')
+    if not (np.isfinite(baseline) and baseline > 0):
+        raise ParameterError(f'baseline is {baseline} m; it must be above 0')
+    return rig_from_angle(STYLES[style], baseline)
+
+
+def rig_from_angle(inward: float, baseline: float) -> Pose:
+    """Return the left camera in the right one, turned inward by an angle, rad."""
+    turn = rotation_from_vector(np.array([0.0, inward, 0.0]))
+    return Pose(turn, np.array([-baseline, 0.0, 0.0]))
+
+
+def paper_pose(*shape: int) -> Pose:
+    """Return the paper's true pose: at the origin, gazing along -z of the world."""
+    rotation = np.broadcast_to(PAPER_FROM_OPTICAL, (*shape, 3, 3)).copy()
+    return Pose(rotation, np.zeros((*shape, 3)))
+
+
+def calibration_poses() -> Pose:
+    """Return ten poses of the right camera in the world (compare figure 8)."""
+    tilt = np.radians(12.0)
+    step = 0.03
+    angles = 2 * np.pi * np.arange(9) / 9
+    turns = np.zeros((10, 3))
+    places = np.zeros((10, 3))
+    turns[1:, 0], turns[1:, 1] = tilt * np.cos(angles), tilt * np.sin(angles)
+    turns[1:, 2] = np.radians(20.0) * np.sin(2 * angles)
+    places[1:, 0], places[1:, 1] = step * np.cos(2 * angles), step * np.sin(2 * angles)
+    places[1:, 2] = 0.5 * step * np.cos(3 * angles)
+    return Pose(rotation_from_vector(turns) @ PAPER_FROM_OPTICAL, places)

@@ -1,0 +1,1 @@
+"""Solvers: poses, rigs, depths and lenses from image points."""

@@ -1,0 +1,115 @@
+"""Levenberg-Marquardt on many independent systems at once."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+
+Arrays = tuple[Array, ...]
+
+MAX_ITERATIONS = 60
+# A step that would move the whitened residuals by less than this (their 2-norm) is the last one.
+STEP_TOLERANCE = 1e-9
+_ROUNDING = 1e-13
+_STUCK = 1e12
+
+
+class Problem(Protocol):
+    """S independent least-squares systems; `index` (A,) says which of them are asked for.
+
+    States, normal equations and steps are tuples of arrays whose leading axis is the system.
+    """
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        """Return the costs (A,), inf outside the domain, and the normal equations."""
+
+    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+        """Solve (H + damping diag H) d = -g; return d and |J d|^2, (A,)."""
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        """Apply a step to the states."""
+
+
+class Solved(NamedTuple):
+    """state; cost (S,): sum of squared whitened residuals; converged (S,); iterations (S,)."""
+
+    state: Arrays
+    cost: Array
+    converged: Mask
+    iterations: Index
+
+
+def levenberg_marquardt(
+    problem: Problem, start: Arrays, max_iterations: int = MAX_ITERATIONS
+) -> Solved:
+    """Minimise every system from its own start, with a damping of its own.
+
+    Source: Marquardt's scaling with Nielsen's damping (IMM-REP-1999-05, section 3).  A step that
+    leaves the domain of the lens costs infinity and is refused.
+    """
+    systems = start[0].shape[0]
+    state = tuple(array.copy() for array in start)
+    active: Index = np.arange(systems)
+    total, normal = problem.linearise(state, active)
+    damping, growth = np.full(systems, 1e-4), np.full(systems, 2.0)
+    converged = np.zeros(systems, dtype=bool)
+    iterations = np.zeros(systems, dtype=np.int64)
+    active, normal = _keep(np.isfinite(total), active, normal)
+    for _ in range(max_iterations):
+        if not active.size:
+            break
+        iterations[active] += 1
+        step, moved = problem.step(normal, damping[active])
+        trial = problem.retract(_take(state, active), step)
+        cost, fresh = problem.linearise(trial, active)
+        before = total[active]
+        better = cost <= before * (1 + _ROUNDING)
+        done = (moved <= STEP_TOLERANCE**2 + _ROUNDING * before) & (damping[active] < 1)
+        accepted = active[better]
+        for array, new in zip(state, trial, strict=True):
+            array[accepted] = new[better]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            ratio = np.where(better, (before - cost) / moved, 0.0)
+        total[accepted] = cost[better]
+        damping[active], growth[active] = _adjusted(
+            damping[active], growth[active], better, np.nan_to_num(ratio)
+        )
+        for kept, new in zip(normal, fresh, strict=True):
+            kept[better] = new[better]
+        converged[active] = done
+        active, normal = _keep(~done & (damping[active] < _STUCK), active, normal)
+    return Solved(state, total, converged, iterations)
+
+
+def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
+    """Solve (H + damping diag H) d = -g for H (..., P, P), g (..., P), damping (...).
+
+    A parameter that nothing depends on stays where it is.
+    """
+    size = range(hessian.shape[-1])
+    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    scaled = hessian / (scale[..., :, None] * scale[..., None, :])
+    # The floor keeps an exactly singular system solvable; it is far below the data's weight.
+    scaled[..., size, size] = (1 + 1e-15 + damping)[..., None]
+    step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
+    return step
+
+
+def _adjusted(damping: Array, growth: Array, better: Mask, ratio: Array) -> tuple[Array, Array]:
+    shrunk = np.maximum(damping * np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), 1e-15)
+    raised = np.maximum(damping, 1e-9) * growth
+    return np.where(better, shrunk, raised), np.where(better, 2.0, 2 * growth)
+
+
+def _take(arrays: Arrays, index: Index) -> Arrays:
+    return tuple(array[index] for array in arrays)
+
+
+def _keep(mask: Mask, active: Index, normal: Arrays) -> tuple[Index, Arrays]:
+    if mask.all():
+        return active, normal
+    return active[mask], tuple(array[mask] for array in normal)

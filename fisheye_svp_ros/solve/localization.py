@@ -1,0 +1,114 @@
+"""Self-localization: the pose of a camera from the image points of known landmarks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt, solve_damped
+
+MIN_POINTS = 4
+
+
+class Localization(NamedTuple):
+    """Solved poses of S views.
+
+    pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
+    residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
+    squares; converged, iterations (S,).
+    """
+
+    pose: Pose
+    covariance: Array
+    residual: Array
+    cost: Array
+    converged: Mask
+    iterations: Index
+
+
+def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
+    """Return the maximum-likelihood pose of every view; no start value is needed.
+
+    Kita, section 3: bundle adjustment of one camera against known landmarks.
+    Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
+    """
+    check_views(views, MIN_POINTS)
+    if start is None:
+        start = start_poses(model, views)
+    problem = _Localization(model, views)
+    solved = levenberg_marquardt(problem, tuple(start))
+    pose = Pose(*solved.state)
+    _, (hessian, _) = problem.linearise(solved.state, np.arange(len(pose.position)))
+    predicted = model.linearise(pose, views).uv
+    residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
+    covariance = np.asarray(np.linalg.pinv(hessian, hermitian=True), dtype=float)
+    return Localization(
+        pose, covariance, residual, solved.cost, solved.converged, solved.iterations
+    )
+
+
+def start_poses(model: ForwardModel, views: Views) -> Pose:
+    """Return rough poses (S,) of the views from the directions of their rays.
+
+    Raises GeometryError, naming the frame, where too few points lie inside the field of view.
+    """
+    rays = model.back_project(views.uv)
+    inside = np.where(rays.valid, views.weight, 0.0)
+    check_views(views._replace(weight=inside), MIN_POINTS, 'inside the field of view of the lens')
+    return initial_poses(views.points, rays.direction, inside)
+
+
+def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
+    """Raise GeometryError, naming the first frame with fewer than `minimum` weighted points."""
+    counts = (views.weight > 0).sum(axis=1)
+    poor = np.flatnonzero(counts < minimum)
+    if poor.size:
+        raise GeometryError(
+            f'frame {views.frame[poor[0]]} has {counts[poor[0]]} usable points {what}; '
+            f'at least {minimum} are needed'
+        )
+
+
+class _Localization:
+    """S systems of one pose each, see least_squares.Problem."""
+
+    def __init__(self, model: ForwardModel, views: Views) -> None:
+        self._model = model
+        self._views = views
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        views = self._views.take(index)
+        linear = self._model.linearise(Pose(*state), views)
+        return normal_equations(linear.uv, linear.d_pose, views)
+
+    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+        hessian, gradient = normal
+        step = solve_damped(hessian, gradient, damping)
+        return (step,), np.einsum('si,sij,sj->s', step, hessian, step)
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        return tuple(Pose(*state).retract(step[0]))
+
+
+def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, Arrays]:
+    """Return cost (S,) and (H (S, P, P), g (S, P)) of predictions with Jacobian (S, N, 2, P)."""
+    weight = views.weight[..., None]
+    with np.errstate(invalid='ignore'):
+        residual = np.where(weight > 0, (uv - views.uv) * weight, 0.0)
+    systems, columns = len(uv), jacobian.shape[-1]
+    j = np.where(weight[..., None] > 0, jacobian * weight[..., None], 0.0)
+    j = j.reshape(systems, -1, columns)
+    r = residual.reshape(systems, -1, 1)
+    transposed = np.swapaxes(j, -1, -2)
+    cost = (r**2).sum(axis=(1, 2))
+    outside = ~np.isfinite(cost)
+    hessian, gradient = transposed @ j, (transposed @ r)[..., 0]
+    hessian[outside], gradient[outside] = np.eye(columns), 0.0
+    return np.where(outside, np.inf, cost), (hessian, gradient)

@@ -1,0 +1,64 @@
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+package_name = 'fisheye_svp_ros'
+share = f'share/{package_name}'
+nodes = (
+    'synthetic_camera',
+    'measured_camera',
+    'localizer',
+    'stereo_calibrator',
+    'stereo_depth',
+    'model_critic',
+)
+
+
+def tree(folder):
+    """Return data_files entries that keep a folder's layout below share/."""
+    files = sorted(path for path in Path(folder).rglob('*') if path.is_file())
+    return [(f'{share}/{path.parent}', [str(path)]) for path in files]
+
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    packages=find_packages(include=[package_name, f'{package_name}.*']),
+    package_data={package_name: ['py.typed', 'reporting/templates/*']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+        (share, ['package.xml']),
+        *tree('config'),
+        *tree('launch'),
+    ],
+    python_requires='>=3.11',
+    install_requires=[
+        'setuptools',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'opencv-python-headless>=4.6',
+        'PyYAML>=6.0',
+        'matplotlib>=3.6',
+        'rich>=13.0',
+        'Jinja2>=3.1',
+        'rosbags>=0.11',
+        'pyarrow>=14',
+    ],
+    extras_require={
+        'standalone': ['cyclonedds>=0.10.5'],
+        'test': ['pytest>=7.4', 'mpmath>=1.3', 'hypothesis>=6.80'],
+        'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],
+    },
+    zip_safe=True,
+    maintainer='fisheye_svp_ros maintainers',
+    maintainer_email='maintainers@fisheye-svp-ros.example',
+    description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
+    'simulation gets wrong about measured image points.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            f'fisheye-svp = {package_name}.cli:main',
+            *(f'{node} = {package_name}.nodes.{node}:main' for node in nodes),
+        ],
+    },
+)
