@@ -1,0 +1,86 @@
+"""The state between `rclpy.init()` and `rclpy.shutdown()`: arguments, wire, signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from types import FrameType
+from typing import Any
+
+from fisheye_svp_ros.standalone import arguments, dds, logging
+from fisheye_svp_ros.standalone.exceptions import NotInitializedException, RCLError
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Context:
+    """Everything that the nodes of one process share."""
+
+    def __init__(self) -> None:
+        self.arguments = arguments.Arguments()
+        self.nodes: list[Any] = []
+        self._running = False
+        self._wire: tuple[dds.Participant, dds.Graph] | None = None
+        self._handlers: dict[signal.Signals, Any] = {}
+
+    def init(self, args: list[str] | None = None, domain_id: int | None = None) -> None:
+        """Read the arguments, join the domain and take over SIGINT and SIGTERM."""
+        if self._running:
+            raise RCLError('Context.init() must only be called once')
+        self.shut_down()
+        self.arguments = arguments.parse(sys.argv if args is None else args)
+        for name, level in self.arguments.log_levels.items():
+            logging.set_logger_level(name, level)
+        if domain_id is None:
+            domain_id = int(os.getenv('ROS_DOMAIN_ID') or 0)
+        participant = dds.Participant(domain_id)
+        self._wire = participant, dds.Graph(participant)
+        self._running = True
+        if threading.current_thread() is threading.main_thread():
+            self._handlers = {s: signal.signal(s, self._on_signal) for s in _SIGNALS}
+
+    def ok(self) -> bool:
+        """Say whether nodes may run: initialized, and neither shut down nor interrupted."""
+        return self._running
+
+    @property
+    def participant(self) -> dds.Participant:
+        """This process on the domain."""
+        return self._connected()[0]
+
+    @property
+    def graph(self) -> dds.Graph:
+        """What this process tells about its nodes."""
+        return self._connected()[1]
+
+    def shut_down(self) -> None:
+        """Leave the domain; nodes that still exist are destroyed."""
+        self._running = False
+        for node in [*self.nodes]:
+            node.destroy_node()
+        self._wire = None
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        self._handlers = {}
+
+    def _connected(self) -> tuple[dds.Participant, dds.Graph]:
+        if self._wire is None:
+            raise NotInitializedException('rclpy.init() has not been called')
+        return self._wire
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        # As in rclpy: the context ends, and Python's own handler turns SIGINT into an exception.
+        self._running = False
+        previous = self._handlers.get(signal.Signals(number))
+        if callable(previous):
+            previous(number, frame)
+
+
+_default = Context()
+
+
+def get_default_context() -> Context:
+    """Return the context of this process."""
+    return _default

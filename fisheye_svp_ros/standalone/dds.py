@@ -1,0 +1,289 @@
+"""The wire: ROS 2's conventions for topics, types, QoS and discovery, on Eclipse Cyclone DDS.
+
+The conventions are those of rmw_cyclonedds_cpp, so that nodes of an installed ROS 2 and nodes of
+this client find each other and exchange messages.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import struct
+import time
+from functools import cache
+from typing import Any, ClassVar, NamedTuple
+from uuid import UUID
+
+from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import types as idl
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+from rosbags.interfaces import Nodetype
+
+from fisheye_svp_ros.standalone import messages
+from fisheye_svp_ros.standalone.exceptions import NotSupportedError
+from fisheye_svp_ros.standalone.qos import (
+    DurabilityPolicy,
+    HistoryPolicy,
+    QoSProfile,
+    ReliabilityPolicy,
+)
+
+_ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+_HEADER = struct.Struct('<Qq')  # before requests and replies: client, sequence number
+_IDL = {'bool': bool, 'string': str, 'byte': idl.byte, 'char': idl.uint8}
+
+# As in ROS 2: this many processes of one domain find each other on one host without multicast.
+_LOCALHOST = """<CycloneDDS><Domain>
+<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+_SUBNET = """<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"""
+
+
+class Sample:
+    """CDR bytes that cyclonedds hands on as they are; a subclass exists for each DDS type."""
+
+    __idl__: ClassVar[Any]
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+        self.sample_info: Any = None
+
+    def serialize(self, use_version_2: bool | None = None) -> bytes:
+        """Return the bytes to send."""
+        return self.data
+
+    @classmethod
+    def deserialize(cls, data: bytes) -> Sample:
+        """Keep the bytes that were received."""
+        return cls(data)
+
+    deserialize_key = deserialize
+
+
+class Request(NamedTuple):
+    """Who asked, which of their requests it is, and which writer it came from."""
+
+    client: int
+    sequence: int
+    writer: int
+
+
+@cache
+def _idl_struct(typename: str) -> type[IdlStruct]:
+    package, kind, name = typename.split('/')
+    fields = {field: _idl_type(desc) for field, desc in messages.definition(typename)}
+    struct: type[IdlStruct] = make_idl_struct(name, f'{package}.{kind}.dds_.{name}_', fields)
+    return struct
+
+
+def _idl_type(desc: Any) -> Any:
+    kind, argument = desc
+    if kind == Nodetype.BASE:
+        name, bound = argument
+        if name == 'string' and bound:
+            return idl.bounded_str[bound]
+        return _IDL.get(name) or getattr(idl, name)
+    if kind == Nodetype.NAME:
+        return _idl_struct(argument)
+    item, length = argument
+    if kind == Nodetype.ARRAY:
+        return idl.array[_idl_type(item), length]
+    return idl.sequence[_idl_type(item), length] if length else idl.sequence[_idl_type(item)]
+
+
+@cache
+def _sample_class(typename: str, *, service: bool) -> type[Sample]:
+    definition = _idl_struct(typename)
+    if service:
+        header = {'rmw_client': idl.uint64, 'rmw_sequence': idl.int64}
+        fields = header | dict(definition.__annotations__)
+        definition = make_idl_struct(
+            definition.__name__, definition.__idl_typename__, fields)
+    return type(definition.__name__, (Sample,), {'__idl__': definition.__idl__})
+
+
+class Participant:
+    """One process on a domain, with everything that its nodes write and read."""
+
+    def __init__(self, domain_id: int) -> None:
+        self._domain = Domain(domain_id, f'{_configuration()},{os.getenv("CYCLONEDDS_URI", "")}')
+        self.entity = DomainParticipant(domain_id, Qos(Policy.Userdata(b'enclave=/;')))
+        self.guid: UUID = self.entity.guid
+        self._service_ids = itertools.count(1)
+
+    def topic(self, name: str, typename: str, *, service: bool = False) -> Topic[Any]:
+        """Return a DDS topic that carries a ROS type."""
+        return Topic(self.entity, name, _sample_class(typename, service=service))
+
+    def service_id(self) -> str:
+        """Return a new user-data entry that ties the two halves of a service together."""
+        identifier = self.guid.bytes[:12] + next(self._service_ids).to_bytes(4, 'big')
+        return f'serviceid={".".join(f"{byte:x}" for byte in identifier)};'
+
+
+def _configuration() -> str:
+    asked = os.getenv('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'LOCALHOST'
+    if asked not in {'LOCALHOST', 'SUBNET'}:
+        raise NotSupportedError(f'ROS_AUTOMATIC_DISCOVERY_RANGE={asked}: use LOCALHOST or SUBNET')
+    alone = os.getenv('ROS_LOCALHOST_ONLY') == '1'
+    return _LOCALHOST if alone or asked == 'LOCALHOST' else _SUBNET
+
+
+class Writer:
+    """Publishes messages of one type on one DDS topic."""
+
+    def __init__(
+        self,
+        participant: Participant,
+        topic: str,
+        typename: str,
+        qos: QoSProfile,
+        user_data: str | None = None,
+    ) -> None:
+        dds_topic = participant.topic(topic, typename, service=user_data is not None)
+        self.entity = DataWriter(participant.entity, dds_topic, _dds_qos(qos, typename, user_data))
+
+    def write(self, message: messages.Message) -> None:
+        """Send a message."""
+        self._write(messages.serialize(message))
+
+    def reply(self, request: Request, message: messages.Message) -> None:
+        """Send the answer to a request."""
+        data = messages.serialize(message)
+        self._write(data[:4] + _HEADER.pack(request.client, request.sequence) + data[4:])
+
+    def wait_for_client(self, user_data: bytes, timeout: float) -> None:
+        """Wait until the reader of a client is connected: what is sent earlier would be lost."""
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline:
+            for handle in self.entity.get_matched_subscriptions():
+                endpoint = self.entity.get_matched_subscription_data(handle)
+                if endpoint and _client_id(endpoint.qos) == user_data:
+                    return
+            time.sleep(0.005)
+
+    def _write(self, data: bytes) -> None:
+        self.entity.write(self.entity.data_type(data))
+
+
+class Reader:
+    """Receives messages of one type on one DDS topic."""
+
+    def __init__(
+        self,
+        participant: Participant,
+        topic: str,
+        cls: type[messages.Message],
+        qos: QoSProfile,
+        user_data: str | None = None,
+    ) -> None:
+        typename = cls.TYPENAME
+        dds_topic = participant.topic(topic, typename, service=user_data is not None)
+        self.entity = DataReader(participant.entity, dds_topic, _dds_qos(qos, typename, user_data))
+        self.condition = ReadCondition(self.entity, _ANY)
+        self._class = cls
+
+    def take(self) -> messages.Message | None:
+        """Return the next message, or None."""
+        sample = self._take()
+        return messages.deserialize(sample.data, self._class) if sample else None
+
+    def take_request(self) -> tuple[Request, messages.Message] | None:
+        """Return the next request and its header, or None."""
+        sample = self._take()
+        if sample is None:
+            return None
+        data, end = sample.data, 4 + _HEADER.size
+        order = '<' if data[1] & 1 else '>'
+        client, sequence = struct.unpack(f'{order}Qq', data[4:end])
+        request = Request(client, sequence, sample.sample_info.publication_handle)
+        return request, messages.deserialize(data[:4] + data[end:], self._class)
+
+    def client_of(self, request: Request) -> bytes:
+        """Return what a client calls itself; empty when it is gone or does not say."""
+        endpoint = self.entity.get_matched_publication_data(request.writer)
+        return _client_id(endpoint.qos) if endpoint else b''
+
+    def _take(self) -> Sample | None:
+        # Samples without data tell that a writer left; there may be several before the next one.
+        while taken := self.entity.take(1):
+            if taken[0].sample_info.valid_data:
+                return taken[0]  # type: ignore[no-any-return]
+        return None
+
+
+def _client_id(qos: Qos) -> bytes:
+    policy = qos[Policy.Userdata] if Policy.Userdata in qos else None  # noqa: SIM401
+    entries = policy.data.split(b';') if policy else []
+    return next((entry for entry in entries if entry.startswith(b'clientid=')), b'')
+
+
+def _dds_qos(qos: QoSProfile, typename: str, user_data: str | None) -> Qos:
+    keep_all = qos.history == HistoryPolicy.KEEP_ALL
+    history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(qos.depth or 1)
+    policies = [
+        history,
+        Policy.Reliability.BestEffort
+        if qos.reliability == ReliabilityPolicy.BEST_EFFORT
+        else Policy.Reliability.Reliable(max_blocking_time=duration(infinite=True)),
+        Policy.WriterDataLifecycle(autodispose=False),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(f'{user_data or ""}typehash={messages.type_hash(typename)};'.encode()),
+    ]
+    if qos.durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        policies += [
+            Policy.Durability.TransientLocal,
+            # What late subscribers receive is as deep as the history of the topic.
+            Policy.DurabilityService(0, history, -1, -1, -1),
+        ]
+    return Qos(*policies)
+
+
+class Graph:
+    """Announces the nodes of this process, as `ros2 node list` and `info` see them."""
+
+    _QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def __init__(self, participant: Participant) -> None:
+        self._participant = participant
+        self._nodes: dict[Any, tuple[list[Any], list[Any]]] = {}
+        name = 'rmw_dds_common/msg/ParticipantEntitiesInfo'
+        self._writer = Writer(participant, 'ros_discovery_info', name, self._QOS)
+
+    def announce(
+        self, node: tuple[str, str], readers: list[Reader], writers: list[Writer]
+    ) -> None:
+        """Tell what a node, given as (namespace, name), reads and writes by now."""
+        self._nodes[node] = ([_gid(r.entity.guid) for r in readers],
+                             [_gid(w.entity.guid) for w in writers])  # fmt: skip
+        self._publish()
+
+    def withdraw(self, node: tuple[str, str]) -> None:
+        """Tell that a node is gone."""
+        self._nodes.pop(node, None)
+        self._publish()
+
+    def _publish(self) -> None:
+        info: Any = messages.message_class('rmw_dds_common/msg/ParticipantEntitiesInfo')
+        entry: Any = messages.message_class('rmw_dds_common/msg/NodeEntitiesInfo')
+        self._writer.write(info(
+            gid=_gid(self._participant.guid),
+            node_entities_info_seq=[
+                entry(node_namespace=ns, node_name=name, reader_gid_seq=r, writer_gid_seq=w)
+                for (ns, name), (r, w) in self._nodes.items()
+            ],
+        ))
+
+
+def _gid(guid: UUID) -> Any:
+    return messages.message_class('rmw_dds_common/msg/Gid')(data=[*guid.bytes])

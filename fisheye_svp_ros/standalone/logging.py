@@ -1,0 +1,120 @@
+"""Loggers that write to stderr in the format of ROS 2 and to /rosout: `rclpy.logging`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from enum import IntEnum
+
+
+class LoggingSeverity(IntEnum):
+    """Severities, in the numbering of rcl_interfaces/Log."""
+
+    UNSET = 0
+    DEBUG = 10
+    INFO = 20
+    WARN = 30
+    ERROR = 40
+    FATAL = 50
+
+
+Sink = Callable[[int, int, str, str], None]
+
+_levels: dict[str, LoggingSeverity] = {'': LoggingSeverity.INFO}
+_sinks: dict[str, Sink] = {}
+
+
+class Logger:
+    """Writes messages of a node; `throttle_duration_sec`, `once` and `skip_first` filter them."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._calls: dict[tuple[str, int], float] = {}
+
+    def get_child(self, name: str) -> Logger:
+        """Return a logger below this one."""
+        return Logger(f'{self.name}.{name}' if self.name else name)
+
+    def set_level(self, level: int) -> None:
+        """Drop messages of this logger below a severity."""
+        _levels[self.name] = LoggingSeverity(level)
+
+    def get_effective_level(self) -> LoggingSeverity:
+        """Return the severity set for this logger or for the nearest one above it."""
+        name = self.name
+        while name and not _levels.get(name):
+            name = name.rpartition('.')[0]
+        return _levels[name]
+
+    def is_enabled_for(self, severity: int) -> bool:
+        """Say whether a message of this severity is written."""
+        return severity >= self.get_effective_level()
+
+    def debug(self, message: str, **filters: float) -> bool:
+        """Write a message of severity DEBUG; False if it was filtered out."""
+        return self._log(LoggingSeverity.DEBUG, message, filters)
+
+    def info(self, message: str, **filters: float) -> bool:
+        """Write a message of severity INFO; False if it was filtered out."""
+        return self._log(LoggingSeverity.INFO, message, filters)
+
+    def warning(self, message: str, **filters: float) -> bool:
+        """Write a message of severity WARN; False if it was filtered out."""
+        return self._log(LoggingSeverity.WARN, message, filters)
+
+    def warn(self, message: str, **filters: float) -> bool:
+        """Write a message of severity WARN; False if it was filtered out."""
+        return self._log(LoggingSeverity.WARN, message, filters)
+
+    def error(self, message: str, **filters: float) -> bool:
+        """Write a message of severity ERROR; False if it was filtered out."""
+        return self._log(LoggingSeverity.ERROR, message, filters)
+
+    def fatal(self, message: str, **filters: float) -> bool:
+        """Write a message of severity FATAL; False if it was filtered out."""
+        return self._log(LoggingSeverity.FATAL, message, filters)
+
+    def _log(self, severity: LoggingSeverity, message: str, filters: dict[str, float]) -> bool:
+        if not self.is_enabled_for(severity) or (filters and not self._passes(**filters)):
+            return False
+        stamp = time.time_ns()
+        seconds, rest = divmod(stamp, 10**9)
+        line = f'[{severity.name}] [{seconds}.{rest:09d}] [{self.name}]: {message}\n'
+        sys.stderr.write(line)
+        sys.stderr.flush()
+        if sink := _sinks.get(self.name):
+            sink(stamp, severity, self.name, message)
+        return True
+
+    def _passes(
+        self, *, throttle_duration_sec: float = 0, once: float = False, skip_first: float = False
+    ) -> bool:
+        frame = sys._getframe(3)  # filters count per line of code, so find the caller's
+        call = (frame.f_code.co_filename, frame.f_lineno)
+        last, now = self._calls.get(call), time.monotonic()
+        if once or skip_first:
+            self._calls.setdefault(call, now)
+            return (last is None) == bool(once)
+        if last is not None and now < last + throttle_duration_sec:
+            return False
+        self._calls[call] = now
+        return True
+
+
+def get_logger(name: str) -> Logger:
+    """Return a logger of a name; loggers of one name share their level."""
+    return Logger(name)
+
+
+def set_logger_level(name: str, level: int) -> None:
+    """Set the severity below which a logger writes nothing; an empty name is the default."""
+    _levels[name] = LoggingSeverity(level)
+
+
+def attach_sink(name: str, sink: Sink | None) -> None:
+    """Send what a logger writes to a function as well: stamp in ns, severity, name, message."""
+    if sink:
+        _sinks[name] = sink
+    else:
+        _sinks.pop(name, None)

@@ -1,0 +1,366 @@
+"""Nodes and what they are made of: `rclpy.node`, `rclpy.publisher`, `rclpy.timer` and so on."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from fisheye_svp_ros.standalone import dds, logging, names
+from fisheye_svp_ros.standalone.arguments import parse
+from fisheye_svp_ros.standalone.clock import Clock, ClockType, Duration, Time
+from fisheye_svp_ros.standalone.context import Context, get_default_context
+from fisheye_svp_ros.standalone.exceptions import (
+    NotInitializedException,
+    NotSupportedError,
+    RCLError,
+)
+from fisheye_svp_ros.standalone.messages import Message, message_class
+from fisheye_svp_ros.standalone.parameter_services import ParameterServices
+from fisheye_svp_ros.standalone.parameters import Parameter, ParameterHolder
+from fisheye_svp_ros.standalone.qos import (
+    QoSProfile,
+    profile,
+    qos_profile_parameter_events,
+    qos_profile_rosout_default,
+    qos_profile_services_default,
+)
+
+# How long a reply waits for the reader of its client, as in rmw_cyclonedds.
+_CLIENT_TIMEOUT = 0.1
+
+
+class Publisher:
+    """Publishes messages of one type on a topic."""
+
+    def __init__(self, writer: dds.Writer, msg_type: type[Message], topic: str) -> None:
+        self.writer: dds.Writer | None = writer
+        self.msg_type = msg_type
+        self.topic_name = topic
+
+    def publish(self, msg: Message) -> None:
+        """Send a message to all subscribers."""
+        if not isinstance(msg, self.msg_type):
+            raise TypeError(f'Expected {self.msg_type.TYPENAME}, got {type(msg).__name__}')
+        self._alive().write(msg)
+
+    def get_subscription_count(self) -> int:
+        """Return how many subscribers are connected."""
+        return len(self._alive().entity.get_matched_subscriptions())
+
+    def destroy(self) -> None:
+        """Leave the topic."""
+        self.writer = None
+
+    def _alive(self) -> dds.Writer:
+        if self.writer is None:
+            raise RCLError(f'the publisher of {self.topic_name} is destroyed')
+        return self.writer
+
+
+class Entity:
+    """Something of a node that the executor waits for."""
+
+    reader: dds.Reader | None = None
+    next_call: int | None = None
+
+    def __init__(self, node: Node, callback: Callable[..., Any]) -> None:
+        self.node = node
+        self.callback = callback
+
+    def is_ready(self) -> bool:
+        """Say whether there is something to do."""
+        return self.reader is not None and bool(self.reader.condition.triggered)
+
+    def execute(self) -> None:
+        """Do one thing."""
+        raise NotImplementedError
+
+    def destroy(self) -> None:
+        """Do nothing any more."""
+        self.reader = self.next_call = None
+
+
+class Timer(Entity):
+    """Calls a function periodically, skipping calls that would come too late."""
+
+    def __init__(self, node: Node, callback: Callable[[], Any], period: int) -> None:
+        super().__init__(node, callback)
+        self.timer_period_ns = period
+        self.reset()
+
+    def is_ready(self) -> bool:
+        """Say whether a call is due."""
+        return self.next_call is not None and time.monotonic_ns() >= self.next_call
+
+    def execute(self) -> None:
+        """Call the function."""
+        now, period = time.monotonic_ns(), self.timer_period_ns
+        assert self.next_call is not None  # it is ready
+        late = now - self.next_call
+        self.next_call += period * (1 + late // period) if period else late
+        self.callback()
+
+    def cancel(self) -> None:
+        """Stop until reset."""
+        self.next_call = None
+
+    def reset(self) -> None:
+        """Start anew: the next call comes one period from now."""
+        self.next_call = time.monotonic_ns() + self.timer_period_ns
+
+    def is_canceled(self) -> bool:
+        """Say whether the timer is stopped."""
+        return self.next_call is None
+
+
+class Subscription(Entity):
+    """Calls a function with each message on a topic."""
+
+    def __init__(
+        self, node: Node, callback: Callable[[Any], Any], reader: dds.Reader, topic: str
+    ) -> None:
+        super().__init__(node, callback)
+        self.reader = reader
+        self.topic_name = topic
+
+    def execute(self) -> None:
+        """Call the function with one message."""
+        message = self.reader.take() if self.reader else None
+        if message is not None:
+            self.callback(message)
+
+
+class Service(Entity):
+    """Answers requests with what a function makes of them."""
+
+    def __init__(
+        self,
+        node: Node,
+        callback: Callable[[Any, Any], Any],
+        srv_type: Any,
+        ends: tuple[dds.Reader, dds.Writer],
+        name: str,
+    ) -> None:
+        super().__init__(node, callback)
+        self.reader, self.writer = ends
+        self.srv_type = srv_type
+        self.srv_name = name
+
+    def execute(self) -> None:
+        """Answer one request."""
+        taken = self.reader.take_request() if self.reader else None
+        if self.reader is None or taken is None:
+            return
+        header, request = taken
+        response = self.callback(request, self.srv_type.Response())
+        if client := self.reader.client_of(header):
+            self.writer.wait_for_client(client, _CLIENT_TIMEOUT)
+        self.writer.reply(header, response)
+
+
+class Node(ParameterHolder):
+    """A participant in the ROS graph: name, parameters, publishers, subscriptions, services."""
+
+    def __init__(
+        self,
+        node_name: str,
+        *,
+        context: Context | None = None,
+        cli_args: list[str] | None = None,
+        namespace: str | None = None,
+        use_global_arguments: bool = True,
+        enable_rosout: bool = True,
+        start_parameter_services: bool = True,
+        parameter_overrides: list[Parameter] | None = None,
+        allow_undeclared_parameters: bool = False,
+        automatically_declare_parameters_from_overrides: bool = False,
+    ) -> None:
+        self.context = context or get_default_context()
+        if not self.context.ok():
+            raise NotInitializedException('cannot create a node before rclpy.init()')
+        local = parse(['--ros-args', *(cli_args or [])])
+        sources = [self.context.arguments, local] if use_global_arguments else [local]
+        # Rules for this node alone come before those for the process.
+        self.__rules = [rule for source in reversed(sources) for rule in source.rules]
+        given = names.node_name(node_name), names.namespace(namespace or '/')
+        self.__name, self.__namespace = names.remap_node(self.__rules, *given)
+        overrides = {
+            name: Parameter(name, value=value)
+            for source in sources
+            for name, value in source.overrides(self.get_fully_qualified_name()).items()
+        } | {parameter.name: parameter for parameter in parameter_overrides or []}
+        super().__init__(overrides.values(), allow_undeclared_parameters)
+        self._publishers: list[Publisher] = []
+        self._subscriptions: list[Subscription] = []
+        self._services: list[Service] = []
+        self._timers: list[Timer] = []
+        self._clock = Clock(clock_type=ClockType.ROS_TIME)
+        dotted = self.get_fully_qualified_name()[1:].replace('/', '.')
+        self._logger = logging.get_logger(dotted)
+        self.context.nodes.append(self)
+        self.__set_up(enable_rosout and all(source.rosout for source in sources))
+        if automatically_declare_parameters_from_overrides:
+            for parameter in overrides.values():
+                self.declare_parameter(parameter.name, parameter.value)
+        if not self.has_parameter('use_sim_time'):
+            self.declare_parameter('use_sim_time', False)
+        if start_parameter_services:
+            ParameterServices(self)
+
+    def __set_up(self, rosout: bool) -> None:
+        event: Any = message_class('rcl_interfaces/msg/ParameterEvent')
+        self._parameter_event_publisher = self.create_publisher(
+            event, '/parameter_events', qos_profile_parameter_events)
+        if rosout:
+            log: Any = message_class('rcl_interfaces/msg/Log')
+            publisher = self.create_publisher(log, '/rosout', qos_profile_rosout_default)
+
+            def sink(stamp: int, severity: int, name: str, message: str) -> None:
+                now = Time(nanoseconds=stamp).to_msg()
+                publisher.publish(log(stamp=now, level=int(severity), name=name, msg=message))
+
+            logging.attach_sink(self._logger.name, sink)
+
+    def _publish_parameter_event(self, event: Any) -> None:
+        event.node = self.get_fully_qualified_name()
+        event.stamp = self._clock.now().to_msg()
+        self._parameter_event_publisher.publish(event)
+
+    def get_name(self) -> str:
+        """Return the name of this node, after remapping."""
+        return self.__name
+
+    def get_namespace(self) -> str:
+        """Return the namespace of this node, after remapping."""
+        return self.__namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """Return namespace and name."""
+        return names.join(self.__namespace, self.__name)
+
+    def get_clock(self) -> Clock:
+        """Return the clock of this node."""
+        return self._clock
+
+    def get_logger(self) -> logging.Logger:
+        """Return the logger of this node."""
+        return self._logger
+
+    def resolve_topic_name(self, topic: str) -> str:
+        """Return the absolute name of a topic, after remapping."""
+        return names.remap(self.__rules, topic, self.__name, self.__namespace)
+
+    def create_publisher(
+        self, msg_type: type[Message], topic: str, qos_profile: QoSProfile | int
+    ) -> Publisher:
+        """Publish on a topic."""
+        name = self.resolve_topic_name(topic)
+        writer = dds.Writer(
+            self.context.participant, f'rt{name}', msg_type.TYPENAME, profile(qos_profile))
+        publisher = Publisher(writer, msg_type, name)
+        self._publishers.append(publisher)
+        self.__announce()
+        return publisher
+
+    def create_subscription(
+        self,
+        msg_type: type[Message],
+        topic: str,
+        callback: Callable[[Any], Any],
+        qos_profile: QoSProfile | int,
+    ) -> Subscription:
+        """Have a function called with each message on a topic."""
+        name = self.resolve_topic_name(topic)
+        reader = dds.Reader(self.context.participant, f'rt{name}', msg_type, profile(qos_profile))
+        subscription = Subscription(self, callback, reader, name)
+        self._subscriptions.append(subscription)
+        self.__announce()
+        return subscription
+
+    def create_service(
+        self,
+        srv_type: Any,
+        srv_name: str,
+        callback: Callable[[Any, Any], Any],
+        *,
+        qos_profile: QoSProfile = qos_profile_services_default,
+    ) -> Service:
+        """Have a function answer requests: it fills in the response and returns it."""
+        name = names.remap(self.__rules, srv_name, self.__name, self.__namespace, 'service')
+        participant = self.context.participant
+        user_data = participant.service_id()
+        reader = dds.Reader(
+            participant, f'rq{name}Request', srv_type.Request, qos_profile, user_data)
+        writer = dds.Writer(
+            participant, f'rr{name}Reply', srv_type.Response.TYPENAME, qos_profile, user_data)
+        service = Service(self, callback, srv_type, (reader, writer), name)
+        self._services.append(service)
+        self.__announce()
+        return service
+
+    def create_timer(self, timer_period_sec: float, callback: Callable[[], Any]) -> Timer:
+        """Have a function called periodically."""
+        timer = Timer(self, callback, Duration(seconds=timer_period_sec).nanoseconds)
+        self._timers.append(timer)
+        return timer
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """Leave a topic."""
+        return self.__destroy(self._publishers, publisher)
+
+    def destroy_subscription(self, subscription: Subscription) -> bool:
+        """Leave a topic."""
+        return self.__destroy(self._subscriptions, subscription)
+
+    def destroy_timer(self, timer: Timer) -> bool:
+        """Stop a timer for good."""
+        return self.__destroy(self._timers, timer)
+
+    def destroy_service(self, service: Service) -> bool:
+        """Answer no more requests."""
+        return self.__destroy(self._services, service)
+
+    def destroy_node(self) -> None:
+        """Leave the graph; the node is of no use afterwards."""
+        if self not in self.context.nodes:
+            return
+        self.context.nodes.remove(self)
+        logging.attach_sink(self._logger.name, None)
+        for things in (self._publishers, self._subscriptions, self._services, self._timers):
+            for thing in things:
+                thing.destroy()
+            things.clear()
+        self.context.graph.withdraw((self.__namespace, self.__name))
+
+    @property
+    def timers(self) -> Iterator[Timer]:
+        """The timers of this node."""
+        yield from self._timers
+
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        """The subscriptions of this node."""
+        yield from self._subscriptions
+
+    @property
+    def services(self) -> Iterator[Service]:
+        """The services of this node."""
+        yield from self._services
+
+    def __destroy(self, things: list[Any], thing: Any) -> bool:
+        if thing not in things:
+            return False
+        things.remove(thing)
+        thing.destroy()
+        self.__announce()
+        return True
+
+    def __announce(self) -> None:
+        readers = [e.reader for e in (*self._subscriptions, *self._services) if e.reader]
+        writers = [p.writer for p in self._publishers if p.writer]
+        writers += [service.writer for service in self._services]
+        self.context.graph.announce((self.__namespace, self.__name), readers, writers)
+
+    def __getattr__(self, name: str) -> Any:
+        raise NotSupportedError(f'Node.{name} does not exist, or needs an installation of ROS 2')

@@ -1,0 +1,83 @@
+"""Quality of service profiles: `rclpy.qos`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from fisheye_svp_ros.standalone.exceptions import NotSupportedError
+
+
+class InvalidQoSProfileException(Exception):
+    """A profile lacks history and depth."""
+
+
+class HistoryPolicy(IntEnum):
+    """How many messages wait for delivery."""
+
+    SYSTEM_DEFAULT = 0
+    KEEP_LAST = 1
+    KEEP_ALL = 2
+
+
+class ReliabilityPolicy(IntEnum):
+    """Whether lost messages are sent again."""
+
+    SYSTEM_DEFAULT = 0
+    RELIABLE = 1
+    BEST_EFFORT = 2
+
+
+class DurabilityPolicy(IntEnum):
+    """Whether late subscribers receive earlier messages."""
+
+    SYSTEM_DEFAULT = 0
+    TRANSIENT_LOCAL = 1
+    VOLATILE = 2
+
+
+QoSHistoryPolicy = HistoryPolicy
+QoSReliabilityPolicy = ReliabilityPolicy
+QoSDurabilityPolicy = DurabilityPolicy
+
+
+@dataclass(init=False)
+class QoSProfile:
+    """History, depth, reliability and durability of a topic, with the defaults of ROS 2."""
+
+    history: HistoryPolicy
+    depth: int
+    reliability: ReliabilityPolicy
+    durability: DurabilityPolicy
+
+    def __init__(
+        self,
+        *,
+        history: HistoryPolicy | None = None,
+        depth: int | None = None,
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+        durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+        **others: object,
+    ) -> None:
+        if others:
+            raise NotSupportedError(f'QoS policies {[*others]} need an installation of ROS 2')
+        if depth is None and history in {None, HistoryPolicy.KEEP_LAST}:
+            raise InvalidQoSProfileException('a QoSProfile needs a depth, or history KEEP_ALL')
+        self.history = HistoryPolicy(history or HistoryPolicy.KEEP_LAST)
+        self.depth = depth or 0
+        self.reliability = ReliabilityPolicy(reliability)
+        self.durability = DurabilityPolicy(durability)
+
+
+qos_profile_system_default = QoSProfile(depth=10)
+qos_profile_default = QoSProfile(depth=10)
+qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+qos_profile_services_default = QoSProfile(depth=10)
+qos_profile_parameters = QoSProfile(depth=1000)
+qos_profile_parameter_events = QoSProfile(depth=1000)
+qos_profile_rosout_default = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def profile(qos: QoSProfile | int) -> QoSProfile:
+    """Return a profile as given, or the default one with a history of that depth."""
+    return QoSProfile(depth=qos) if isinstance(qos, int) else qos
