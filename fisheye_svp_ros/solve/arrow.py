@@ -1,0 +1,158 @@
+"""Arrow-shaped least squares: V small blocks and K shared parameters a system, S systems at once.
+
+A row of a system depends on one block (the pose of its view) and on what all views share (a lens,
+a rig).  Eliminating the blocks leaves K equations (Schur complement; Triggs et al., Bundle
+Adjustment - A Modern Synthesis, 2000, section 6.1).  No sparse solver is needed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.solve.least_squares import Arrays
+
+_FLOOR = 1e-15  # keeps an exactly singular block solvable; far below any data's weight
+_SINGULAR = 1e-14  # relative eigenvalue below which shared parameters are left where they are
+
+
+class ArrowEquations(NamedTuple):
+    """Normal equations of S systems, each H = [[blocks, cross], [cross^T, shared]].
+
+    blocks (S, V, B, B); cross (S, V, B, K); shared (S, K, K); block_gradient (S, V, B);
+    shared_gradient (S, K).
+    """
+
+    blocks: Array
+    cross: Array
+    shared: Array
+    block_gradient: Array
+    shared_gradient: Array
+
+
+class ArrowCovariance(NamedTuple):
+    """Covariance of the blocks (S, V, B, B) and of the shared parameters (S, K, K)."""
+
+    blocks: Array
+    shared: Array
+
+
+def arrow_equations(
+    residual: Array, block_jacobian: Array, shared_jacobian: Array
+) -> tuple[Array, Arrays]:
+    """Return the costs (S,) and the fields of ArrowEquations, as `least_squares.Problem` wants.
+
+    residual (S, V, M): predicted minus measured, whitened, 0 for padding; block_jacobian
+    (S, V, M, B) and shared_jacobian (S, V, M, K): its derivatives, whitened alike.  The cost of a
+    system with a residual that is not finite is inf, its equations are harmless.
+    """
+    cost = (residual**2).sum(axis=(1, 2))
+    outside = ~np.isfinite(cost)
+    if np.any(outside):
+        inside = ~outside[:, None, None]
+        residual = np.where(inside, residual, 0.0)
+        block_jacobian = np.where(inside[..., None], block_jacobian, 0.0)
+        shared_jacobian = np.where(inside[..., None], shared_jacobian, 0.0)
+    block_transposed = np.swapaxes(block_jacobian, -1, -2)
+    shared_transposed = np.swapaxes(shared_jacobian, -1, -2)
+    column = residual[..., None]
+    equations = ArrowEquations(
+        block_transposed @ block_jacobian,
+        block_transposed @ shared_jacobian,
+        (shared_transposed @ shared_jacobian).sum(axis=1),
+        (block_transposed @ column)[..., 0],
+        (shared_transposed @ column)[..., 0].sum(axis=1),
+    )
+    return np.where(outside, np.inf, cost), tuple(equations)
+
+
+def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+    """Solve (H + damping diag H) d = -g: `least_squares.Problem.step`; damping (S,).
+
+    Returns ((block steps (S, V, B), shared steps (S, K)), |J d|^2 (S,)).  A parameter that nothing
+    depends on stays where it is.
+    """
+    equations = ArrowEquations(*normal)
+    scaled, block_scale, shared_scale = _scaled(equations, damping)
+    eliminated, reduced = _eliminate(scaled)
+    right = scaled.shared_gradient - np.einsum(
+        'svbk,svb->sk', eliminated[..., :-1], scaled.block_gradient
+    )
+    shared_step = -(np.linalg.pinv(reduced, _SINGULAR, hermitian=True) @ right[..., None])[..., 0]
+    block_step = -eliminated[..., -1] - (
+        eliminated[..., :-1] @ shared_step[:, None, :, None]
+    )[..., 0]
+    block_step, shared_step = block_step / block_scale, shared_step / shared_scale
+    return (block_step, shared_step), _moved(equations, block_step, shared_step)
+
+
+def arrow_information(normal: Arrays) -> Array:
+    """Return the information (S, K, K) about the shared parameters, the blocks being unknown."""
+    equations = ArrowEquations(*normal)
+    scaled, _, shared_scale = _scaled(equations, np.zeros(len(equations.shared)))
+    _, reduced = _eliminate(scaled)
+    information: Array = reduced * shared_scale[:, :, None] * shared_scale[:, None, :]
+    return information
+
+
+def arrow_covariance(normal: Arrays) -> ArrowCovariance:
+    """Return the covariance of every block and of the shared parameters, whitened rows assumed.
+
+    A direction that the rows do not determine is left out of it: check `arrow_information` first.
+    """
+    equations = ArrowEquations(*normal)
+    scaled, block_scale, shared_scale = _scaled(equations, np.zeros(len(equations.shared)))
+    eliminated, reduced = _eliminate(scaled)
+    shared = np.linalg.pinv(reduced, _SINGULAR, hermitian=True)
+    leverage = eliminated[..., :-1]
+    blocks = np.linalg.pinv(scaled.blocks, _SINGULAR, hermitian=True)
+    blocks = blocks + leverage @ shared[:, None] @ np.swapaxes(leverage, -1, -2)
+    return ArrowCovariance(
+        blocks / (block_scale[..., :, None] * block_scale[..., None, :]),
+        shared / (shared_scale[:, :, None] * shared_scale[:, None, :]),
+    )
+
+
+def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
+    """Scale to a unit diagonal and damp it; return also the scales (S, V, B) and (S, K)."""
+    block_scale, shared_scale = _scale(equations.blocks), _scale(equations.shared)
+    blocks = equations.blocks / (block_scale[..., :, None] * block_scale[..., None, :])
+    shared = equations.shared / (shared_scale[:, :, None] * shared_scale[:, None, :])
+    b, k = range(blocks.shape[-1]), range(shared.shape[-1])
+    blocks[..., b, b] = (1 + _FLOOR + damping)[:, None, None]
+    shared[..., k, k] = (1 + _FLOOR + damping)[:, None]
+    scaled = ArrowEquations(
+        blocks,
+        equations.cross / (block_scale[..., :, None] * shared_scale[:, None, None, :]),
+        shared,
+        equations.block_gradient / block_scale,
+        equations.shared_gradient / shared_scale,
+    )
+    return scaled, block_scale, shared_scale
+
+
+def _scale(hessian: Array) -> Array:
+    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+
+
+def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
+    """Return blocks^-1 [cross, gradient] (S, V, B, K + 1) and the Schur complement (S, K, K)."""
+    right = np.concatenate([scaled.cross, scaled.block_gradient[..., None]], axis=-1)
+    eliminated = np.linalg.solve(scaled.blocks, right)
+    known = np.einsum('svbk,svbl->skl', scaled.cross, eliminated[..., :-1])
+    reduced = scaled.shared - known
+    return eliminated, (reduced + np.swapaxes(reduced, -1, -2)) / 2
+
+
+def _moved(equations: ArrowEquations, block_step: Array, shared_step: Array) -> Array:
+    inner = equations.blocks @ block_step[..., None] + 2 * (
+        equations.cross @ shared_step[:, None, :, None]
+    )
+    by_blocks = np.einsum('svb,svb->s', block_step, inner[..., 0])
+    moved: Array = by_blocks + np.einsum(
+        'sk,skl,sl->s', shared_step, equations.shared, shared_step
+    )
+    return moved
