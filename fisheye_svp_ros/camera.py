@@ -81,6 +81,8 @@ def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     limited: also refuse angles past the lens's `max_incidence`; a solver on its way does not.
     Source: Kita, section 2 and figure 2.
     """
+    if points.ndim == 1:
+        return Incidence(*(field[0] for field in incidence(lens, points[None], limited)))
     x, y, z = (np.ascontiguousarray(points[..., i], dtype=float) for i in range(3))
     r2 = x * x + y * y
     r = np.sqrt(r2)
@@ -189,8 +191,8 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     height = np.sqrt(mx * mx + my * my)
     edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
     valid = height <= edge + _ANGLE_SLACK
-    theta = np.minimum(lens.image_height.angle(height), lens.max_incidence)
-    theta[~valid] = np.nan
+    angle = np.minimum(lens.image_height.angle(height), lens.max_incidence)
+    theta = np.where(valid, angle, np.nan)
     inverse = 1 / np.where(height > 0, height, 1.0)
     sin = np.sin(theta)
     direction = np.stack([sin * mx * inverse, sin * my * inverse, np.cos(theta)], axis=-1)
