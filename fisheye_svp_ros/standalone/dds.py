@@ -70,12 +70,12 @@ class Sample:
     deserialize_key = deserialize
 
 
-class Request(NamedTuple):
-    """Who asked, which of their requests it is, and which writer it came from."""
+class Header(NamedTuple):
+    """What precedes a request or reply: who asks, and which of their requests it is."""
 
     client: int
     sequence: int
-    writer: int
+    writer: int = 0  # the DDS writer that a request came from; not sent
 
 
 @cache
@@ -157,10 +157,10 @@ class Writer:
         """Send a message."""
         self._write(messages.serialize(message))
 
-    def reply(self, request: Request, message: messages.Message) -> None:
-        """Send the answer to a request."""
+    def write_call(self, header: Header, message: messages.Message) -> None:
+        """Send a request or a reply."""
         data = messages.serialize(message)
-        self._write(data[:4] + _HEADER.pack(request.client, request.sequence) + data[4:])
+        self._write(data[:4] + _HEADER.pack(header.client, header.sequence) + data[4:])
 
     def wait_for_client(self, user_data: bytes, timeout: float) -> None:
         """Wait until the reader of a client is connected: what is sent earlier would be lost."""
@@ -198,20 +198,20 @@ class Reader:
         sample = self._take()
         return messages.deserialize(sample.data, self._class) if sample else None
 
-    def take_request(self) -> tuple[Request, messages.Message] | None:
-        """Return the next request and its header, or None."""
+    def take_call(self) -> tuple[Header, messages.Message] | None:
+        """Return the next request or reply with its header, or None."""
         sample = self._take()
         if sample is None:
             return None
         data, end = sample.data, 4 + _HEADER.size
         order = '<' if data[1] & 1 else '>'
         client, sequence = struct.unpack(f'{order}Qq', data[4:end])
-        request = Request(client, sequence, sample.sample_info.publication_handle)
-        return request, messages.deserialize(data[:4] + data[end:], self._class)
+        header = Header(client, sequence, sample.sample_info.publication_handle)
+        return header, messages.deserialize(data[:4] + data[end:], self._class)
 
-    def client_of(self, request: Request) -> bytes:
+    def client_of(self, header: Header) -> bytes:
         """Return what a client calls itself; empty when it is gone or does not say."""
-        endpoint = self.entity.get_matched_publication_data(request.writer)
+        endpoint = self.entity.get_matched_publication_data(header.writer)
         return _client_id(endpoint.qos) if endpoint else b''
 
     def _take(self) -> Sample | None:

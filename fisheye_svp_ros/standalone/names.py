@@ -24,15 +24,15 @@ def namespace(name: str) -> str:
     return _checked(_NAMESPACE, 'namespace', absolute)
 
 
-def join(*parts: str) -> str:
-    """Join names into an absolute one, whether or not the parts bring slashes along."""
-    return '/' + '/'.join(part.strip('/') for part in parts if part.strip('/'))
+def join(ns: str, name: str) -> str:
+    """Return the absolute form of a name in a namespace."""
+    return f'{ns.rstrip("/")}/{name}'
 
 
 def expand(name: str, node: str, ns: str, kind: str = 'topic') -> str:
     """Return the absolute name of a relative, private (`~/x`) or absolute one."""
     if name == '~' or name.startswith('~/'):
-        absolute = join(ns, node, name[1:])
+        absolute = join(ns, node) + name[1:]
     else:
         absolute = name if name.startswith('/') else join(ns, name)
     return _checked(_FULL, f'{kind} name', absolute, name)
@@ -53,7 +53,7 @@ class Rule:
         left, separator, right = text.partition(':=')
         if not (left and separator and right):
             raise NameValidationException(f'remapping rule {text!r} is not from:=to')
-        found = re.fullmatch(rf'(?:({_TOKEN}):)?(?:ros(topic|service)://)?(.+)', left)
+        found = re.fullmatch(rf'(?:({_TOKEN}):(?!//))?(?:ros(topic|service)://)?(.+)', left)
         assert found, left  # the last group takes any text
         node, kind, match = found.groups()
         return cls('__node' if match == '__name' else match, right, node, kind)

@@ -149,14 +149,14 @@ class Service(Entity):
 
     def execute(self) -> None:
         """Answer one request."""
-        taken = self.reader.take_request() if self.reader else None
+        taken = self.reader.take_call() if self.reader else None
         if self.reader is None or taken is None:
             return
         header, request = taken
         response = self.callback(request, self.srv_type.Response())
         if client := self.reader.client_of(header):
             self.writer.wait_for_client(client, _CLIENT_TIMEOUT)
-        self.writer.reply(header, response)
+        self.writer.write_call(header, response)
 
 
 class Node(ParameterHolder):

@@ -1,0 +1,119 @@
+"""Two processes that publish and subscribe through the standalone client."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from conftest import NodeProcess
+
+pytest.importorskip('cyclonedds')
+pytest.importorskip('rosbags')
+
+_HEAD = """
+import hashlib, sys
+import numpy as np
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Float64, String
+rclpy.init()
+node = Node(sys.argv[1])
+latched = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""
+
+_LISTEN = _HEAD + """
+heard = []
+def hear(message):
+    heard.append(message.data)
+    print('heard', message.data, flush=True)
+node.create_subscription(String, 'chatter', hear, {qos})
+print('listening', flush=True)
+rclpy.spin(node)
+"""
+
+_TALK = _HEAD + """
+publisher = node.create_publisher(String, 'chatter', {qos})
+count = 0
+def talk():
+    global count
+    if publisher.get_subscription_count() and count < 5:
+        count += 1
+        publisher.publish(String(data=f'{{count}}'))
+node.create_timer(0.01, talk)
+rclpy.spin(node)
+"""
+
+_LATCH = _HEAD + """
+publisher = node.create_publisher(String, 'chatter', latched)
+for word in 'abcde':
+    publisher.publish(String(data=word))
+print('published', flush=True)
+rclpy.spin(node)
+"""
+
+_SEND_CLOUD = _HEAD + """
+points = np.random.default_rng(7).normal(size=(43_691, 3))  # 1 MB of them
+publisher = node.create_publisher(PointCloud2, 'cloud', latched)
+fields = [PointField(name=n, offset=8 * i, datatype=PointField.FLOAT64, count=1)
+          for i, n in enumerate('xyz')]
+publisher.publish(PointCloud2(height=1, width=len(points), fields=fields, point_step=24,
+                              row_step=points.nbytes, data=points.tobytes(), is_dense=True))
+print('sent', points.nbytes, hashlib.sha256(points.tobytes()).hexdigest(), flush=True)
+rclpy.spin(node)
+"""
+
+_RECEIVE_CLOUD = _HEAD + """
+def receive(cloud):
+    points = np.frombuffer(cloud.data, np.float64).reshape(-1, 3)
+    print('received', points.nbytes, hashlib.sha256(points.tobytes()).hexdigest(),
+          cloud.fields[2].name, cloud.width, cloud.is_dense, flush=True)
+node.create_subscription(PointCloud2, 'cloud', receive, latched)
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.parametrize('reliability', ['RELIABLE', 'BEST_EFFORT'])
+def test_messages_arrive_in_order(
+    run_node: Callable[..., NodeProcess], reliability: str
+) -> None:
+    qos = f'QoSProfile(depth=10, reliability=ReliabilityPolicy.{reliability})'
+    listener = run_node(_LISTEN.format(qos=qos), 'listener')
+    run_node(_TALK.format(qos=qos), 'talker')
+    heard = [listener.wait_for('heard (.*)')[1] for _ in range(5)]
+    assert heard == ['1', '2', '3', '4', '5']
+
+
+def test_late_subscriber_receives_the_last_ones(run_node: Callable[..., NodeProcess]) -> None:
+    run_node(_LATCH, 'talker').wait_for('published')
+    for name in ('first', 'second'):
+        late = run_node(_LISTEN.format(qos='latched'), name)
+        assert [late.wait_for('heard (.*)')[1] for _ in range(3)] == ['c', 'd', 'e']
+
+
+def test_large_point_cloud_arrives_unchanged(run_node: Callable[..., NodeProcess]) -> None:
+    receiver = run_node(_RECEIVE_CLOUD, 'receiver')
+    sent = run_node(_SEND_CLOUD, 'sender').wait_for('sent (.*)')[1]
+    assert receiver.wait_for('received (.*)')[1] == f'{sent} z 43691 True'
+    assert run_node(_RECEIVE_CLOUD, 'late').wait_for('received')
+
+
+def test_incompatible_qos_does_not_connect(run_node: Callable[..., NodeProcess]) -> None:
+    talker = run_node(_HEAD + """
+publisher = node.create_publisher(String, 'chatter', 10)
+other = node.create_publisher(String, 'end', latched)
+other.publish(String())
+rclpy.spin(node)
+""", 'talker')  # fmt: skip
+    listener = run_node(_HEAD + """
+node.create_subscription(String, 'chatter', print, latched)
+def end(message):
+    names = ('chatter', 'end')
+    print('connected', *(n for n, s in zip(names, node.subscriptions)
+                         if s.reader.entity.get_matched_publications()), flush=True)
+node.create_subscription(String, 'end', end, latched)
+rclpy.spin(node)
+""", 'listener')  # fmt: skip
+    assert listener.wait_for('connected(.*)')[1] == ' end'
+    assert talker.process.poll() is None
