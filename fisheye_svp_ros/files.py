@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +15,20 @@ import yaml
 from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 as PyYAML reads it, but with 1e-3 as the number that it is in ROS and YAML 1.2."""
+
+
+_Loader.add_implicit_resolver(
+    'tag:yaml.org,2002:float', re.compile(r'[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$'),
+    list('-+0123456789'),
+)
+
+
 def read_yaml(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
     """Return the mapping a YAML file holds; raise `error`, naming file and line, if it cannot."""
     try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        document = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
     except OSError as cause:
         raise error(f'{path}: cannot be read ({cause.strerror}); check the path') from cause
     except UnicodeDecodeError as cause:

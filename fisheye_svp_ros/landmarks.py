@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,19 +50,19 @@ def environment(spread: str, radius: float, layout: str | Path | None = None) ->
     try:
         groups = {name: np.array(document[name], dtype=float) for name in ('inner', 'outer')}
         counts = [len(groups['inner']), len(groups['outer'])]
-        angles = np.radians(np.concatenate(list(groups.values()))[:, :2])
+        incidence, azimuth = np.radians(np.concatenate(list(groups.values()))).T
     except (KeyError, ValueError, IndexError, TypeError) as cause:
         raise ObservationError(
             f'{path}: inner and outer must each be a list of [incidence_deg, azimuth_deg]'
         ) from cause
-    incidence, azimuth = angles.T
     directions = np.stack([
         np.sin(incidence) * np.cos(azimuth),
         np.sin(incidence) * np.sin(azimuth),
         -np.cos(incidence),
     ], axis=-1)
     chosen = np.repeat([spread in ('whole', 'inner'), spread in ('whole', 'outer')], counts)
-    return Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
+    landmarks = Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
+    return check_landmarks(landmarks, str(path))
 
 
 def load_landmarks(path: str | Path) -> Landmarks:
@@ -77,11 +78,9 @@ def load_landmarks(path: str | Path) -> Landmarks:
             if missing:
                 raise ObservationError(f'{path}: column {sorted(missing)[0]!r} is missing')
             for row in reader:
-                try:
-                    ids.append(int(row['landmark']))
-                    points.append([float(row[axis]) for axis in 'xyz'])
-                except (TypeError, ValueError) as cause:
-                    raise ObservationError(f'{path}, line {reader.line_num}: {cause}') from cause
+                where = f'{path}, line {reader.line_num}'
+                ids.append(_value(row, 'landmark', np.int64, where))
+                points.append([_value(row, axis, float, where) for axis in 'xyz'])
     except (OSError, UnicodeDecodeError, csv.Error) as cause:
         raise ObservationError(f'{path}: cannot be read ({cause})') from cause
     landmarks = Landmarks(np.array(ids, dtype=np.int64), np.array(points).reshape(-1, 3))
@@ -100,3 +99,13 @@ def check_landmarks(landmarks: Landmarks, where: str) -> Landmarks:
         raise ObservationError(f'{where}: landmark {landmarks.ids[bad][0]} has a coordinate '
                                'that is not a finite number')
     return landmarks
+
+
+def _value(row: dict[str, str], column: str, kind: type, where: str) -> Any:
+    try:
+        return kind(row[column])
+    except (TypeError, ValueError, OverflowError) as cause:
+        raise ObservationError(
+            f'{where}: {column} is {row[column]!r}; a {"whole " * (kind is not float)}number is '
+            'needed'
+        ) from cause

@@ -135,13 +135,13 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     numbers = {name: _number(projection, name, f'{where}: projection') for name in INTRINSICS}
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
-        width=int(_number(image, 'width', f'{where}: image')),
-        height=int(_number(image, 'height', f'{where}: image')),
+        width=_pixels(image, 'width', f'{where}: image'),
+        height=_pixels(image, 'height', f'{where}: image'),
         image_height=kind(**dict(zip(height_names, coefficients, strict=False))),
         max_incidence=np.radians(_number(document, 'max_incidence_deg', where)).item(),
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
         effects=_effects(document.get('effects'), where),
-        calibration=document.get('calibration'),
+        calibration=_calibration(document.get('calibration'), where),
         **numbers,
     )
     return check_lens(lens, where)
@@ -205,6 +205,12 @@ def _effects(section: Any, where: str) -> dict[str, Any]:
     return dict(section)
 
 
+def _calibration(section: Any, where: str) -> dict[str, Any] | None:
+    if section is not None and not isinstance(section, dict):
+        raise LensError(f'{where}: calibration must be a mapping, is {section!r}')
+    return section
+
+
 def _section(document: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
     section = document.get(name)
     if not isinstance(section, dict):
@@ -219,6 +225,13 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
     return float(value)
 
 
+def _pixels(mapping: Mapping[str, Any], name: str, where: str) -> int:
+    value = _number(mapping, name, where)
+    if not value.is_integer():
+        raise LensError(f'{where}: {name} is {value}; a whole number of pixels is needed')
+    return int(value)
+
+
 def _vector(values: Any, where: str) -> list[float]:
     if not isinstance(values, list) or not all(isinstance(v, int | float) for v in values):
         raise LensError(f'{where} must be a list of numbers, is {values!r}')
@@ -226,7 +239,7 @@ def _vector(values: Any, where: str) -> list[float]:
 
 
 def _registered(name: Any, registry: Mapping[str, Any], where: str) -> Any:
-    if name not in registry:
+    if not isinstance(name, str) or name not in registry:
         raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
     return registry[name]
 
