@@ -1,0 +1,46 @@
+"""Boards: the rigid pieces of a target, with axes of their own."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+
+
+class Board(NamedTuple):
+    """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
+
+    size: half the extent along its longer side; flat: all landmarks lie in the plane a, b.
+    """
+
+    id: int
+    centre: Array
+    axes: Array
+    size: float
+    flat: bool
+
+    def local(self, points: Array) -> Array:
+        """Return points (..., 3) in the board's axes, over its size."""
+        return np.asarray((points - self.centre) @ self.axes.T / self.size)
+
+
+def find_boards(points: Array, board: Index) -> list[Board]:
+    """Return the boards of landmarks (M, 3), m, labelled by `board` (M,), largest id last."""
+    return [_board(int(label), points[board == label]) for label in np.unique(board)]
+
+
+def _board(label: int, points: Array) -> Board:
+    distinct = np.unique(np.round(points, 9), axis=0)
+    centre = (distinct.min(axis=0) + distinct.max(axis=0)) / 2
+    local = distinct - distinct.mean(axis=0)
+    axes = np.linalg.svd(local, full_matrices=True)[2] if len(distinct) > 2 else np.eye(3)
+    # Axes along the target's own where the board lies square to them: readable coefficients.
+    if np.abs(axes[2]).max() > 1 - 1e-9:
+        axes = np.roll(np.eye(3), 2 - int(np.argmax(np.abs(axes[2]))), axis=0)
+    axes[2] = np.cross(axes[0], axes[1])
+    along = (distinct - centre) @ axes.T
+    size = float(np.abs(along).max(initial=1e-9))
+    flat = bool(np.abs(along[:, 2] - along[:, 2].mean()).max(initial=0.0) < 1e-6 + 1e-3 * size)
+    return Board(label, centre, axes, size, flat)

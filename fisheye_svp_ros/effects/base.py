@@ -1,0 +1,227 @@
+"""What an effect is: a small extension of the forward model at one of its stages.
+
+The stages and what a displacement means there (S views of N points, last axis D):
+target   D = 3, m: the landmark moves in the target frame
+pose     D = 6, m and rad: the camera moves for this one point (`Pose.retract`)
+ray      D = 2, m and px: viewpoint shift s and image height h change
+image    D = 2, px: the optical image moves
+detector D = 2, px: the detected point moves
+noise    nothing moves; the scatter or the table changes
+Nearly all effects are linear in their parameters: displacement = columns @ values.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.boards import Board, find_boards
+from fisheye_svp_ros.camera import Incidence
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.pose import Pose
+
+STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
+
+
+class Untestable(Exception):  # noqa: N818 - not an error: an answer
+    """The data lacks what an effect needs; the text says what."""
+
+
+class Parameter(NamedTuple):
+    """One number of an effect: its name, unit and a size that would be large in practice."""
+
+    name: str
+    unit: str
+    large: float
+
+
+@dataclass
+class Scene:
+    """All that an effect may look at: views, lens, the camera's poses (S,) and ideal images.
+
+    uv (S, N, 2), px: predicted without detector effects; incidence: where the rays meet the lens;
+    rig: pose (C,) of each camera in the rig's body.  Fields may be None before their stage.
+    """
+
+    views: Views
+    lens: Lens
+    pose: Pose
+    uv: Array
+    incidence: Incidence | None = None
+    rig: Pose | None = None
+
+    @cached_property
+    def boards(self) -> list[Board]:
+        """The rigid pieces of the target with their own axes."""
+        used = self.views.used
+        return find_boards(self.views.points[used], self.views.board[used])
+
+    @cached_property
+    def theta_max(self) -> float:
+        """Largest incidence angle among the observations, rad."""
+        if self.incidence is None:
+            return self.lens.max_incidence
+        theta = self.incidence.theta[self.views.used]
+        return float(np.nanmax(theta, initial=1e-3))
+
+    @property
+    def theta(self) -> Array:
+        """Incidence angles (S, N), rad."""
+        assert self.incidence is not None, 'asked before the ray stage'
+        return self.incidence.theta
+
+    @cached_property
+    def times(self) -> Array:
+        """Time of each view (S,), s; NaN where unknown."""
+        t = np.where(self.views.used, self.views.t, np.nan)
+        known = np.isfinite(t).any(axis=1)
+        mean = np.full(len(t), np.nan)
+        mean[known] = np.nanmean(t[known], axis=1)
+        return mean
+
+    @cached_property
+    def twist(self) -> Array:
+        """Velocity (S, 6) of each view's camera, m/s and rad/s, from its neighbours in time."""
+        twist = np.zeros((len(self.times), 6))
+        for camera in np.unique(self.views.camera):
+            mine = np.flatnonzero((self.views.camera == camera) & np.isfinite(self.times))
+            order = mine[np.argsort(self.times[mine], kind='stable')]
+            if len(order) > 2:
+                twist[order] = _velocities(self.pose.take(order), self.times[order])
+        return twist
+
+    def normalised(self) -> Array:
+        """Image points (S, N, 2) relative to the principal point, over the focal length."""
+        centre, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
+        return np.asarray((self.uv - np.array(centre)) / np.array(focal))
+
+
+@dataclass(frozen=True)
+class Effect(ABC):
+    """One effect with its structure (the dataclass fields); the values live outside."""
+
+    name: ClassVar[str]
+    stage: ClassVar[str]
+    signature: ClassVar[str]
+    confused_with: ClassVar[str]
+    to_separate: ClassVar[str]
+
+    @classmethod
+    @abstractmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        """Return the forms of this effect worth testing, simplest first; raise Untestable."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The parameters, in the order of the columns."""
+
+    @abstractmethod
+    def columns(self, scene: Scene) -> Array:
+        """Derivatives (S, N, D, P) of the displacement at this effect's stage."""
+
+    def displacement(self, scene: Scene, values: Array) -> Array:
+        """Displacement (S, N, D) at this effect's stage."""
+        return np.asarray(self.columns(scene) @ values)
+
+    @property
+    def key(self) -> str:
+        """A short name of this form, unique within a data set."""
+        parts = [
+            f'{f.name}={_short(getattr(self, f.name))}' for f in fields(self)
+            if f.metadata.get('key', True)
+        ]
+        return f'{self.name}({", ".join(parts)})' if parts else self.name
+
+    def to_dict(self, values: Array) -> dict[str, Any]:
+        """Return structure and values as the lens YAML holds them."""
+        names = [parameter.name for parameter in self.parameters]
+        numbers = dict(zip(names, map(float, values), strict=True))
+        structure = {name: _plain(value) for name, value in asdict(self).items()}
+        return {**structure, 'parameters': numbers}
+
+    @classmethod
+    def from_dict(cls, entry: Mapping[str, Any], where: str) -> tuple[Effect, Array]:
+        """Return the effect and its values; raise LensError naming `where` and the field."""
+        structure = {name: value for name, value in entry.items() if name != 'parameters'}
+        try:
+            effect = cls(**{name: _frozen(value) for name, value in structure.items()})
+            names = [parameter.name for parameter in effect.parameters]
+            numbers = dict(entry['parameters'])
+            values = np.array([float(numbers.pop(name)) for name in names])
+        except (KeyError, TypeError, ValueError) as cause:
+            raise LensError(f'{where}: effect {cls.name} is incomplete ({cause})') from cause
+        if numbers or not np.isfinite(values).all():
+            odd = next(iter(numbers), 'a value that is not finite')
+            raise LensError(f'{where}: effect {cls.name} has {odd}, which does not belong there')
+        return effect, values
+
+
+class NoiseEffect(Effect):
+    """An effect that moves no prediction: it changes the scatter or the table itself."""
+
+    stage: ClassVar[str] = 'noise'
+
+    def columns(self, scene: Scene) -> Array:
+        return np.empty((*scene.uv.shape[:2], 0, len(self.parameters)))
+
+
+def require_time(scene: Scene, minimum: int) -> Array:
+    """Return the times (S,) of the views; raise Untestable for fewer than `minimum` instants."""
+    instants = np.unique(scene.times[np.isfinite(scene.times)])
+    if len(instants) < minimum or not np.isfinite(scene.times).all():
+        raise Untestable('the observations carry no time, or too few instants')
+    return scene.times
+
+
+def require_cameras(scene: Scene) -> None:
+    """Raise Untestable where there is no second camera."""
+    if not np.any(scene.views.camera > 0):
+        raise Untestable('there is one camera only')
+
+
+def require_motion(scene: Scene) -> Array:
+    """Return the velocities (S, 6); raise Untestable where nothing is known to move."""
+    require_time(scene, 5)
+    twist = scene.twist
+    if np.abs(twist).max() < 1e-6:
+        raise Untestable('the camera does not move')
+    return twist
+
+
+def _velocities(pose: Pose, t: Array) -> Array:
+    """Velocities by the parabola through each pose and its two neighbours in time."""
+    middle = np.clip(np.arange(len(t)), 1, len(t) - 2)
+    before, after = pose.take(middle - 1), pose.take(middle + 1)
+    here = pose.take(middle)
+    h0 = np.maximum(t[middle] - t[middle - 1], 1e-9)[:, None]
+    h1 = np.maximum(t[middle + 1] - t[middle], 1e-9)[:, None]
+    d0, d1 = here.difference(before) / h0, after.difference(here) / h1
+    # Slope of the parabola at the instant itself, also at the two ends.
+    offset = (t - t[middle])[:, None]
+    return np.asarray((d0 * h1 + d1 * h0) / (h0 + h1) + offset * 2 * (d1 - d0) / (h0 + h1))
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, tuple):
+        shown = ' '.join(_short(item) for item in value[:4])
+        return shown + (' ...' if len(value) > 4 else '')
+    return f'{value:.4g}' if isinstance(value, float) else str(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value

@@ -1,0 +1,43 @@
+"""Lens elements are not centred on one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+
+
+@dataclass(frozen=True)
+class DecenteringEffect(Effect):
+    """Brown and Conrady p1, p2, in image points over the focal length."""
+
+    name: ClassVar[str] = 'decentering'
+    stage: ClassVar[str] = 'image'
+    signature: ClassVar[str] = (
+        'residuals that grow with the square of the image height, strongest along one diameter'
+    )
+    confused_with: ClassVar[str] = 'sensor_tilt, principal_point'
+    to_separate: ClassVar[str] = (
+        'landmarks over the whole field of view, to its edge, on all sides'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))
+
+    def columns(self, scene: Scene) -> Array:
+        x, y = np.moveaxis(scene.normalised(), -1, 0)
+        r2 = x * x + y * y
+        p1 = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
+        p2 = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)
+        focal = np.array([scene.lens.fx, scene.lens.fy])
+        return np.asarray(np.stack([p1, p2], axis=-1) * focal[:, None])

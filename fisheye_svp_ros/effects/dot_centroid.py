@@ -1,0 +1,71 @@
+"""The centroid of a dot's image is not the image of its centre."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.camera import project
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
+
+_RIM = 12  # points on the rim of the dot whose image is taken as a polygon
+_EQUAL = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon the disc's moments
+_PROBE = 0.02  # radius of the probing dot over its distance: small, yet far above rounding
+
+
+@dataclass(frozen=True)
+class DotCentroidEffect(Effect):
+    """Bias of the centroid of a flat round dot, in proportion to its radius squared."""
+
+    name: ClassVar[str] = 'dot_centroid'
+    stage: ClassVar[str] = 'image'
+    signature: ClassVar[str] = (
+        'residuals across tilted boards that grow with the size of the dot in the image'
+    )
+    confused_with: ClassVar[str] = 'radial_profile, viewpoint_shift on near and tilted boards'
+    to_separate: ClassVar[str] = 'dots of half the size, or corners instead of dots'
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        if not any(board.flat for board in scene.boards):
+            raise Untestable('no landmarks lie on a flat board, so no dot has a known plane')
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('radius_squared', 'm^2', 1e-4),)
+
+    def columns(self, scene: Scene) -> Array:
+        views = scene.views
+        column = np.zeros((*views.points.shape[:2], 2, 1))
+        # The dot's shape matters, not the shift of its centre: project with the lens alone.
+        lens = replace(scene.lens, effects={})
+        in_camera = scene.pose.into_body(views.points)
+        distance = np.linalg.norm(in_camera, axis=-1)
+        for board in scene.boards:
+            mine = views.used & (views.board == board.id)
+            if not board.flat or board.size < 1e-6 or not mine.any():
+                continue
+            radius = _PROBE * distance[mine]
+            angle = 2 * np.pi * np.arange(_RIM) / _RIM
+            rim = np.cos(angle)[:, None] * board.axes[0] + np.sin(angle)[:, None] * board.axes[1]
+            turned = rim @ scene.pose.rotation[np.nonzero(mine)[0]]
+            points = in_camera[mine][:, None] + (_EQUAL * radius)[:, None, None] * turned
+            centre = project(lens, in_camera[mine], limited=False).uv
+            bias = _polygon_centroid(project(lens, points, limited=False).uv) - centre
+            column[mine] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]
+        return column
+
+
+def _polygon_centroid(corners: Array) -> Array:
+    """Centroids (M, 2) of polygons (M, K, 2)."""
+    middle = corners.mean(axis=1, keepdims=True)
+    a = corners - middle
+    b = np.roll(a, -1, axis=1)
+    doubled = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    moment = ((a + b) * doubled[..., None]).sum(axis=1) / 3
+    return np.asarray(middle[:, 0] + moment / doubled.sum(axis=1)[:, None])

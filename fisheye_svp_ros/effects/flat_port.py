@@ -1,0 +1,48 @@
+"""A plane window in front of the lens."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
+from fisheye_svp_ros.curves import FlatPort
+
+
+@dataclass(frozen=True)
+class FlatPortEffect(Effect):
+    """A window of unknown thickness and given refractive index, square to the axis."""
+
+    refractive_index: float = 1.5
+
+    name: ClassVar[str] = 'flat_port'
+    stage: ClassVar[str] = 'ray'
+    signature: ClassVar[str] = (
+        'residuals along the radius that grow with the angle and with 1 / range, bounded by the thickness'
+    )
+    confused_with: ClassVar[str] = 'viewpoint_shift, radial_profile at one single range'
+    to_separate: ClassVar[str] = (
+        'views beyond 60 degrees at clearly different ranges; look at the housing'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        if scene.theta_max >= np.pi / 2:
+            raise Untestable('rays beyond 90 degrees cannot have come through a plane window')
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('thickness', 'm', 0.005),)
+
+    def columns(self, scene: Scene) -> Array:
+        shift = FlatPort(1.0, self.refractive_index).columns(scene.theta)[..., :1]
+        return np.stack([shift, np.zeros_like(shift)], axis=-2)
+
+    def shift(self, values: Array) -> FlatPort:
+        """Return the curve that adds to the lens's viewpoint shift."""
+        return FlatPort(float(values[0]), self.refractive_index)

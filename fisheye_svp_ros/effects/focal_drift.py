@@ -1,0 +1,48 @@
+"""The focal length drifts smoothly with time (temperature)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_time
+
+
+@dataclass(frozen=True)
+class FocalDriftEffect(Effect):
+    """A relative change of the focal length as a polynomial of time, constant left out."""
+
+    degree: int = 1
+    start: float = field(default=0.0, metadata={'key': False})
+    duration: float = field(default=1.0, metadata={'key': False})
+
+    name: ClassVar[str] = 'focal_drift'
+    stage: ClassVar[str] = 'image'
+    signature: ClassVar[str] = (
+        'residuals in proportion to the image height that change smoothly with time'
+    )
+    confused_with: ClassVar[str] = 'session_step, focal_length'
+    to_separate: ClassVar[str] = (
+        'a longer recording with the temperature noted; frames well spread in time'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        t = require_time(scene, 5)
+        start, duration = float(t.min()), float(np.ptp(t))
+        return [cls(degree, start, duration) for degree in (1, 2, 3)]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f'relative_t{i + 1}', '1', 0.01) for i in range(self.degree))
+
+    def columns(self, scene: Scene) -> Array:
+        x = np.nan_to_num(2 * (scene.times - self.start) / self.duration - 1)
+        powers = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
+        focal = np.array([scene.lens.fx, scene.lens.fy])
+        growth = (scene.normalised() * focal)[..., None]
+        return np.asarray(growth * powers[:, None, None, :])

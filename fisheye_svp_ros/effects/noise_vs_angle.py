@@ -1,0 +1,34 @@
+"""The scatter of the detector grows with the incidence angle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
+
+
+@dataclass(frozen=True)
+class NoiseVsAngleEffect(NoiseEffect):
+    """sigma(theta) = sigma(0) exp(growth theta^2)."""
+
+    name: ClassVar[str] = 'noise_vs_angle'
+    signature: ClassVar[str] = 'residuals without a pattern whose scatter grows towards the edge'
+    confused_with: ClassVar[str] = 'any unmodelled pattern near the edge of the field'
+    to_separate: ClassVar[str] = 'repeat the same view without moving anything: the scatter stays'
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('growth', '1/rad^2', 0.5),)
+
+    def noise_scale(self, scene: Scene, values: Array) -> Array:
+        """Factor (S, N) on the standard deviation of the noise."""
+        return np.exp(np.nan_to_num(values[0] * scene.theta**2))

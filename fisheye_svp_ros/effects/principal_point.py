@@ -1,0 +1,38 @@
+"""The principal point differs from the one assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+
+
+@dataclass(frozen=True)
+class PrincipalPointEffect(Effect):
+    """A shift of the whole image."""
+
+    name: ClassVar[str] = 'principal_point'
+    stage: ClassVar[str] = 'image'
+    signature: ClassVar[str] = (
+        'residuals with a constant part over the image that no turn of the camera takes up'
+    )
+    confused_with: ClassVar[str] = 'decentering, sensor_tilt; with a narrow field, a turn of the camera'
+    to_separate: ClassVar[str] = (
+        'landmarks over the whole field of view; views turned about the axis'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('cx', 'px', 10.0), Parameter('cy', 'px', 10.0))
+
+    def columns(self, scene: Scene) -> Array:
+        return np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))

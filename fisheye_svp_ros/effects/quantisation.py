@@ -1,0 +1,34 @@
+"""Image points are rounded to a grid."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
+
+
+@dataclass(frozen=True)
+class QuantisationEffect(NoiseEffect):
+    """u and v are whole multiples of a step."""
+
+    name: ClassVar[str] = 'quantisation'
+    signature: ClassVar[str] = 'every image point is a multiple of one step'
+    confused_with: ClassVar[str] = 'detector_bias'
+    to_separate: ClassVar[str] = 'store the image points with more digits, or refine to sub-pixel'
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('step', 'px', 1.0),)
+
+    def detected(self, uv: Array, values: Array) -> Array:
+        """Return the image points as the table would hold them."""
+        return np.asarray(np.round(uv / values[0]) * values[0])

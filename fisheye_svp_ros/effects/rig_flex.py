@@ -1,0 +1,54 @@
+"""The rig bends: its second camera does not keep its place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_cameras
+
+
+@dataclass(frozen=True)
+class RigFlexEffect(Effect):
+    """The turn of the second camera in the rig as a polynomial of time, or of its own in each frame."""
+
+    degree: int = 1
+    frames: tuple[int, ...] = field(default=(), metadata={'key': False})
+
+    name: ClassVar[str] = 'rig_flex'
+    stage: ClassVar[str] = 'pose'
+    signature: ClassVar[str] = (
+        'residuals of one camera against the other that differ from frame to frame'
+    )
+    confused_with: ClassVar[str] = 'stereo_time_offset, session_step'
+    to_separate: ClassVar[str] = (
+        'a stiffer rig; frames with the rig unloaded and loaded'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        require_cameras(scene)
+        frames = tuple(int(frame) for frame in np.unique(scene.views.frame))
+        return [cls(degree, frames) for degree in (1, 2, 0) if degree < len(frames)]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Degree 0 stands for a turn of its own in each frame."""
+        labels = [f't{i + 1}' for i in range(self.degree)] or [f'f{f}' for f in self.frames]
+        return tuple(Parameter(f'{a}_{label}', 'rad', 0.01) for label in labels for a in 'xyz')
+
+    def columns(self, scene: Scene) -> Array:
+        order = np.searchsorted(self.frames, scene.views.frame)
+        if self.degree:
+            x = 2 * order / max(len(self.frames) - 1, 1) - 1
+            amounts = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
+        else:
+            amounts = (order[:, None] == np.arange(len(self.frames))).astype(float)
+        turn = scene.pose.rotation * (scene.views.camera > 0)[:, None, None]
+        turns = (amounts[:, None, :, None] * turn[:, :, None, :]).reshape(len(order), 3, -1)
+        columns = np.concatenate([np.zeros_like(turns), turns], axis=1)
+        return np.broadcast_to(columns[:, None], (*scene.uv.shape[:2], *columns.shape[1:]))

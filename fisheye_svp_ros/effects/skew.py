@@ -1,0 +1,40 @@
+"""The pixel axes are not square to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+
+
+@dataclass(frozen=True)
+class SkewEffect(Effect):
+    """A shear: u grows with v."""
+
+    name: ClassVar[str] = 'skew'
+    stage: ClassVar[str] = 'image'
+    signature: ClassVar[str] = (
+        'residuals like a shear of the image: outward along one diagonal, inward along the other'
+    )
+    confused_with: ClassVar[str] = 'aspect turned by 45 degrees'
+    to_separate: ClassVar[str] = (
+        'views turned about the axis by 45 and 90 degrees'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('shear', '1', 0.01),)
+
+    def columns(self, scene: Scene) -> Array:
+        column = np.zeros((*scene.uv.shape, 1))
+        column[..., 0, 0] = scene.normalised()[..., 1] * scene.lens.fx
+        return column

@@ -1,0 +1,41 @@
+"""The second camera of a rig exposes later than its stamp says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_cameras, require_motion
+
+
+@dataclass(frozen=True)
+class StereoTimeOffsetEffect(Effect):
+    """A delay of every camera but the first; motion from the neighbouring frames."""
+
+    name: ClassVar[str] = 'stereo_time_offset'
+    stage: ClassVar[str] = 'pose'
+    signature: ClassVar[str] = (
+        'residuals of one camera against the other that grow with the speed of the rig'
+    )
+    confused_with: ClassVar[str] = 'rig_flex, rolling_shutter'
+    to_separate: ClassVar[str] = (
+        'the same scene with the rig at rest; a flash of light seen by both cameras'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        require_cameras(scene)
+        require_motion(scene)
+        return [cls()]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter('delay', 's', 0.05),)
+
+    def columns(self, scene: Scene) -> Array:
+        later = scene.twist * (scene.views.camera > 0)[:, None]
+        return np.broadcast_to(later[:, None, :, None], (*scene.uv.shape[:2], 6, 1))

@@ -1,0 +1,47 @@
+"""The viewpoint moves along the axis with the incidence angle."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.curves import Gennery
+
+
+@dataclass(frozen=True)
+class ViewpointShiftEffect(Effect):
+    """A Gennery shift e0 + e1 theta^2 + ... on top of the lens (s0 is part of the pose)."""
+
+    order: int = 1
+
+    name: ClassVar[str] = 'viewpoint_shift'
+    stage: ClassVar[str] = 'ray'
+    signature: ClassVar[str] = (
+        'residuals along the radius that grow with the angle and with 1 / range'
+    )
+    confused_with: ClassVar[str] = 'radial_profile at one single range, flat_port, target_shape of a warped board'
+    to_separate: ClassVar[str] = (
+        'views of the same angles at clearly different ranges, the nearest ones as near as possible;'
+        'a target of known flatness'
+    )
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        return [cls(order) for order in (1, 2, 3)]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        return tuple(Parameter(f'e{i}', 'm', 0.01) for i in range(self.order))
+
+    def columns(self, scene: Scene) -> Array:
+        shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]
+        return np.stack([shift, np.zeros_like(shift)], axis=-2)
+
+    def shift(self, values: Array) -> Gennery:
+        """Return the curve that adds to the lens's viewpoint shift."""
+        return Gennery(0.0, *values)
