@@ -48,24 +48,34 @@ def arrow_equations(
     (S, V, M, B) and shared_jacobian (S, V, M, K): its derivatives, whitened alike.  The cost of a
     system with a residual that is not finite is inf, its equations are harmless.
     """
-    cost = (residual**2).sum(axis=(1, 2))
+    cost = (residual**2).sum(axis=-1)
     outside = ~np.isfinite(cost)
+    jacobian = np.concatenate([block_jacobian, shared_jacobian], axis=-1)
     if np.any(outside):
-        inside = ~outside[:, None, None]
-        residual = np.where(inside, residual, 0.0)
-        block_jacobian = np.where(inside[..., None], block_jacobian, 0.0)
-        shared_jacobian = np.where(inside[..., None], shared_jacobian, 0.0)
-    block_transposed = np.swapaxes(block_jacobian, -1, -2)
-    shared_transposed = np.swapaxes(shared_jacobian, -1, -2)
-    column = residual[..., None]
+        residual = np.where(outside[..., None], 0.0, residual)
+        jacobian = np.where(outside[..., None, None], 0.0, jacobian)
+    transposed = np.swapaxes(jacobian, -1, -2)
+    gradient = (transposed @ residual[..., None])[..., 0]
+    cost = np.where(outside, np.inf, cost)
+    return arrow_of_views(cost, transposed @ jacobian, gradient, block_jacobian.shape[-1])
+
+
+def arrow_of_views(
+    cost: Array, hessian: Array, gradient: Array, block: int
+) -> tuple[Array, Arrays]:
+    """Gather the normal equations of single views into arrows, as `arrow_equations` does.
+
+    cost (S, V); hessian (S, V, B + K, B + K), gradient (S, V, B + K): `block` = B columns of the
+    view's own, then those that all views share.
+    """
     equations = ArrowEquations(
-        block_transposed @ block_jacobian,
-        block_transposed @ shared_jacobian,
-        (shared_transposed @ shared_jacobian).sum(axis=1),
-        (block_transposed @ column)[..., 0],
-        (shared_transposed @ column)[..., 0].sum(axis=1),
+        hessian[..., :block, :block],
+        hessian[..., :block, block:],
+        hessian[..., block:, block:].sum(axis=1),
+        gradient[..., :block],
+        gradient[..., block:].sum(axis=1),
     )
-    return np.where(outside, np.inf, cost), tuple(equations)
+    return cost.sum(axis=1), tuple(equations)
 
 
 def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:

@@ -1,0 +1,187 @@
+"""Lens calibration: a lens and the poses of its views together, from targets, without starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.camera import back_project, incidence
+from fisheye_svp_ros.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError, LensError
+from fisheye_svp_ros.lens import INTRINSICS, Lens, check_lens
+from fisheye_svp_ros.observations import Observations, Views
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.lens_adjustment import (
+    Adjusted,
+    adjust,
+    adjust_batch,
+    parameter_values,
+)
+from fisheye_svp_ros.solve.lens_start import INSIDE, field_of_view, focal_candidates, thinned
+from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px
+
+FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
+_CANDIDATES = 4
+_ROUNDS = 4
+_SHIFT_STARTS: tuple[ViewpointShift, ...] = (Gennery(), FlatPort(0.0, 1.5))
+
+
+class Calibration(NamedTuple):
+    """A calibrated lens.
+
+    adjusted: the lens with its `calibration` block and its views, covariances for the noise of
+    the data; sigma: noise of u and of v, px, estimated, NaN where the observations bring their
+    own; views: the views used; left_out: frames that cannot be posed; beyond: how many
+    observations lie past `max_incidence`, where the fitted curve turns back.
+    """
+
+    adjusted: Adjusted
+    sigma: float
+    views: Views
+    left_out: tuple[int, ...]
+    beyond: int
+
+
+def calibrate(
+    observations: Observations,
+    model: str,
+    image_size: tuple[int, int],
+    free: Sequence[str] | None = None,
+    name: str = 'lens',
+) -> Calibration:
+    """Fit a lens to image points of planar or 3-D targets; neither poses nor a start are needed.
+
+    model: a name in IMAGE_HEIGHTS; image_size: width, height, px; free: parameters to fit, among
+    them f, or fx and fy (fx, fy, cx, cy and the model's coefficients by default); a coefficient of
+    a viewpoint shift gives the lens that shift.  What is not freed stays neutral: the centre in
+    the middle of the image, coefficients at 0.
+    Raises LensError for an impossible model, image size or name; ObservationError for rows of
+    several cameras; GeometryError where the views do not determine the lens.
+    """
+    start = _start_lens(model, image_size, free or (), name)
+    names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
+    _check_names(start, names)
+    views, left_out = posable_views(observations)
+    rows, unknowns = 2 * int(views.used.sum()), 6 * len(views.frame) + len(names)
+    if rows <= unknowns:
+        raise GeometryError(
+            f'{observations.source}: {rows // 2} image points in {len(views.frame)} frames do not '
+            f'determine {len(names)} lens parameters and the poses; add frames or points'
+        )
+    adjusted = _from_nothing(start, views, names)
+    sigma = float('nan')
+    if np.isnan(observations.sigma).any():
+        sigma = noise_sigma(adjusted.cost.sum(), rows, unknowns)
+        adjusted = adjusted._replace(
+            covariance=adjusted.covariance * sigma**2,
+            pose_covariance=adjusted.pose_covariance * sigma**2,
+        )
+    _check_focal(adjusted, observations.source)
+    lens, beyond = _with_field(adjusted, views)
+    block = {
+        'rms_px': rms_px(adjusted.residual),
+        'observations': rows // 2,
+        'frames': len(views.frame),
+        'source': observations.source,
+    }
+    lens = check_lens(replace(lens, calibration=block), observations.source)
+    return Calibration(adjusted._replace(lens=lens), sigma, views, left_out, beyond)
+
+
+def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
+    if model not in IMAGE_HEIGHTS:
+        raise LensError(f'model {model!r} is unknown; known are {", ".join(IMAGE_HEIGHTS)}')
+    width, height = image_size
+    if min(width, height) < 1:
+        raise LensError(f'image size is {width}x{height}; both must be above 0')
+    shifts = (s for s in _SHIFT_STARTS if set(s.coefficient_names) & set(free))
+    lens = Lens(
+        name=name, width=width, height=height,
+        fx=float(width), fy=float(width), cx=(width - 1) / 2, cy=(height - 1) / 2,
+        image_height=IMAGE_HEIGHTS[model](), max_incidence=1.0,
+        viewpoint_shift=next(shifts, None),
+    )
+    return _with_corner(lens)
+
+
+def _check_names(lens: Lens, names: tuple[str, ...]) -> None:
+    lens.with_parameters(names, np.ones(len(names)))
+    if len(set(names)) < len(names):
+        raise LensError(f'free names a parameter twice: {", ".join(names)}')
+    if ('f' in names) == ('fx' in names) or ('fx' in names) != ('fy' in names):
+        raise LensError('free must name f, or fx and fy: a calibration starts without them')
+
+
+def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
+    """Scan the focal length, adjust the best candidates to few points, then to everything."""
+    shift = start.viewpoint_shift
+    svp_names = names
+    if shift is not None:
+        svp_names = tuple(name for name in names if name not in shift.coefficient_names)
+    few = thinned(views)
+    focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
+    values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
+    values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
+    solved = adjust_batch(start.svp(), few, pose, values, svp_names)
+    best = solved.state[2][np.argmin(solved.cost)]
+    adjusted = _settled(start.svp().with_parameters(svp_names, best), views, svp_names)
+    if shift is None:
+        return adjusted
+    lens = _with_corner(replace(adjusted.lens, viewpoint_shift=shift))
+    return adjust(lens, views, adjusted.pose, names)
+
+
+def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
+    """Pose every view and adjust, until no view fits better when it is posed afresh."""
+    pose = _posed(lens, views).pose
+    for _ in range(_ROUNDS):
+        adjusted = adjust(lens, views, pose, names)
+        lens, pose = adjusted.lens, adjusted.pose
+        fresh = _posed(lens, views)
+        better = fresh.cost < adjusted.cost * (1 - 1e-6)
+        if not better.any():
+            break
+        pose = Pose(*(
+            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            for new, old in zip(fresh.pose, pose, strict=True)
+        ))
+    return adjusted
+
+
+def _posed(lens: Lens, views: Views) -> Localization:
+    """Pose every view from what lies inside the field of view, however little that is."""
+    lens = _with_corner(lens)
+    rays = back_project(lens, views.uv)
+    start = initial_poses(views.points, rays.direction, np.where(rays.valid, views.weight, 0.0))
+    return localize(ForwardModel(lens), views, start)
+
+
+def _with_corner(lens: Lens) -> Lens:
+    return replace(lens, max_incidence=field_of_view(lens))
+
+
+def _with_field(adjusted: Adjusted, views: Views) -> tuple[Lens, int]:
+    """Return the lens with its `max_incidence` and the number of observations beyond it."""
+    lens = _with_corner(adjusted.lens)
+    points = adjusted.pose.into_body(views.points)
+    theta = incidence(lens, points, limited=False).theta[views.used]
+    limit = lens.image_height.limit * INSIDE
+    lens = replace(lens, max_incidence=max(lens.max_incidence, min(float(theta.max()), limit)))
+    return lens, int((theta > lens.max_incidence).sum())
+
+
+def _check_focal(adjusted: Adjusted, source: str) -> None:
+    for i, name in enumerate(adjusted.names):
+        if name in ('f', 'fx', 'fy'):
+            relative = float(np.sqrt(adjusted.covariance[i, i])) / adjusted.lens.fx
+            if not relative < FOCAL_UNCERTAINTY:
+                raise GeometryError(
+                    f'{source}: {name} is known to {100 * relative:.0f} % only; add views in '
+                    'which the target is tilted and covers the image'
+                )

@@ -1,0 +1,82 @@
+"""Start values for a lens calibration: a focal length and a pose a view, from nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.camera import back_project, project
+from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.observations import Views, views_of
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.initial_pose import initial_poses
+
+# Incidence angles between which the farthest image corner is looked for, rad, and in how many
+# steps; neighbouring focal lengths differ by less than a fifth.
+_CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
+_VIEWS, _POINTS = 20, 60  # enough for a start
+_GOLDEN = (np.sqrt(5) - 1) / 2
+INSIDE = 1 - 1e-6  # just inside the monotone range, where the curve can still be inverted
+
+
+def field_of_view(lens: Lens) -> float:
+    """Return the incidence angle of the farthest image corner, rad, within the monotone range."""
+    u = max(lens.cx + 0.5, lens.width - 0.5 - lens.cx) / lens.fx
+    v = max(lens.cy + 0.5, lens.height - 0.5 - lens.cy) / lens.fy
+    corner = lens.image_height.angle(np.asarray(np.hypot(u, v)))
+    limit = lens.image_height.limit
+    if lens.viewpoint_shift is not None:
+        limit = min(limit, lens.viewpoint_shift.limit)
+    return float(min(corner, limit * INSIDE))
+
+
+def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
+    """Return the best focal lengths (C,), px, of a scan and the poses (C, V) under each.
+
+    The image height is that of `lens` with the coefficients it has (kannala_brandt without any is
+    equidistant), the centre is the lens's.  Candidates are ranked by what their poses leave over.
+    """
+    corner = np.hypot(lens.width, lens.height) / 2
+    heights, _ = lens.image_height.value_and_slope(
+        np.minimum(_CORNER_ANGLES, lens.image_height.limit * INSIDE)
+    )
+    focals = np.unique(corner / heights)
+    lenses = [replace(lens, fx=focal, fy=focal) for focal in focals.tolist()]
+    lenses = [replace(one, max_incidence=field_of_view(one)) for one in lenses]
+    direction = np.stack([back_project(one, views.uv).direction for one in lenses])
+    shape = direction.shape[:3]
+    points = np.broadcast_to(views.points, (*shape, 3)).reshape(-1, *views.points.shape[1:])
+    weight = np.broadcast_to(views.weight, shape).reshape(-1, shape[-1])
+    flat = initial_poses(points, direction.reshape(points.shape), weight)
+    pose = Pose(flat.rotation.reshape(*shape[:2], 3, 3), flat.position.reshape(*shape[:2], 3))
+    misfit = np.array([
+        _misfit(one, pose.take(i), views) for i, one in enumerate(lenses)
+    ])
+    best = np.argsort(misfit)[:keep]
+    return focals[best], pose.take(best)
+
+
+def thinned(views: Views) -> Views:
+    """Return the views that spread widest in the image, with a few evenly spread points each."""
+    used = views.used[..., None]
+    count = used.sum(axis=(1, 2))
+    centre = (views.uv * used).sum(axis=1, keepdims=True) / count[:, None, None]
+    spread = ((views.uv - centre) ** 2 * used).sum(axis=(1, 2)) / count
+    widest = np.sort(np.argsort(-spread, kind='stable')[:_VIEWS])
+    chosen = views.take(widest)
+    # Multiples of the golden ratio do not fall into step with the rows of a board.
+    steps = np.arange(min(_POINTS, int(count.max()))) * _GOLDEN % 1
+    slot = (count[widest, None] * steps).astype(np.int64)
+    uv = np.take_along_axis(chosen.uv, slot[..., None], axis=1)
+    points = np.take_along_axis(chosen.points, slot[..., None], axis=1)
+    return views_of(points, uv, np.take_along_axis(chosen.weight, slot, axis=1))
+
+
+def _misfit(lens: Lens, pose: Pose, views: Views) -> float:
+    """Sum over the views of the residuals' root mean square, px: one lost view is forgiven."""
+    image = project(lens, pose.into_body(views.points), limited=False)
+    distance2 = np.where(views.used, ((image.uv - views.uv) ** 2).sum(axis=-1), 0.0)
+    mean = distance2.sum(axis=1) / views.used.sum(axis=1)
+    return float(np.sqrt(np.where(np.isfinite(mean), mean, np.inf)).sum())

@@ -1,0 +1,52 @@
+"""Measured views: which of them can be posed, how noisy they are, what is left of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.observations import Observations, Views, group_views
+from fisheye_svp_ros.solve.localization import MIN_POINTS
+
+_LINE = 1e-6  # width of a point set relative to its length, below which it is a line
+
+
+def posable_views(observations: Observations) -> tuple[Views, tuple[int, ...]]:
+    """Group one camera's table into views; return those that fix a pose, and the other frames.
+
+    A pose needs MIN_POINTS points that are not on one line.
+    Raises ObservationError for rows of several cameras, GeometryError where no frame is left.
+    """
+    cameras = np.unique(observations.camera)
+    if len(cameras) > 1:
+        names = ', '.join(observations.cameras[i] for i in cameras)
+        raise ObservationError(
+            f'{observations.source}: it holds the cameras {names}; keep the rows of one of them'
+        )
+    views = group_views(observations)
+    used = views.used[..., None]
+    count = used.sum(axis=1, keepdims=True)
+    centred = np.where(used, views.points - (views.points * used).sum(1, keepdims=True) / count, 0)
+    extent = np.linalg.svd(centred, compute_uv=False)
+    posable = (count[:, 0, 0] >= MIN_POINTS) & (extent[:, 1] > _LINE * extent[:, 0])
+    if not posable.any():
+        raise GeometryError(
+            f'{observations.source}: no frame can be posed; each needs {MIN_POINTS} points that '
+            'are not on one line'
+        )
+    return views.take(posable), tuple(views.frame[~posable].tolist())
+
+
+def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
+    """Return the standard deviation of unit-weight rows from the sum of their squared residuals.
+
+    NaN where there are no more rows than unknowns.
+    """
+    return float(np.sqrt(cost / (rows - unknowns))) if rows > unknowns else float('nan')
+
+
+def rms_px(residual: Array) -> float:
+    """Return the root mean square of the 2-D norm of residuals (..., 2), px, NaN left out."""
+    norm2 = (residual**2).sum(axis=-1)
+    return float(np.sqrt(norm2[np.isfinite(norm2)].mean()))
