@@ -15,6 +15,7 @@ from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt, solve_damped
 
 MIN_POINTS = 4
+_UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
 
 
 class Localization(NamedTuple):
@@ -22,7 +23,8 @@ class Localization(NamedTuple):
 
     pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
     residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
-    squares; converged, iterations (S,).
+    squares; converged, iterations (S,).  A view whose points do not fix a pose (they lie on one
+    line, say) has not converged; where that is so the covariance is NaN.
     """
 
     pose: Pose
@@ -48,10 +50,10 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     _, (hessian, _) = problem.linearise(solved.state, np.arange(len(pose.position)))
     predicted = model.linearise(pose, views).uv
     residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
-    covariance = np.asarray(np.linalg.pinv(hessian, hermitian=True), dtype=float)
-    return Localization(
-        pose, covariance, residual, solved.cost, solved.converged, solved.iterations
-    )
+    fixed = solved.converged & _determined(hessian)
+    covariance = np.full(hessian.shape, np.nan)
+    covariance[fixed] = np.linalg.inv(hessian[fixed])
+    return Localization(pose, covariance, residual, solved.cost, fixed, solved.iterations)
 
 
 def start_poses(model: ForwardModel, views: Views) -> Pose:
@@ -62,7 +64,15 @@ def start_poses(model: ForwardModel, views: Views) -> Pose:
     rays = model.back_project(views.uv)
     inside = np.where(rays.valid, views.weight, 0.0)
     check_views(views._replace(weight=inside), MIN_POINTS, 'inside the field of view of the lens')
-    return initial_poses(views.points, rays.direction, inside)
+    pose = initial_poses(views.points, rays.direction, inside)
+    # Seen from the rough pose, each landmark's own viewpoint can be brought to the origin: near a
+    # lens with a shift the pose would otherwise leave landmarks without an image.
+    axial = np.where(inside[..., None] > 0, rays.origin, 0.0)
+    if np.any(axial):
+        pose = initial_poses(
+            views.points - axial @ np.swapaxes(pose.rotation, -1, -2), rays.direction, inside
+        )
+    return pose
 
 
 def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
@@ -74,6 +84,14 @@ def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
             f'frame {views.frame[poor[0]]} has {counts[poor[0]]} usable points {what}; '
             f'at least {minimum} are needed'
         )
+
+
+def _determined(hessian: Array) -> Mask:
+    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    relative = hessian / (scale[..., :, None] * scale[..., None, :])
+    fixed: Mask = np.linalg.eigvalsh(relative)[..., 0] > _UNDETERMINED
+    return fixed
 
 
 class _Localization:
