@@ -15,7 +15,7 @@ from fisheye_svp_ros.share import lens_path
 from fisheye_svp_ros.solve.localization import localize
 
 LENSES = {name: load_lens(lens_path(name)) for name in ('fish180', 'fish214')}
-# Kita, tables 1 and 2: z error in mm and residual in px by radius and spread (whole, inner, outer).
+# Kita, tables 1 and 2: z error in mm, residual in px; by radius for whole, inner, outer.
 PUBLISHED = {
     'fish180': {2.0: [(-0.1148, 0.0399), (0.2372, 0.0281), (-1.5733, 0.0176)],
                 0.5: [(-0.1614, 0.1642), (0.2363, 0.1131), (-1.6713, 0.0759)],
