@@ -71,7 +71,7 @@ class Conformance(Node):
         say('topics', self._values.topic_name, self._cloud.topic_name, self._late.topic_name,
             self._absolute.topic_name)  # fmt: skip
         self._service = self.create_service(Trigger, '~/finish', self._on_finish)
-        say('service', self._service.srv_name)
+        say('service', self._service.service_name)
         self._ticks = 0
         self._timer = self.create_timer(0.02, self._on_tick)
 
@@ -174,7 +174,8 @@ class Conformance(Node):
         say('value', message.data)
 
     def _on_tick(self) -> None:
-        if self._echo_is_ready() and self._ticks < 3:
+        # One message at a time, so that the order of the transcript does not depend on timing.
+        if self._echo_is_ready() and self._ticks == self._received:
             self._ticks += 1
             data = np.arange(self._ticks, dtype=np.float64).tobytes()
             self._cloud.publish(PointCloud2(

@@ -24,7 +24,7 @@ nodes = [Node('a', namespace='ns'), Node('b', cli_args=['-r', 'x:=mine'])]
 for node in nodes:
     topics = [node.create_publisher(Float64, t, 1).topic_name for t in ('x', '~/x', '/x', 'sub/x')]
     service = node.create_service(Trigger, 'x', lambda request, response: response)
-    print(node.get_fully_qualified_name(), *topics, service.srv_name, flush=True)
+    print(node.get_fully_qualified_name(), *topics, service.service_name, flush=True)
 """
 
 

@@ -20,17 +20,11 @@ class ClockType(IntEnum):
     STEADY_TIME = 3
 
 
-@total_ordering
 class Duration:
     """A span of time, kept in nanoseconds."""
 
     def __init__(self, *, seconds: float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = int(seconds * _NS) + int(nanoseconds)
-
-    @classmethod
-    def from_msg(cls, msg: Any) -> Duration:
-        """Read a builtin_interfaces/Duration."""
-        return cls(seconds=msg.sec, nanoseconds=msg.nanosec)
 
     def to_msg(self) -> Any:
         """Return a builtin_interfaces/Duration."""
@@ -39,14 +33,6 @@ class Duration:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Duration) and self.nanoseconds == other.nanoseconds
-
-    def __lt__(self, other: object) -> bool:
-        if not isinstance(other, Duration):
-            return NotImplemented
-        return self.nanoseconds < other.nanoseconds
-
-    def __hash__(self) -> int:
-        return hash(self.nanoseconds)
 
     def __repr__(self) -> str:
         return f'Duration(nanoseconds={self.nanoseconds})'
@@ -101,9 +87,6 @@ class Time:
         if not isinstance(other, Time):
             return NotImplemented
         return self._same_clock(other) < other.nanoseconds
-
-    def __hash__(self) -> int:
-        return hash(self.nanoseconds)
 
     def __repr__(self) -> str:
         return f'Time(nanoseconds={self.nanoseconds}, clock_type={self.clock_type.name})'

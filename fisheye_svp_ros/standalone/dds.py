@@ -37,16 +37,14 @@ _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _HEADER = struct.Struct('<Qq')  # before requests and replies: client, sequence number
 _IDL = {'bool': bool, 'string': str, 'byte': idl.byte, 'char': idl.uint8}
 
-# As in ROS 2: this many processes of one domain find each other on one host without multicast.
-_LOCALHOST = """<CycloneDDS><Domain>
-<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
-<AllowMulticast>false</AllowMulticast></General>
-<Discovery><ParticipantIndex>auto</ParticipantIndex>
-<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
-<Peers><Peer address="127.0.0.1"/></Peers></Discovery>
-</Domain></CycloneDDS>"""
-_SUBNET = """<CycloneDDS><Domain><Discovery><ParticipantIndex>auto</ParticipantIndex>
-<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"""
+# As in ROS 2, this many processes of one domain find each other on one host without multicast.
+_DISCOVERY = (
+    '<ParticipantIndex>auto</ParticipantIndex>'
+    '<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>'
+)
+_LOCALHOST = '<Peers><Peer address="127.0.0.1"/></Peers>'
+_UNICAST = '<AllowMulticast>false</AllowMulticast>'
+_LOOPBACK = '<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>'
 
 
 class Sample:
@@ -116,7 +114,7 @@ class Participant:
     """One process on a domain, with everything that its nodes write and read."""
 
     def __init__(self, domain_id: int) -> None:
-        self._domain = Domain(domain_id, f'{_configuration()},{os.getenv("CYCLONEDDS_URI", "")}')
+        self._domain = Domain(domain_id, _configuration())
         self.entity = DomainParticipant(domain_id, Qos(Policy.Userdata(b'enclave=/;')))
         self.guid: UUID = self.entity.guid
         self._service_ids = itertools.count(1)
@@ -135,8 +133,13 @@ def _configuration() -> str:
     asked = os.getenv('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'LOCALHOST'
     if asked not in {'LOCALHOST', 'SUBNET'}:
         raise NotSupportedError(f'ROS_AUTOMATIC_DISCOVERY_RANGE={asked}: use LOCALHOST or SUBNET')
-    alone = os.getenv('ROS_LOCALHOST_ONLY') == '1'
-    return _LOCALHOST if alone or asked == 'LOCALHOST' else _SUBNET
+    general, discovery, own = '', _DISCOVERY, os.getenv('CYCLONEDDS_URI', '')
+    if asked == 'LOCALHOST' or os.getenv('ROS_LOCALHOST_ONLY') == '1':
+        discovery += _LOCALHOST
+        # Cyclone refuses an interface that is named twice, so the user's own choice stands alone.
+        general = _UNICAST + ('' if own else _LOOPBACK)
+    inner = f'<General>{general}</General><Discovery>{discovery}</Discovery>'
+    return f'<CycloneDDS><Domain>{inner}</Domain></CycloneDDS>,{own}'
 
 
 class Writer:

@@ -41,10 +41,6 @@ class SingleThreadedExecutor:
             self._nodes.remove(node)
         self._attached, self._waitset = [], None
 
-    def get_nodes(self) -> list[Any]:
-        """Return the nodes whose callbacks run here."""
-        return [*self._nodes]
-
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop, and forget all nodes."""
         self._stopped = True

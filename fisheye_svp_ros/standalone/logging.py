@@ -26,15 +26,11 @@ _sinks: dict[str, Sink] = {}
 
 
 class Logger:
-    """Writes messages of a node; `throttle_duration_sec`, `once` and `skip_first` filter them."""
+    """Writes messages of a node; `throttle_duration_sec` and `once` filter them."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self._calls: dict[tuple[str, int], float] = {}
-
-    def get_child(self, name: str) -> Logger:
-        """Return a logger below this one."""
-        return Logger(f'{self.name}.{name}' if self.name else name)
 
     def set_level(self, level: int) -> None:
         """Drop messages of this logger below a severity."""
@@ -87,16 +83,11 @@ class Logger:
             sink(stamp, severity, self.name, message)
         return True
 
-    def _passes(
-        self, *, throttle_duration_sec: float = 0, once: float = False, skip_first: float = False
-    ) -> bool:
+    def _passes(self, *, throttle_duration_sec: float = 0, once: float = False) -> bool:
         frame = sys._getframe(3)  # filters count per line of code, so find the caller's
         call = (frame.f_code.co_filename, frame.f_lineno)
         last, now = self._calls.get(call), time.monotonic()
-        if once or skip_first:
-            self._calls.setdefault(call, now)
-            return (last is None) == bool(once)
-        if last is not None and now < last + throttle_duration_sec:
+        if last is not None and (once or now < last + throttle_duration_sec):
             return False
         self._calls[call] = now
         return True

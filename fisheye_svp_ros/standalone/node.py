@@ -140,12 +140,14 @@ class Service(Entity):
         callback: Callable[[Any, Any], Any],
         srv_type: Any,
         ends: tuple[dds.Reader, dds.Writer],
+        given_name: str,
         name: str,
     ) -> None:
         super().__init__(node, callback)
         self.reader, self.writer = ends
         self.srv_type = srv_type
-        self.srv_name = name
+        self.srv_name = given_name
+        self.service_name = name
 
     def execute(self) -> None:
         """Answer one request."""
@@ -294,7 +296,7 @@ class Node(ParameterHolder):
             participant, f'rq{name}Request', srv_type.Request, qos_profile, user_data)
         writer = dds.Writer(
             participant, f'rr{name}Reply', srv_type.Response.TYPENAME, qos_profile, user_data)
-        service = Service(self, callback, srv_type, (reader, writer), name)
+        service = Service(self, callback, srv_type, (reader, writer), srv_name, name)
         self._services.append(service)
         self.__announce()
         return service

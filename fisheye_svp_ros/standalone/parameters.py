@@ -113,7 +113,6 @@ class ParameterHolder:
         self._parameters: dict[str, Parameter] = {}
         self._descriptors: dict[str, Any] = {}
         self._on_set_parameters_callbacks: list[OnSet] = []
-        self._post_set_parameters_callbacks: list[OnSet] = []
 
     def _publish_parameter_event(self, event: Any) -> None:
         raise NotImplementedError
@@ -217,18 +216,6 @@ class ParameterHolder:
         """Have a function accept or refuse new values; the last one added is asked first."""
         self._on_set_parameters_callbacks.insert(0, callback)
 
-    def add_post_set_parameters_callback(self, callback: OnSet) -> None:
-        """Have a function told of new values after they are in place."""
-        self._post_set_parameters_callbacks.insert(0, callback)
-
-    def remove_on_set_parameters_callback(self, callback: OnSet) -> None:
-        """Stop asking a function."""
-        self._on_set_parameters_callbacks.remove(callback)
-
-    def remove_post_set_parameters_callback(self, callback: OnSet) -> None:
-        """Stop telling a function."""
-        self._post_set_parameters_callbacks.remove(callback)
-
     def __set(self, parameters: list[Parameter], declared: dict[str, Any] | None = None) -> Any:
         for parameter in parameters:
             descriptor = (declared or self._descriptors).get(parameter.name)
@@ -242,8 +229,6 @@ class ParameterHolder:
         for parameter in parameters:
             self.__store(parameter, declared, event)
         self._publish_parameter_event(event)
-        for callback in self._post_set_parameters_callbacks:
-            callback(parameters)
         return _Result(successful=True)
 
     def __store(self, parameter: Parameter, declared: dict[str, Any] | None, event: Any) -> None:

@@ -12,7 +12,6 @@ from fisheye_svp_ros.standalone.node import Node
 __all__ = [
     'create_node',
     'get_default_context',
-    'get_global_executor',
     'init',
     'ok',
     'shutdown',
@@ -55,8 +54,7 @@ def create_node(node_name: str, **options: Any) -> Node:
     return Node(node_name, **options)
 
 
-def get_global_executor() -> SingleThreadedExecutor:
-    """Return the executor that `spin` and `spin_once` use."""
+def _global_executor() -> SingleThreadedExecutor:
     global _executor
     if _executor is None:
         _executor = SingleThreadedExecutor()
@@ -65,7 +63,7 @@ def get_global_executor() -> SingleThreadedExecutor:
 
 def spin(node: Node, executor: SingleThreadedExecutor | None = None) -> None:
     """Run the callbacks of a node until the context is shut down."""
-    executor = executor or get_global_executor()
+    executor = executor or _global_executor()
     executor.add_node(node)
     try:
         executor.spin()
@@ -80,7 +78,7 @@ def spin_once(
     timeout_sec: float | None = None,
 ) -> None:
     """Run one callback of a node, or return after a while without any."""
-    executor = executor or get_global_executor()
+    executor = executor or _global_executor()
     executor.add_node(node)
     try:
         executor.spin_once(timeout_sec)
