@@ -1,0 +1,104 @@
+"""Simulation: landmarks, poses, a lens and its effects to the observations a camera would give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.landmarks import Landmarks
+from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.observations import Observations, make_observations, views_of
+from fisheye_svp_ros.pose import Pose
+
+STEREO = ('left', 'right')
+
+
+def simulate(
+    model: ForwardModel,
+    landmarks: Landmarks,
+    poses: Pose,
+    sigma: float,
+    rng: np.random.Generator,
+    *,
+    t: Array | None = None,
+    board: Index | None = None,
+) -> Observations:
+    """Return the image points of landmarks (N,) from poses (S,) of the camera in the world.
+
+    sigma: of Gaussian noise on u and on v, px; t (S,): time of each frame, s; board (N,): the
+    rigid piece of the target that carries each landmark.  Frames count from 0; what lies outside
+    the field of view or the image, or has no ray through the lens, is absent.
+    Raises ParameterError for a sigma below 0.
+    """
+    seen = _image_points(model, landmarks, poses, sigma, rng, t, board, camera=0)
+    return _table(seen[:, None], landmarks, sigma, t, board, ('',))
+
+
+def simulate_stereo(
+    left: ForwardModel,
+    right: ForwardModel,
+    landmarks: Landmarks,
+    rig: Pose,
+    poses: Pose,
+    sigma: float,
+    rng: np.random.Generator,
+    *,
+    t: Array | None = None,
+    board: Index | None = None,
+) -> Observations:
+    """Return the image points in both cameras of a rig, as `simulate` does, in one table.
+
+    rig: left camera in the right one; poses (S,) of the right camera in the world.
+    """
+    seen = [
+        _image_points(model, landmarks, place, sigma, rng, t, board, camera)
+        for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
+    ]
+    return _table(np.stack(seen, axis=1), landmarks, sigma, t, board, STEREO)
+
+
+def _image_points(
+    model: ForwardModel, landmarks: Landmarks, poses: Pose, sigma: float,
+    rng: np.random.Generator, t: Array | None, board: Index | None, camera: int,
+) -> Array:
+    """Return image points (S, N, 2), px, NaN where there is none."""
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
+    shape = (len(poses.position), len(landmarks.ids))
+    views = views_of(landmarks.points, np.zeros((*shape, 2)))._replace(
+        landmark=np.broadcast_to(landmarks.ids, shape),
+        camera=np.full(shape[0], camera),
+        board=np.broadcast_to(0 if board is None else board, shape),
+        t=np.broadcast_to(np.nan if t is None else t[:, None], shape),
+    )
+    uv = model.predict(poses, views).uv
+    uv = uv + sigma * rng.standard_normal(uv.shape)
+    return np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
+
+
+def _inside(lens: Lens, uv: Array) -> Array:
+    size = np.array([lens.width, lens.height])
+    inside: Array = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1)
+    return inside
+
+
+def _table(
+    seen: Array, landmarks: Landmarks, sigma: float, t: Array | None, board: Index | None,
+    cameras: tuple[str, ...],
+) -> Observations:
+    """Make the table of image points (S, C, N, 2) in the order of frame, camera, landmark."""
+    frame, camera, slot = np.nonzero(np.isfinite(seen).all(axis=-1))
+    return make_observations(
+        frame,
+        landmarks.ids[slot],
+        seen[frame, camera, slot],
+        landmarks.points[slot],
+        camera=camera,
+        board=None if board is None else board[slot],
+        t=None if t is None else t[frame],
+        sigma=np.full(len(frame), sigma) if sigma else None,
+        cameras=cameras,
+        source='simulation',
+    )
