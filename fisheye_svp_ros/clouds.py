@@ -1,0 +1,92 @@
+"""The layout of sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
+
+Messages come as rclpy, the standalone client or a bag reader made them: only attributes count.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import ObservationError
+
+Points = NDArray[np.void]
+
+LANDMARKS = np.dtype([('landmark', '<u4'), ('x', '<f8'), ('y', '<f8'), ('z', '<f8')])
+IMAGE_POINTS = np.dtype([('landmark', '<u4'), ('u', '<f8'), ('v', '<f8')])
+RESIDUALS = np.dtype([
+    *IMAGE_POINTS.descr, ('du', '<f8'), ('dv', '<f8'), ('theta', '<f8'), ('range', '<f8')
+])
+
+# sensor_msgs/PointField: datatype numbers.
+DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+_KINDS = {'u': ('iu', 'a whole number'), 'f': ('f', 'a floating-point number')}
+
+
+def structured(layout: np.dtype[np.void], landmark: Index, *columns: Array) -> Points:
+    """Return an array (N,) of `layout` from ids (N,) and its other fields, each (N,)."""
+    points = np.empty(len(landmark), dtype=layout)
+    for name, values in zip(layout.names or (), (landmark, *columns), strict=True):
+        points[name] = values
+    return points
+
+
+def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
+    """Return the points (N,) of a PointCloud2 as `layout`, whatever their order and widths.
+
+    what: topic or file, for the error.  Raises ObservationError where a field is missing, of the
+    wrong kind, not finite, or where a landmark stands twice.
+    """
+    raw = _raw_points(cloud, what)
+    points = np.empty(raw.shape, dtype=layout)
+    for name in layout.names or ():
+        if name not in (raw.dtype.names or ()):
+            needed = ', '.join(layout.names or ())
+            raise ObservationError(f'{what}: field {name!r} is missing; needed are {needed}')
+        kinds, kind = _KINDS[layout[name].kind]
+        if raw.dtype[name].kind not in kinds:
+            given = raw.dtype[name]
+            raise ObservationError(f'{what}: field {name!r} is {given}; {kind} is needed')
+        bad = np.flatnonzero(~_representable(raw[name], layout[name]))
+        if bad.size:
+            raise ObservationError(
+                f'{what}: field {name!r} of point {bad[0]} is {raw[name][bad[0]]}; leave out '
+                'points without a value'
+            )
+        points[name] = raw[name]
+    ids, counts = np.unique(points['landmark'], return_counts=True)
+    if np.any(counts > 1):
+        raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} stands there twice')
+    return points
+
+
+def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool_]:
+    if kind.kind == 'f':
+        return np.asarray(np.isfinite(values))
+    return np.asarray((values >= 0) & (values <= np.iinfo(kind).max))
+
+
+def _raw_points(cloud: Any, what: str) -> Points:
+    order = '>' if cloud.is_bigendian else '<'
+    step, count = int(cloud.point_step), int(cloud.width) * int(cloud.height)
+    names, formats, offsets = [], [], []
+    for field in cloud.fields:
+        size = np.dtype(DATATYPES.get(field.datatype, 'V0')).itemsize
+        if not size or field.count != 1 or field.offset + size > step or field.name in names:
+            raise ObservationError(
+                f'{what}: field {field.name!r} has an impossible type, count or offset'
+            )
+        names.append(field.name)
+        formats.append(order + DATATYPES[field.datatype])
+        offsets.append(int(field.offset))
+    if len(cloud.data) != step * count:
+        raise ObservationError(
+            f'{what}: {len(cloud.data)} bytes of data do not hold {count} points of {step} bytes'
+        )
+    layout = np.dtype(
+        {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': max(step, 1)}
+    )
+    return np.frombuffer(cloud.data, dtype=layout) if count else np.empty(0, dtype=layout)

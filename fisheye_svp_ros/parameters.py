@@ -1,0 +1,116 @@
+"""Typed tables of parameters: frozen dataclasses whose fields are the rows; and sweeps of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple, TypeVar
+
+from fisheye_svp_ros.errors import ParameterError
+
+SWEEP = 'sweep.'
+
+S = TypeVar('S')
+
+
+class Row(NamedTuple):
+    """One parameter: its default gives the type; low to high is the range, ends included."""
+
+    name: str
+    default: Any
+    description: str
+    unit: str = ''
+    low: float | None = None
+    high: float | None = None
+    choices: tuple[str, ...] = ()
+
+    def constraint(self) -> str:
+        """Say what values are allowed beyond the type; empty for any."""
+        if self.choices:
+            return 'one of ' + ', '.join(self.choices)
+        return '' if self.low is None else f'{self.low:g} to {self.high:g}'
+
+    def check(self, value: Any) -> Any:
+        """Return the value in the type of the default; raise ParameterError if not allowed."""
+        if isinstance(self.default, tuple):
+            return tuple(self._check_one(one, self.default[0]) for one in value)
+        return self._check_one(value, self.default)
+
+    def _check_one(self, value: Any, like: Any) -> Any:
+        kind = type(like)
+        if kind is float and type(value) is int:
+            value = float(value)
+        if type(value) is not kind:
+            raise ParameterError(f'{self.name} is {value!r}; {kind.__name__} is needed')
+        if kind is float and not math.isfinite(value):
+            raise ParameterError(f'{self.name} is {value}; a finite number is needed')
+        outside = self.low is not None and not self.low <= value <= (self.high or 0)
+        if outside or (self.choices and value not in self.choices):
+            raise ParameterError(f'{self.name} is {value!r}; allowed is {self.constraint()}')
+        return value
+
+
+def parameter(
+    default: Any,
+    description: str,
+    unit: str = '',
+    span: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Return a dataclass field that is a row of the table; span: smallest and largest value."""
+    low, high = span or (None, None)
+    row = Row('', default, description, unit, low, high, choices)
+    return field(default=default, metadata={'row': row})
+
+
+def rows(table: Any) -> list[Row]:
+    """Return the rows of a table, given as class or instance."""
+    return [f.metadata['row']._replace(name=f.name) for f in fields(table)]
+
+
+def changed(table: S, values: Mapping[str, Any]) -> S:
+    """Return the table with some values changed; names that are no row are ignored.
+
+    Raises ParameterError for a value that is not allowed.
+    """
+    given = {
+        row.name: row.check(values[row.name]) if row.name in values else getattr(table, row.name)
+        for row in rows(table)
+    }
+    return type(table)(**given)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The Cartesian product of lists of parameter values; the last list runs fastest."""
+
+    lists: Mapping[str, Sequence[Any]]
+
+    def __len__(self) -> int:
+        return math.prod(map(len, self.lists.values()))
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for point in itertools.product(*self.lists.values()):
+            yield dict(zip(self.lists, point, strict=True))
+
+
+def sweep_of(table: Any, parameters: Mapping[str, Any]) -> Sweep:
+    """Return the sweep that the `sweep.<parameter>` entries of a parameter file ask for.
+
+    Raises ParameterError for an unknown parameter, an empty list or a value that is not allowed.
+    """
+    known = {row.name: row for row in rows(table) if not isinstance(row.default, tuple)}
+    lists = {}
+    for name, values in parameters.items():
+        if not name.startswith(SWEEP):
+            continue
+        row = known.get(name.removeprefix(SWEEP))
+        if row is None:
+            raise ParameterError(f'{name}: no such parameter to sweep; known are '
+                                 + ', '.join(known))
+        if isinstance(values, str) or not isinstance(values, Sequence) or not len(values):
+            raise ParameterError(f'{name} is {values!r}; a list of at least one value is needed')
+        lists[row.name] = [row.check(value) for value in values]
+    return Sweep(lists)
