@@ -128,7 +128,7 @@ for _ in range(3):
     log.info('never')
     log.warn('once', once=True)
     log.fatal('seldom', throttle_duration_sec=60.0)
-""", '--ros-args', '--log-level', 'warn', '--log-level', 'left.noisy:=debug', '-p', 'x:=1')  # fmt: skip
+""", '--ros-args', '--log-level', 'warn', '--log-level', 'left.noisy:=debug')  # fmt: skip
     assert node.finish() == 0
     assert all(
         re.fullmatch(r'\[[A-Z]+\] \[\d{10}\.\d{9}\] \[left\.noisy\]: .*', line)

@@ -53,7 +53,7 @@ print('published', flush=True)
 rclpy.spin(node)
 """
 
-_SEND_CLOUD = _HEAD + """
+SEND_CLOUD = _HEAD + """
 points = np.random.default_rng(7).normal(size=(43_691, 3))  # 1 MB of them
 publisher = node.create_publisher(PointCloud2, 'cloud', latched)
 fields = [PointField(name=n, offset=8 * i, datatype=PointField.FLOAT64, count=1)
@@ -64,7 +64,7 @@ print('sent', points.nbytes, hashlib.sha256(points.tobytes()).hexdigest(), flush
 rclpy.spin(node)
 """
 
-_RECEIVE_CLOUD = _HEAD + """
+RECEIVE_CLOUD = _HEAD + """
 def receive(cloud):
     points = np.frombuffer(cloud.data, np.float64).reshape(-1, 3)
     print('received', points.nbytes, hashlib.sha256(points.tobytes()).hexdigest(),
@@ -93,10 +93,10 @@ def test_late_subscriber_receives_the_last_ones(run_node: Callable[..., NodeProc
 
 
 def test_large_point_cloud_arrives_unchanged(run_node: Callable[..., NodeProcess]) -> None:
-    receiver = run_node(_RECEIVE_CLOUD, 'receiver')
-    sent = run_node(_SEND_CLOUD, 'sender').wait_for('sent (.*)')[1]
+    receiver = run_node(RECEIVE_CLOUD, 'receiver')
+    sent = run_node(SEND_CLOUD, 'sender').wait_for('sent (.*)')[1]
     assert receiver.wait_for('received (.*)')[1] == f'{sent} z 43691 True'
-    assert run_node(_RECEIVE_CLOUD, 'late').wait_for('received')
+    assert run_node(RECEIVE_CLOUD, 'late').wait_for('received')
 
 
 def test_incompatible_qos_does_not_connect(run_node: Callable[..., NodeProcess]) -> None:

@@ -35,7 +35,7 @@ from fisheye_svp_ros.standalone.qos import (
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _HEADER = struct.Struct('<Qq')  # before requests and replies: client, sequence number
-_IDL = {'bool': bool, 'string': str, 'byte': idl.byte, 'char': idl.uint8}
+_IDL = {'bool': bool, 'string': str}
 
 # As in ROS 2, this many processes of one domain find each other on one host without multicast.
 _DISCOVERY = (

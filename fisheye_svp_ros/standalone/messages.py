@@ -47,8 +47,8 @@ _DEFAULTS: dict[tuple[str, str], object] = {
 }
 
 _CODES = {
-    'int8': 'b', 'uint8': 'B', 'char': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i',
-    'uint32': 'I', 'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
+    'int8': 'b', 'uint8': 'B', 'int16': 'h', 'uint16': 'H', 'int32': 'i', 'uint32': 'I',
+    'int64': 'q', 'uint64': 'Q', 'float32': 'f', 'float64': 'd',
 }  # fmt: skip
 
 # rosidl puts one byte into a message without fields, because IDL knows no empty structure.
@@ -124,11 +124,21 @@ def _plain(value: object) -> object:
 @cache
 def _store() -> Any:
     store = get_typestore(Stores.ROS2_JAZZY)
+    for name, (constants, fields) in store.fielddefs.items():
+        store.fielddefs[name] = (constants, [(n, _without_char(desc)) for n, desc in fields])
     for service, parts in _SERVICES.items():
         for suffix, text in zip(('_Request', '_Response'), parts, strict=True):
             (definition,) = get_types_from_msg(text, f'{service}{suffix}').values()
             store.register({f'{service}{suffix}': definition})
     return store
+
+
+def _without_char(desc: Any) -> Any:
+    """Return a descriptor in which char is uint8, as rosidl has it in its type hashes."""
+    kind, argument = desc
+    if kind in {Nodetype.ARRAY, Nodetype.SEQUENCE}:
+        return kind, (_without_char(argument[0]), argument[1])
+    return (kind, ('uint8', 0)) if argument == ('char', 0) else desc
 
 
 @cache
