@@ -113,6 +113,7 @@ class ParameterHolder:
         self._parameters: dict[str, Parameter] = {}
         self._descriptors: dict[str, Any] = {}
         self._on_set_parameters_callbacks: list[OnSet] = []
+        self._post_set_parameters_callbacks: list[Callable[[list[Parameter]], None]] = []
 
     def _publish_parameter_event(self, event: Any) -> None:
         raise NotImplementedError
@@ -216,6 +217,12 @@ class ParameterHolder:
         """Have a function accept or refuse new values; the last one added is asked first."""
         self._on_set_parameters_callbacks.insert(0, callback)
 
+    def add_post_set_parameters_callback(
+        self, callback: Callable[[list[Parameter]], None]
+    ) -> None:
+        """Have a function told of new values after they are in place."""
+        self._post_set_parameters_callbacks.insert(0, callback)
+
     def __set(self, parameters: list[Parameter], declared: dict[str, Any] | None = None) -> Any:
         for parameter in parameters:
             descriptor = (declared or self._descriptors).get(parameter.name)
@@ -229,6 +236,8 @@ class ParameterHolder:
         for parameter in parameters:
             self.__store(parameter, declared, event)
         self._publish_parameter_event(event)
+        for told in self._post_set_parameters_callbacks:
+            told(parameters)
         return _Result(successful=True)
 
     def __store(self, parameter: Parameter, declared: dict[str, Any] | None, event: Any) -> None:
