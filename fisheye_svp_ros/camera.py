@@ -23,6 +23,8 @@ from fisheye_svp_ros.lens import Lens
 
 _NEWTON_STEPS = 3
 _SETTLED = 1e-7  # a last Newton step this small leaves an error of its square
+_HALVINGS = 48
+_EXACT = 1e-13  # rad
 _MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still gets an answer
 _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
 
@@ -237,17 +239,11 @@ def _newton(
 
 def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:
     """Find the smallest root up to `limit` of the ray equation of points (N,); NaN for none."""
-
-    def equation(theta: Array) -> Array:
-        value, _ = shift.value_and_slope(theta, np.tan(theta / 2))
-        left: Array = r[:, None] * np.cos(theta) - (z[:, None] - value) * np.sin(theta)
-        return left
-
     low = np.zeros((len(r), 1))
     high = np.full((len(r), 1), limit)
     for _ in range(2):
         grid = low + (high - low) * np.linspace(0, 1, 65)
-        values = equation(grid)
+        values, _ = _ray_equation(shift, r[:, None], z[:, None], grid)
         falls = (values[:, :-1] >= 0) & (values[:, 1:] < 0)
         found = falls.any(axis=1)
         # Where no sign changes, two roots may hide between neighbours of the lowest value.
@@ -257,11 +253,31 @@ def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:
         right = np.where(found, first + 1, lowest + 1)[:, None]
         low = np.take_along_axis(grid, left, axis=1)
         high = np.take_along_axis(grid, right, axis=1)
-    for _ in range(48):
-        middle = (low + high) / 2
-        positive = equation(middle) >= 0
-        low, high = np.where(positive, middle, low), np.where(positive, high, middle)
-    return np.where(found, low[:, 0], np.nan)
+    theta = np.full(len(r), np.nan)
+    if found.any():
+        theta[found] = _bracketed(shift, r[found], z[found], low[found, 0], high[found, 0])
+    return theta
+
+
+def _bracketed(shift: ViewpointShift, r: Array, z: Array, low: Array, high: Array) -> Array:
+    """Newton steps that fall back to halving the bracket; the equation falls through zero."""
+    theta = (low + high) / 2
+    for _ in range(_HALVINGS):
+        value, slope = _ray_equation(shift, r, z, theta)
+        low, high = np.where(value >= 0, theta, low), np.where(value >= 0, high, theta)
+        step = theta - value / slope
+        inside = (step >= low) & (step <= high)
+        before, theta = theta, np.where(inside, step, (low + high) / 2)
+        if np.all(np.abs(theta - before) < _EXACT):
+            break
+    return theta
+
+
+def _ray_equation(shift: ViewpointShift, r: Array, z: Array, theta: Array) -> tuple[Array, Array]:
+    """Return r cos(theta) - (Z - s(theta)) sin(theta) and its derivative."""
+    value, slope = shift.value_and_slope(theta, np.tan(theta / 2))
+    sin, cos, reach = np.sin(theta), np.cos(theta), z - value
+    return r * cos - reach * sin, slope * sin - r * sin - reach * cos
 
 
 def _image_points(lens: Lens, rays: Incidence, height: Array) -> Array:
