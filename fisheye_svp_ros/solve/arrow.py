@@ -39,34 +39,14 @@ class ArrowCovariance(NamedTuple):
     shared: Array
 
 
-def arrow_equations(
-    residual: Array, block_jacobian: Array, shared_jacobian: Array
-) -> tuple[Array, Arrays]:
-    """Return the costs (S,) and the fields of ArrowEquations, as `least_squares.Problem` wants.
-
-    residual (S, V, M): predicted minus measured, whitened, 0 for padding; block_jacobian
-    (S, V, M, B) and shared_jacobian (S, V, M, K): its derivatives, whitened alike.  The cost of a
-    system with a residual that is not finite is inf, its equations are harmless.
-    """
-    cost = (residual**2).sum(axis=-1)
-    outside = ~np.isfinite(cost)
-    jacobian = np.concatenate([block_jacobian, shared_jacobian], axis=-1)
-    if np.any(outside):
-        residual = np.where(outside[..., None], 0.0, residual)
-        jacobian = np.where(outside[..., None, None], 0.0, jacobian)
-    transposed = np.swapaxes(jacobian, -1, -2)
-    gradient = (transposed @ residual[..., None])[..., 0]
-    cost = np.where(outside, np.inf, cost)
-    return arrow_of_views(cost, transposed @ jacobian, gradient, block_jacobian.shape[-1])
-
-
 def arrow_of_views(
     cost: Array, hessian: Array, gradient: Array, block: int
 ) -> tuple[Array, Arrays]:
-    """Gather the normal equations of single views into arrows, as `arrow_equations` does.
+    """Gather the normal equations of single views, whitened, into arrows.
 
     cost (S, V); hessian (S, V, B + K, B + K), gradient (S, V, B + K): `block` = B columns of the
-    view's own, then those that all views share.
+    view's own, then those that all views share.  Returns the costs (S,) and the fields of
+    ArrowEquations, as `least_squares.Problem.linearise` does.
     """
     equations = ArrowEquations(
         hessian[..., :block, :block],

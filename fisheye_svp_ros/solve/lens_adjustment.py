@@ -61,9 +61,9 @@ def adjust(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> Adjust
             'and its units (m)'
         )
     rotation, position, values = (array[0] for array in solved.state)
-    fitted, pose = lens.with_parameters(names, values), Pose(rotation, position)
-    predicted, cost, normal = _linearised(fitted, views, pose, names)
-    _, arrow = arrow_of_views(cost[None], *(array[None] for array in normal), block=6)
+    fitted, pose = lens.with_parameters(names, values.tolist()), Pose(rotation, position)
+    predicted, cost, (hessian, gradient) = _linearised(fitted, views, pose, names)
+    _, arrow = arrow_of_views(cost[None], hessian[None], gradient[None], block=6)
     _check_determined(arrow, names)
     covariance = arrow_covariance(arrow)
     residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
@@ -98,7 +98,8 @@ class _Adjustment:
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         systems = [self._system(Pose(r, p), values) for r, p, values in zip(*state, strict=True)]
-        return arrow_of_views(*(np.stack(part) for part in zip(*systems, strict=True)), block=6)
+        cost, hessian, gradient = (np.stack(part) for part in zip(*systems, strict=True))
+        return arrow_of_views(cost, hessian, gradient, block=6)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         return arrow_step(normal, damping)
@@ -109,7 +110,7 @@ class _Adjustment:
 
     def _system(self, pose: Pose, values: Array) -> tuple[Array, Array, Array]:
         """Return the cost (V,), H (V, 6 + K, 6 + K) and g (V, 6 + K) of one adjustment."""
-        lens = self._lens.with_parameters(self._names, values)
+        lens = self._lens.with_parameters(self._names, values.tolist())
         if min(lens.fx, lens.fy) <= 0 or lens.parameters.get('refractive_index', 2.0) <= 1:
             count, columns = len(pose.position), 6 + len(values)
             hessian = np.broadcast_to(np.eye(columns), (count, columns, columns))

@@ -22,7 +22,12 @@ from fisheye_svp_ros.solve.lens_adjustment import (
     adjust_batch,
     parameter_values,
 )
-from fisheye_svp_ros.solve.lens_start import INSIDE, field_of_view, focal_candidates, thinned
+from fisheye_svp_ros.solve.lens_start import (
+    field_of_view,
+    focal_candidates,
+    monotone_limit,
+    thinned,
+)
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px
 
@@ -111,7 +116,7 @@ def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], na
 
 
 def _check_names(lens: Lens, names: tuple[str, ...]) -> None:
-    lens.with_parameters(names, np.ones(len(names)))
+    lens.with_parameters(names, [1.0] * len(names))
     if len(set(names)) < len(names):
         raise LensError(f'free names a parameter twice: {", ".join(names)}')
     if ('f' in names) == ('fx' in names) or ('fx' in names) != ('fy' in names):
@@ -129,7 +134,7 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
     values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
     solved = adjust_batch(start.svp(), few, pose, values, svp_names)
-    best = solved.state[2][np.argmin(solved.cost)]
+    best = solved.state[2][np.argmin(solved.cost)].tolist()
     adjusted = _settled(start.svp().with_parameters(svp_names, best), views, svp_names)
     if shift is None:
         return adjusted
@@ -171,8 +176,8 @@ def _with_field(adjusted: Adjusted, views: Views) -> tuple[Lens, int]:
     lens = _with_corner(adjusted.lens)
     points = adjusted.pose.into_body(views.points)
     theta = incidence(lens, points, limited=False).theta[views.used]
-    limit = lens.image_height.limit * INSIDE
-    lens = replace(lens, max_incidence=max(lens.max_incidence, min(float(theta.max()), limit)))
+    seen = min(float(theta.max()), monotone_limit(lens))
+    lens = replace(lens, max_incidence=max(lens.max_incidence, seen))
     return lens, int((theta > lens.max_incidence).sum())
 
 

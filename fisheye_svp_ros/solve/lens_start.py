@@ -18,18 +18,23 @@ from fisheye_svp_ros.solve.initial_pose import initial_poses
 _CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
 _VIEWS, _POINTS = 20, 60  # enough for a start
 _GOLDEN = (np.sqrt(5) - 1) / 2
-INSIDE = 1 - 1e-6  # just inside the monotone range, where the curve can still be inverted
+_INSIDE = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
 
 
 def field_of_view(lens: Lens) -> float:
     """Return the incidence angle of the farthest image corner, rad, within the monotone range."""
     u = max(lens.cx + 0.5, lens.width - 0.5 - lens.cx) / lens.fx
     v = max(lens.cy + 0.5, lens.height - 0.5 - lens.cy) / lens.fy
-    corner = lens.image_height.angle(np.asarray(np.hypot(u, v)))
+    corner = float(lens.image_height.angle(np.asarray(np.hypot(u, v))))
+    return min(corner, monotone_limit(lens))
+
+
+def monotone_limit(lens: Lens) -> float:
+    """Return the angle, rad, just inside which both curves of the lens can be used."""
     limit = lens.image_height.limit
     if lens.viewpoint_shift is not None:
         limit = min(limit, lens.viewpoint_shift.limit)
-    return float(min(corner, limit * INSIDE))
+    return limit * _INSIDE
 
 
 def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
@@ -40,7 +45,7 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     """
     corner = np.hypot(lens.width, lens.height) / 2
     heights, _ = lens.image_height.value_and_slope(
-        np.minimum(_CORNER_ANGLES, lens.image_height.limit * INSIDE)
+        np.minimum(_CORNER_ANGLES, monotone_limit(lens))
     )
     focals = np.unique(corner / heights)
     lenses = [replace(lens, fx=focal, fy=focal) for focal in focals.tolist()]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.localization import MIN_POINTS
@@ -12,10 +13,13 @@ from fisheye_svp_ros.solve.localization import MIN_POINTS
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
 
 
-def posable_views(observations: Observations) -> tuple[Views, tuple[int, ...]]:
+def posable_views(
+    observations: Observations, model: ForwardModel | None = None
+) -> tuple[Views, tuple[int, ...]]:
     """Group one camera's table into views; return those that fix a pose, and the other frames.
 
-    A pose needs MIN_POINTS points that are not on one line.
+    A pose needs MIN_POINTS points that are not on one line, inside the field of view of the model
+    if one is given.
     Raises ObservationError for rows of several cameras, GeometryError where no frame is left.
     """
     cameras = np.unique(observations.camera)
@@ -25,15 +29,18 @@ def posable_views(observations: Observations) -> tuple[Views, tuple[int, ...]]:
             f'{observations.source}: it holds the cameras {names}; keep the rows of one of them'
         )
     views = group_views(observations)
-    used = views.used[..., None]
-    count = used.sum(axis=1, keepdims=True)
-    centred = np.where(used, views.points - (views.points * used).sum(1, keepdims=True) / count, 0)
-    extent = np.linalg.svd(centred, compute_uv=False)
-    posable = (count[:, 0, 0] >= MIN_POINTS) & (extent[:, 1] > _LINE * extent[:, 0])
+    usable = views.used if model is None else views.used & model.back_project(views.uv).valid
+    count = usable.sum(axis=1)
+    inside = usable[..., None]
+    centre = (views.points * inside).sum(axis=1) / np.maximum(count, 1)[:, None]
+    centred = np.where(inside, views.points - centre[:, None], 0.0)
+    extent = np.linalg.eigvalsh(np.swapaxes(centred, -1, -2) @ centred)
+    posable = (count >= MIN_POINTS) & (extent[:, 1] > _LINE**2 * extent[:, 2])
     if not posable.any():
+        where = '' if model is None else f', inside the field of view of lens {model.lens.name!r}'
         raise GeometryError(
             f'{observations.source}: no frame can be posed; each needs {MIN_POINTS} points that '
-            'are not on one line'
+            f'are not on one line{where}'
         )
     return views.take(posable), tuple(views.frame[~posable].tolist())
 
