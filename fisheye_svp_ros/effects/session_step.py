@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -14,9 +14,13 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 
 @dataclass(frozen=True)
 class SessionStepEffect(Effect):
-    """From one frame on, focal length and principal point are others."""
+    """From each of the given instants (or frames, where no time is known) on, other intrinsics.
 
-    first_frame: int = 0
+    Every step adds to the ones before it.
+    """
+
+    starts: tuple[float, ...] = ()
+    timed: bool = field(default=True, metadata={'key': False})
 
     name: ClassVar[str] = 'session_step'
     stage: ClassVar[str] = 'image'
@@ -30,22 +34,30 @@ class SessionStepEffect(Effect):
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        frames = np.unique(scene.views.frame)
-        if len(frames) < 6:
+        timed = bool(np.isfinite(scene.times).all())
+        instants = np.unique(scene.times if timed else scene.views.frame)
+        if len(instants) < 6:
             raise Untestable('fewer than six frames')
-        return [cls(int(frame)) for frame in frames[2:-1]]
+        return [cls((float(start),), timed) for start in instants[2:-1]]
+
+    def extended(self, start: float) -> SessionStepEffect:
+        """Return the effect with one more step."""
+        return replace(self, starts=(*self.starts, start))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return (
-            Parameter('relative', '1', 0.01),
-            Parameter('cx', 'px', 5.0),
-            Parameter('cy', 'px', 5.0),
+        return tuple(
+            Parameter(f'step{i + 1}.{name}', unit, large)
+            for i in range(len(self.starts))
+            for name, unit, large in (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
         )
 
     def columns(self, scene: Scene) -> Array:
         focal = np.array([scene.lens.fx, scene.lens.fy])
         growth = (scene.normalised() * focal)[..., None]
         shift = np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))
-        after = scene.views.frame >= self.first_frame
-        return np.concatenate([growth, shift], axis=-1) * after[:, None, None, None]
+        step = np.concatenate([growth, shift], axis=-1)
+        instant = scene.times if self.timed else scene.views.frame
+        after = (instant[:, None] >= np.array(self.starts)).astype(float)
+        columns = step[..., None, :] * after[:, None, None, :, None]
+        return np.asarray(columns.reshape(*scene.uv.shape, -1))
