@@ -29,7 +29,7 @@ from fisheye_svp_ros.solve.lens_start import (
     thinned,
 )
 from fisheye_svp_ros.solve.localization import Localization, localize
-from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px
+from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px, sigma_known
 
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
 _CANDIDATES = 4
@@ -41,13 +41,13 @@ class Calibration(NamedTuple):
     """A calibrated lens.
 
     adjusted: the lens with its `calibration` block and its views, covariances for the noise of
-    the data; sigma: noise of u and of v, px, estimated, NaN where the observations bring their
+    the data; sigma: noise of u and of v, px, estimated, None where the observations bring their
     own; views: the views used; left_out: frames that cannot be posed; beyond: how many
     observations lie past `max_incidence`, where the fitted curve turns back.
     """
 
     adjusted: Adjusted
-    sigma: float
+    sigma: float | None
     views: Views
     left_out: tuple[int, ...]
     beyond: int
@@ -80,8 +80,8 @@ def calibrate(
             f'determine {len(names)} lens parameters and the poses; add frames or points'
         )
     adjusted = _from_nothing(start, views, names)
-    sigma = float('nan')
-    if np.isnan(observations.sigma).any():
+    sigma = None
+    if not sigma_known(observations):
         sigma = noise_sigma(adjusted.cost.sum(), rows, unknowns)
         adjusted = adjusted._replace(
             covariance=adjusted.covariance * sigma**2,

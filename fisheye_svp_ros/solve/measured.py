@@ -1,6 +1,8 @@
-"""Measured views: which of them can be posed, how noisy they are, what is left of them."""
+"""Measured views: which of them can be posed, where they are, how noisy they are."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,9 +10,47 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.observations import Observations, Views, group_views
-from fisheye_svp_ros.solve.localization import MIN_POINTS
+from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
 
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
+
+
+class MeasuredPoses(NamedTuple):
+    """The views of a table that can be posed, and their poses.
+
+    result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
+    the residuals (NaN where they leave nothing for it), None where the observations bring their
+    own; left_out: frames whose points do not fix a pose.
+    """
+
+    views: Views
+    result: Localization
+    sigma: float | None
+    left_out: tuple[int, ...]
+
+
+def localize_measured(model: ForwardModel, observations: Observations) -> MeasuredPoses:
+    """Pose every frame of one camera's table that can be posed.
+
+    Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
+    """
+    views, left_out = posable_views(observations, model)
+    result = localize(model, views)
+    fixed = result.converged
+    if not fixed.all():
+        left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
+        views = views.take(fixed)
+        result = Localization(
+            result.pose.take(fixed), result.covariance[fixed], result.residual[fixed],
+            result.cost[fixed], result.converged[fixed], result.iterations[fixed],
+        )
+    if not len(views.frame):
+        raise GeometryError(f'{observations.source}: the points of no frame fix a pose')
+    sigma = None
+    if not sigma_known(observations):
+        sigma = noise_sigma(result.cost.sum(), 2 * int(views.used.sum()), 6 * len(views.frame))
+        result = result._replace(covariance=result.covariance * sigma**2)
+    return MeasuredPoses(views, result, sigma, left_out)
 
 
 def posable_views(
@@ -43,6 +83,11 @@ def posable_views(
             f'are not on one line{where}'
         )
     return views.take(posable), tuple(views.frame[~posable].tolist())
+
+
+def sigma_known(observations: Observations) -> bool:
+    """Say whether every row brings the noise it was measured with."""
+    return not np.isnan(observations.sigma).any()
 
 
 def noise_sigma(cost: float, rows: int, unknowns: int) -> float:

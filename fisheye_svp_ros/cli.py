@@ -1,0 +1,67 @@
+"""The command line: `fisheye-svp COMMAND ...`.
+
+A command is one module in `commands` with `add_arguments(parser)` and `run(args)`, and one line
+in COMMANDS.  Only the module of the command that is asked for is imported.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import NoReturn
+
+from fisheye_svp_ros.errors import FisheyeSvpError
+
+COMMANDS = {
+    'calibrate': 'a lens from measured observations: poses unknown, no start values',
+    'localize': 'a pose a frame, without start values: residuals, covariance',
+}
+_BAD_INPUT = 2
+_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+_BROKEN_PIPE = 141  # 128 + SIGPIPE
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(_BAD_INPUT, f'fisheye-svp: {message} (see {self.prog} --help)\n')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code: 2, after one line on stderr, for bad input."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    parser = _Parser(
+        prog='fisheye-svp',
+        description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
+        'simulation gets wrong about measured image points.',
+    )
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    for name, purpose in COMMANDS.items():
+        commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
+    named = next((word for word in arguments if not word.startswith('-')), '')
+    if named in COMMANDS:
+        module = import_module(f'fisheye_svp_ros.commands.{named}')
+        module.add_arguments(commands.choices[named])
+        commands.choices[named].set_defaults(run=module.run)
+    parsed = parser.parse_args(arguments)
+    try:
+        parsed.run(parsed)
+        sys.stdout.flush()
+    except FisheyeSvpError as error:
+        print(f'fisheye-svp: {error}', file=sys.stderr)
+        return _BAD_INPUT
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:
+        # Nobody reads on; give the interpreter's own last flush somewhere to go.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return _BROKEN_PIPE
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The commands of `fisheye-svp`, one module each: `add_arguments(parser)` and `run(args)`."""

@@ -1,0 +1,108 @@
+"""`fisheye-svp localize`: a pose a frame from the image points of known landmarks."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.effects.forward import ForwardModel
+    from fisheye_svp_ros.solve.measured import MeasuredPoses
+
+_SHOWN = 40  # frames in the table for people
+_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('observations', metavar='OBS',
+                        help='observations: a CSV file or a folder of ORPC files')
+    parser.add_argument('--lens', required=True, metavar='LENS',
+                        help='a lens file, or the name of one that comes with the package')
+    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+                        help='folder for localize.json, poses.csv, residuals.csv, covariance.csv')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Localize every frame, print the poses, write the results."""
+    from fisheye_svp_ros.commands.notes import note_left_out
+    from fisheye_svp_ros.effects.forward import ForwardModel
+    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.readers import read_observations
+    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.share import lens_path
+    from fisheye_svp_ros.solve.measured import localize_measured
+
+    model = ForwardModel(load_lens(lens_path(args.lens)))
+    observations = read_observations(args.observations)
+    with progress('localizing'):
+        measured = localize_measured(model, observations)
+    _print(measured, args.observations)
+    note_left_out(measured.left_out)
+    if args.output:
+        _write(args.output, model, measured)
+
+
+def _print(measured: MeasuredPoses, source: str) -> None:
+    import numpy as np
+
+    from fisheye_svp_ros.reporting.tables import noise_text, print_table
+    from fisheye_svp_ros.solve.measured import rms_px
+
+    views, result = measured.views, measured.result
+    worst = [
+        np.sqrt(np.linalg.eigvalsh(result.covariance[:, part, part])[:, -1])
+        for part in (slice(0, 3), slice(3, 6))
+    ]
+    rows = []
+    for i, frame in enumerate(views.frame[:_SHOWN]):
+        place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
+        rows.append((
+            str(frame), str(int(views.used[i].sum())), f'{rms_px(result.residual[i]):.4f}', *place,
+            f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
+        ))
+    header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm', 'and deg')
+    print_table(
+        f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
+        f'rms {rms_px(result.residual):.4f} px',
+        header, rows,
+    )
+    if len(views.frame) > _SHOWN:
+        print(f'  and {len(views.frame) - _SHOWN} more frames')
+    print(f'  {noise_text(measured.sigma)}, in the worst direction')
+
+
+def _write(folder: Path, model: ForwardModel, measured: MeasuredPoses) -> None:
+    import numpy as np
+
+    from fisheye_svp_ros.readers import write_poses
+    from fisheye_svp_ros.readers.table import write_table
+    from fisheye_svp_ros.reporting.results import write_json
+    from fisheye_svp_ros.solve.measured import rms_px
+
+    views, result = measured.views, measured.result
+    write_poses(folder / 'poses.csv', views.frame, result.pose)
+    used = views.used
+    frame = np.broadcast_to(views.frame[:, None], used.shape)
+    theta = model.linearise(result.pose, views).image.incidence.theta
+    distance = np.linalg.norm(views.points - result.pose.position[:, None], axis=-1)
+    write_table(folder / 'residuals.csv', {
+        'frame': frame[used], 'landmark': views.landmark[used],
+        'u': views.uv[used][:, 0], 'v': views.uv[used][:, 1],
+        'du': result.residual[used][:, 0], 'dv': result.residual[used][:, 1],
+        'theta': theta[used], 'range': distance[used],
+    })
+    names = [f'{a}_{b}' for a in _AXES for b in _AXES]
+    entries = result.covariance.reshape(-1, 36).T
+    write_table(
+        folder / 'covariance.csv',
+        {'frame': views.frame, **dict(zip(names, entries, strict=True))},
+    )
+    write_json(folder / 'localize.json', {
+        'rms_px': rms_px(result.residual),
+        'frames': len(views.frame),
+        'observations': int(used.sum()),
+        'left_out': measured.left_out,
+        'sigma_px': measured.sigma,
+    })

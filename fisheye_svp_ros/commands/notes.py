@@ -1,0 +1,21 @@
+"""What a command has to say beside its results, on standard error."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+_SHOWN = 10
+
+
+def say(note: str) -> None:
+    """Print a note."""
+    print(f'fisheye-svp: note: {note}', file=sys.stderr)
+
+
+def note_left_out(frames: Sequence[int]) -> None:
+    """Name the frames that could not be posed, if there are any."""
+    if frames:
+        names = ', '.join(map(str, frames[:_SHOWN]))
+        more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
+        say(f'left out, since their points do not fix a pose: frames {names}{more}')

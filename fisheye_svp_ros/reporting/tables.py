@@ -1,0 +1,47 @@
+"""Tables for people, on standard output."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterable, Sequence
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+_WIDE = 200  # columns where no terminal says how many it has
+
+
+def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table: the first column flush left, the others, numbers, flush right."""
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify='left')
+    for i, name in enumerate(header):
+        table.add_column(name, justify='right' if i else 'left', no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console().print(table)
+
+
+def console() -> Console:
+    """Return the console of standard output, wide enough for a table when it is a file."""
+    return Console(
+        width=None if sys.stdout.isatty() else _WIDE, highlight=False, markup=False, emoji=False
+    )
+
+
+def with_error(value: float, standard_error: float) -> tuple[str, str]:
+    """Return a value and its standard error as text, to two digits of the error."""
+    if not (math.isfinite(standard_error) and standard_error > 0):
+        return f'{value:.6g}', '-'
+    decimals = max(0, 1 - math.floor(math.log10(standard_error)))
+    if decimals > 9:
+        return f'{value:.6g}', f'{standard_error:.1e}'
+    return f'{value:.{decimals}f}', f'{standard_error:.{decimals}f}'
+
+
+def noise_text(sigma: float | None) -> str:
+    """Say what noise the standard errors rest on: sigma, px, estimated, or None if given."""
+    if sigma is None:
+        return 'standard errors for the sigma that the observations bring'
+    return f'standard errors for {sigma:.4f} px in u and in v, estimated from the residuals'
