@@ -10,10 +10,15 @@ import itertools
 import os
 import struct
 import time
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple
 from uuid import UUID
 
+from cyclonedds.builtin import (
+    BuiltinDataReader,
+    BuiltinTopicDcpsPublication,
+    BuiltinTopicDcpsSubscription,
+)
 from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct, make_idl_struct
@@ -34,6 +39,7 @@ from fisheye_svp_ros.standalone.qos import (
 )
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+_MANY = 100_000  # endpoints on a domain
 _HEADER = struct.Struct('<Qq')  # before requests and replies: client, sequence number
 _IDL = {'bool': bool, 'string': str}
 
@@ -123,6 +129,23 @@ class Participant:
         """Return a DDS topic that carries a ROS type."""
         return Topic(self.entity, name, _sample_class(typename, service=service))
 
+    def topics(self) -> dict[str, set[str]]:
+        """Return the types of every topic that somebody on the domain writes or reads, by name."""
+        found: dict[str, set[str]] = {}
+        for reader in self._endpoints:
+            for endpoint in reader.read(_MANY):
+                alive = endpoint.sample_info.instance_state == InstanceState.Alive
+                name, typename = endpoint.topic_name, endpoint.type_name
+                if alive and name.startswith('rt/'):
+                    plain = typename.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
+                    found.setdefault(name[2:], set()).add(plain)
+        return found
+
+    @cached_property
+    def _endpoints(self) -> list[BuiltinDataReader]:
+        builtin = (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+        return [BuiltinDataReader(self.entity, topic) for topic in builtin]
+
     def service_id(self) -> str:
         """Return a new user-data entry that ties the two halves of a service together."""
         identifier = self.guid.bytes[:12] + next(self._service_ids).to_bytes(4, 'big')
@@ -198,8 +221,13 @@ class Reader:
 
     def take(self) -> messages.Message | None:
         """Return the next message, or None."""
+        data = self.take_raw()
+        return messages.deserialize(data, self._class) if data else None
+
+    def take_raw(self) -> bytes | None:
+        """Return the next message as CDR with its encapsulation header, or None."""
         sample = self._take()
-        return messages.deserialize(sample.data, self._class) if sample else None
+        return sample.data if sample else None
 
     def take_call(self) -> tuple[Header, messages.Message] | None:
         """Return the next request or reply with its header, or None."""

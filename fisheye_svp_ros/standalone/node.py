@@ -118,15 +118,18 @@ class Subscription(Entity):
     """Calls a function with each message on a topic."""
 
     def __init__(
-        self, node: Node, callback: Callable[[Any], Any], reader: dds.Reader, topic: str
+        self, node: Node, callback: Callable[[Any], Any], reader: dds.Reader, topic: str, raw: bool
     ) -> None:
         super().__init__(node, callback)
         self.reader = reader
         self.topic_name = topic
+        self.raw = raw
 
     def execute(self) -> None:
         """Call the function with one message."""
-        message = self.reader.take() if self.reader else None
+        if self.reader is None:
+            return
+        message = self.reader.take_raw() if self.raw else self.reader.take()
         if message is not None:
             self.callback(message)
 
@@ -253,6 +256,10 @@ class Node(ParameterHolder):
         """Return the absolute name of a topic, after remapping."""
         return names.remap(self.__rules, topic, self.__name, self.__namespace)
 
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return every topic on the domain with its types."""
+        return sorted((n, sorted(t)) for n, t in self.context.participant.topics().items())
+
     def create_publisher(
         self, msg_type: type[Message], topic: str, qos_profile: QoSProfile | int
     ) -> Publisher:
@@ -271,11 +278,13 @@ class Node(ParameterHolder):
         topic: str,
         callback: Callable[[Any], Any],
         qos_profile: QoSProfile | int,
+        *,
+        raw: bool = False,
     ) -> Subscription:
-        """Have a function called with each message on a topic."""
+        """Have a function called with each message on a topic; raw: with its bytes as CDR."""
         name = self.resolve_topic_name(topic)
         reader = dds.Reader(self.context.participant, f'rt{name}', msg_type, profile(qos_profile))
-        subscription = Subscription(self, callback, reader, name)
+        subscription = Subscription(self, callback, reader, name, raw)
         self._subscriptions.append(subscription)
         self.__announce()
         return subscription
