@@ -62,6 +62,7 @@ class Observations:
         return Landmarks(ids, self.xyz[first])
 
 
+STEREO = ('left', 'right')
 _SHARED = ('cameras', 'source')
 
 
@@ -139,17 +140,53 @@ def group_views(observations: Observations, default_sigma: float = 1.0) -> Views
     shape = (len(groups), int(counts.max()))
     row = np.full(shape, -1, dtype=np.int64)
     row[view, slot] = np.arange(len(view))
+    return _views(observations, row, groups[:, 0], groups[:, 1], default_sigma)
+
+
+def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tuple[Views, Views]:
+    """Return the views of the cameras left and right with the same frames and the same slots.
+
+    Frame s and slot n mean the same frame and landmark in both; what one camera lacks is padding.
+    Raises ObservationError for a missing camera or a landmark that stands twice in a view.
+    """
+    missing = [name for name in STEREO if name not in observations.cameras]
+    if missing or not len(observations):
+        held = ', '.join(observations.cameras) if len(observations) else 'no observation'
+        raise ObservationError(
+            f'{observations.source}: the cameras left and right are needed; it holds {held}'
+        )
+    frames, frame = np.unique(observations.frame, return_inverse=True)
+    landmarks, slot = np.unique(observations.landmark, return_inverse=True)
+    pair = []
+    for camera in map(observations.cameras.index, STEREO):
+        mine = np.flatnonzero(observations.camera == camera)
+        row = np.full((len(frames), len(landmarks)), -1, dtype=np.int64)
+        row[frame[mine], slot[mine]] = mine
+        twice = mine[row[frame[mine], slot[mine]] != mine]
+        if twice.size:
+            raise ObservationError(
+                f'{observations.source}: landmark {observations.landmark[twice[0]]} stands twice '
+                f'in frame {observations.frame[twice[0]]} of one camera'
+            )
+        cameras = np.full(len(frames), camera)
+        pair.append(_views(observations, row, frames, cameras, default_sigma))
+    return pair[0], pair[1]
+
+
+def _views(
+    observations: Observations, row: Index, frame: Index, camera: Index, default_sigma: float
+) -> Views:
     used = row >= 0
     sigma = np.where(np.isnan(observations.sigma), default_sigma, observations.sigma)
     return Views(
-        points=np.where(used[..., None], observations.xyz[row], 0.0),
+        points=observations.xyz[row],  # padding repeats a landmark: no point at the camera
         uv=np.where(used[..., None], observations.uv[row], 0.0),
         weight=np.where(used, 1 / sigma[row], 0.0),
         landmark=np.where(used, observations.landmark[row], -1),
         board=np.where(used, observations.board[row], 0),
         t=np.where(used, observations.t[row], np.nan),
-        frame=groups[:, 0],
-        camera=groups[:, 1],
+        frame=frame,
+        camera=camera,
         row=row,
     )
 

@@ -9,10 +9,8 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import Observations, make_observations, views_of
+from fisheye_svp_ros.observations import STEREO, Observations, make_observations, views_of
 from fisheye_svp_ros.pose import Pose
-
-STEREO = ('left', 'right')
 
 
 def simulate(

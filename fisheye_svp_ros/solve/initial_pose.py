@@ -54,16 +54,19 @@ def _best(
 def _algebraic_rotations(local: Array, across: Array) -> Array:
     """Rotations (S, C, 3, 3) from the eigenvectors of the smallest misfit, one sign each way."""
     # Landmarks in their own principal axes: a flat target then lacks the third one exactly.
-    axes = nearest_rotation(np.linalg.svd(local, full_matrices=False)[2])
+    spread = np.linalg.eigh(np.swapaxes(local, -1, -2) @ local)[1]
+    axes = nearest_rotation(np.swapaxes(spread, -1, -2)[:, ::-1])
     own = local @ np.swapaxes(axes, -1, -2)
     flat = (np.abs(own[..., 2]).max(axis=1) < 1e-6)[:, None, None]
-    # Residual across (R X + t): design (S, N, 3, 9 + 3) for the columns of R, then t.
-    rotation_part = np.einsum('snij,snk->snikj', across, own).reshape(*own.shape[:2], 3, 9)
-    inner = np.einsum('snij,snik->sjk', across, across)
-    mixed = np.einsum('snij,snik->sjk', across, rotation_part)
-    solve_t = -np.linalg.pinv(inner) @ mixed
-    reduced = rotation_part + across @ solve_t[:, None]
-    omega = np.einsum('snij,snik->sjk', reduced, reduced)
+    # Misfit |across (R X + t)|^2 in the columns of R; across is a projection, its own square.
+    # Sums over the points of X (x) across and of X X^T (x) across, then t eliminated.
+    systems, count = own.shape[:2]
+    flat_across = across.reshape(systems, count, 9)
+    mixed = (np.swapaxes(own, -1, -2) @ flat_across).reshape(systems, 9, 3)
+    squares = (own[..., :, None] * own[..., None, :]).reshape(systems, count, 9)
+    omega = (np.swapaxes(squares, -1, -2) @ flat_across).reshape(systems, 3, 3, 3, 3)
+    omega = omega.transpose(0, 1, 3, 2, 4).reshape(systems, 9, 9)
+    omega -= mixed @ np.linalg.pinv(across.sum(axis=1)) @ np.swapaxes(mixed, -1, -2)
     omega_flat = omega.copy()
     omega_flat[:, 6:, :] = 0
     omega_flat[:, :, 6:] = 0

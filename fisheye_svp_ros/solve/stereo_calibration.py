@@ -1,0 +1,191 @@
+"""Stereo calibration: a rig and the poses of its views together, intrinsics known."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
+from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, normal_equations
+
+_MEAN_ROUNDS = 10
+
+
+class StereoCalibration(NamedTuple):
+    """Solved rigs of S systems with V views each.
+
+    rig (S,): left camera in the right one; pose (S, V): right camera in the world; their
+    covariances (S, 6, 6) and (S, V, 6, 6), m and rad, of the change in `Pose.retract`, NaN where
+    not converged; left_residual, right_residual (S, V, N, 2), px, measured minus predicted, NaN
+    for padding; cost (S,): whitened sum of squares; converged, iterations (S,).
+    """
+
+    rig: Pose
+    rig_covariance: Array
+    pose: Pose
+    pose_covariance: Array
+    left_residual: Array
+    right_residual: Array
+    cost: Array
+    converged: Mask
+    iterations: Index
+
+
+def calibrate_stereo(
+    left: ForwardModel,
+    right: ForwardModel,
+    left_views: Views,
+    right_views: Views,
+    systems: int = 1,
+) -> StereoCalibration:
+    """Return the maximum-likelihood rig; no start value is needed.
+
+    left_views, right_views: S * V views, system by system, of the same frames in the same order
+    (`observations.stereo_views`); points may be missing in either camera.  Kita, section 4, after
+    OpenCV's stereoCalibrate: the rig is shared, each view has a pose of its own.
+    Raises GeometryError, naming the frame, where a view has too few points in both cameras, and
+    where no view of a system can be posed in both.
+    """
+    pose, rig = _starts(left, right, left_views, right_views, systems)
+    problem = _Rigs((left, right), (left_views, right_views), systems)
+    solved = levenberg_marquardt(problem, (*pose, *rig))
+    pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
+    _, normal = problem.linearise(solved.state, np.arange(systems))
+    covariance = arrow_covariance(normal)
+    lost = ~solved.converged
+    covariance.shared[lost] = covariance.blocks[lost] = np.nan
+    return StereoCalibration(
+        rig, covariance.shared, pose, covariance.blocks,
+        _residual(left, _left_pose(pose, rig), left_views),
+        _residual(right, pose, right_views),
+        solved.cost, solved.converged, solved.iterations,
+    )
+
+
+class _Rigs:
+    """S systems of one rig and V poses each, see least_squares.Problem.
+
+    The state is (rotation, position) of the right camera (S, V) and of the rig (S,).
+    """
+
+    def __init__(
+        self, models: tuple[ForwardModel, ForwardModel], views: tuple[Views, Views], systems: int
+    ) -> None:
+        self._models = models
+        self._views = views
+        self._rows = np.arange(len(views[0].frame)).reshape(systems, -1)
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        right, rig = Pose(*state[:2]), Pose(*state[2:])
+        poses = (_left_pose(right, rig), right)
+        changes = (_left_change(right, rig), np.broadcast_to(np.eye(6, 12), (1, 1, 6, 12)))
+        shape = right.position.shape[:2]
+        cost, hessian = np.zeros(shape), np.zeros((*shape, 12, 12))
+        gradient = np.zeros((*shape, 12))
+        for model, views, pose, change in zip(
+            self._models, self._views, poses, changes, strict=True
+        ):
+            seen = views.take(self._rows[index].ravel())
+            linear = model.linearise(_flat(pose), seen)
+            own_cost, (own_hessian, own_gradient) = normal_equations(
+                linear.uv, linear.d_pose, seen
+            )
+            transposed = np.swapaxes(change, -1, -2)
+            cost += own_cost.reshape(shape)
+            hessian += transposed @ own_hessian.reshape(*shape, 6, 6) @ change
+            gradient += (transposed @ own_gradient.reshape(*shape, 6, 1))[..., 0]
+        return arrow_of_views(cost, hessian, gradient, block=6)
+
+    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+        return arrow_step(normal, damping)
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        return (*Pose(*state[:2]).retract(step[0]), *Pose(*state[2:]).retract(step[1]))
+
+
+def _left_pose(right: Pose, rig: Pose) -> Pose:
+    """Return the left cameras (S, V) in the world from right ones (S, V) and rigs (S,)."""
+    return right.compose(rig.take(np.s_[:, None]))
+
+
+def _left_change(right: Pose, rig: Pose) -> Array:
+    """Derivative (S, V, 6, 12) of the left camera's change by those of the right one and rig."""
+    change = np.zeros((*right.position.shape[:2], 6, 12))
+    change[..., range(6), range(6)] = 1.0
+    arm = (right.rotation @ rig.position[:, None, :, None])[..., 0]
+    change[..., :3, 3:6] = -cross_matrix(arm)
+    change[..., :3, 6:9] = change[..., 3:, 9:] = right.rotation
+    return change
+
+
+def _flat(pose: Pose) -> Pose:
+    return Pose(pose.rotation.reshape(-1, 3, 3), pose.position.reshape(-1, 3))
+
+
+def _residual(model: ForwardModel, pose: Pose, views: Views) -> Array:
+    predicted = model.linearise(_flat(pose), views).uv
+    residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
+    return residual.reshape(*pose.position.shape[:2], -1, 2)
+
+
+def _starts(
+    left: ForwardModel, right: ForwardModel, left_views: Views, right_views: Views, systems: int
+) -> tuple[Pose, Pose]:
+    """Return poses (S, V) of the right camera and rigs (S,) from views localized one by one."""
+    left_pose, left_posed = _posed(left, left_views)
+    right_pose, right_posed = _posed(right, right_views)
+    lost = np.flatnonzero(~(left_posed | right_posed))
+    if lost.size:
+        raise GeometryError(
+            f'frame {left_views.frame[lost[0]]} cannot be posed in either camera; each view needs '
+            f'{MIN_POINTS} points that are not on one line'
+        )
+    shape = (systems, -1)
+    both = (left_posed & right_posed).reshape(shape)
+    if not both.any(axis=1).all():
+        raise GeometryError(
+            f'no view can be posed in both cameras; one with {MIN_POINTS} points in each is needed'
+        )
+    rigs = right_pose.inverse().compose(left_pose)
+    rig = _robust_mean(_shaped(rigs, shape), both)
+    from_left = _shaped(left_pose, shape).compose(rig.inverse().take(np.s_[:, None]))
+    posed = right_posed.reshape(shape)[..., None]
+    own = _shaped(right_pose, shape)
+    return Pose(
+        np.where(posed[..., None], own.rotation, from_left.rotation),
+        np.where(posed, own.position, from_left.position),
+    ), rig
+
+
+def _shaped(pose: Pose, shape: tuple[int, int]) -> Pose:
+    return Pose(pose.rotation.reshape(*shape, 3, 3), pose.position.reshape(*shape, 3))
+
+
+def _posed(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
+    """Localize the views (S,) that have enough points; return also which of them have a pose."""
+    inside = model.back_project(views.uv).valid & (views.weight > 0)
+    posed: Mask = inside.sum(axis=1) >= MIN_POINTS
+    pose = identity(len(views.frame))
+    if posed.any():
+        solved = localize(model, views.take(posed))
+        pose.rotation[posed], pose.position[posed] = solved.pose
+        posed[posed] = solved.converged
+    return pose, posed
+
+
+def _robust_mean(poses: Pose, known: Mask) -> Pose:
+    """Return the geometric median (S,) of the known ones of poses (S, V) (Weiszfeld)."""
+    first = np.arange(len(known)), np.argmax(known, axis=1)
+    mean = poses.take(first)
+    for _ in range(_MEAN_ROUNDS):
+        off = poses.difference(mean.take(np.s_[:, None]))
+        weight = np.where(known, 1 / (np.linalg.norm(off, axis=-1) + 1e-9), 0.0)
+        mean = mean.retract(np.einsum('sv,svi->si', weight, off) / weight.sum(axis=1)[:, None])
+    return mean
