@@ -101,6 +101,23 @@ rclpy.spin(node)
     assert node.lines[-1] == 'ZeroDivisionError: division by zero'
 
 
+@pytest.mark.parametrize(
+    ('name', 'value', 'message'),
+    [
+        ('ROS_DOMAIN_ID', '233', 'not a number from 0 to 232'),
+        ('ROS_DOMAIN_ID', 'x', 'not a number from 0 to 232'),
+        ('ROS_AUTOMATIC_DISCOVERY_RANGE', 'OFF', 'use LOCALHOST or SUBNET'),
+        ('CYCLONEDDS_URI', '<Nonsense/>', 'cannot join ROS domain'),
+    ],
+)
+def test_a_faulty_environment_is_named(
+    run_node: Callable[..., NodeProcess], name: str, value: str, message: str
+) -> None:
+    node = run_node(f'import os, rclpy\nos.environ[{name!r}] = {value!r}\nrclpy.init()')
+    assert node.finish() == 1
+    assert message in node.lines[-1]
+
+
 def test_spin_once_times_out(run_node: Callable[..., NodeProcess]) -> None:
     node = run_node("""
 import time

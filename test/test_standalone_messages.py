@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import copy
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,14 @@ def test_every_kind_of_field_survives_the_wire() -> None:
 def test_values_that_do_not_fit_are_refused(name: str, field: str, value: object) -> None:
     with pytest.raises(FieldValueError, match=rf'{name}\.{field}'):
         _class(name)(**{field: value})
+
+
+def test_copies_are_independent() -> None:
+    pose = _class('geometry_msgs/msg/PoseStamped')()
+    other = copy.deepcopy(pose)
+    other.header.frame_id = 'map'
+    assert pose.header.frame_id == ''
+    assert other != pose
 
 
 def test_unknown_names_are_refused() -> None:

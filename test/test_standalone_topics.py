@@ -99,6 +99,23 @@ def test_large_point_cloud_arrives_unchanged(run_node: Callable[..., NodeProcess
     assert run_node(RECEIVE_CLOUD, 'late').wait_for('received')
 
 
+def test_topics_are_discovered_and_recorded_as_cdr(run_node: Callable[..., NodeProcess]) -> None:
+    run_node(_LATCH, 'talker').wait_for('published')
+    recorder = run_node(_HEAD + """
+node.create_subscription(String, 'chatter', lambda data: print('raw', type(data), data.hex(),
+                                                               flush=True), latched, raw=True)
+while '/chatter' not in (topics := dict(node.get_topic_names_and_types())):
+    rclpy.spin_once(node, timeout_sec=0.05)
+print('topics', topics['/chatter'], topics['/rosout'], flush=True)
+rclpy.spin(node)
+""", 'recorder')  # fmt: skip
+    raw = [recorder.wait_for("raw <class 'bytes'> (.*)|topics (.*)") for _ in range(4)]
+    (topics,) = (match[2] for match in raw if match[2])
+    assert topics == "['std_msgs/msg/String'] ['rcl_interfaces/msg/Log']"
+    first = next(match[1] for match in raw if match[1])
+    assert bytes.fromhex(first)[:10] == b'\0\1\0\0' + b'\2\0\0\0' + b'c\0'
+
+
 def test_incompatible_qos_does_not_connect(run_node: Callable[..., NodeProcess]) -> None:
     talker = run_node(_HEAD + """
 publisher = node.create_publisher(String, 'chatter', 10)

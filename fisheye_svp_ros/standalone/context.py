@@ -13,6 +13,7 @@ from fisheye_svp_ros.standalone import arguments, dds, logging
 from fisheye_svp_ros.standalone.exceptions import NotInitializedException, RCLError
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_LAST_DOMAIN = 232  # the ports of higher ones do not exist
 
 
 class Context:
@@ -33,9 +34,10 @@ class Context:
         self.arguments = arguments.parse(sys.argv if args is None else args)
         for name, level in self.arguments.log_levels.items():
             logging.set_logger_level(name, level)
-        if domain_id is None:
-            domain_id = int(os.getenv('ROS_DOMAIN_ID') or 0)
-        participant = dds.Participant(domain_id)
+        given = os.getenv('ROS_DOMAIN_ID') or '0' if domain_id is None else str(domain_id)
+        if not given.isdecimal() or int(given) > _LAST_DOMAIN:
+            raise RCLError(f'ROS_DOMAIN_ID={given} is not a number from 0 to {_LAST_DOMAIN}')
+        participant = dds.Participant(int(given))
         self._wire = participant, dds.Graph(participant)
         self._running = True
         if threading.current_thread() is threading.main_thread():

@@ -19,7 +19,15 @@ from cyclonedds.builtin import (
     BuiltinTopicDcpsPublication,
     BuiltinTopicDcpsSubscription,
 )
-from cyclonedds.core import InstanceState, Policy, Qos, ReadCondition, SampleState, ViewState
+from cyclonedds.core import (
+    DDSException,
+    InstanceState,
+    Policy,
+    Qos,
+    ReadCondition,
+    SampleState,
+    ViewState,
+)
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import IdlStruct, make_idl_struct
 from cyclonedds.idl import types as idl
@@ -30,7 +38,7 @@ from cyclonedds.util import duration
 from rosbags.interfaces import Nodetype
 
 from fisheye_svp_ros.standalone import messages
-from fisheye_svp_ros.standalone.exceptions import NotSupportedError
+from fisheye_svp_ros.standalone.exceptions import NotSupportedError, RCLError
 from fisheye_svp_ros.standalone.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -120,8 +128,12 @@ class Participant:
     """One process on a domain, with everything that its nodes write and read."""
 
     def __init__(self, domain_id: int) -> None:
-        self._domain = Domain(domain_id, _configuration())
-        self.entity = DomainParticipant(domain_id, Qos(Policy.Userdata(b'enclave=/;')))
+        try:
+            self._domain = Domain(domain_id, _configuration())
+            self.entity = DomainParticipant(domain_id, Qos(Policy.Userdata(b'enclave=/;')))
+        except DDSException as error:
+            hint = 'too many processes on it, or a faulty CYCLONEDDS_URI?'
+            raise RCLError(f'cannot join ROS domain {domain_id}: {hint}') from error
         self.guid: UUID = self.entity.guid
         self._service_ids = itertools.count(1)
 

@@ -149,8 +149,10 @@ def message_class(typename: str) -> type[Message]:
     namespace: dict[str, object] = {
         name: bytes([value]) if kind == 'byte' else value for name, kind, value in constants
     }
-    namespace |= {'__slots__': tuple(fields), 'TYPENAME': typename, 'FIELDS': fields}
-    cls: type[Message] = type(typename.rsplit('/', 1)[1], (Message,), namespace)
+    package, kind, cls_name = typename.split('/')
+    namespace |= {'__slots__': tuple(fields), '__module__': f'{package}.{kind}'}
+    namespace |= {'TYPENAME': typename, 'FIELDS': fields}
+    cls: type[Message] = type(cls_name, (Message,), namespace)
     # rosbags calls what it finds here with the values it read, in the order of the fields.
     _store().types[typename] = cls.from_wire
     return cls
