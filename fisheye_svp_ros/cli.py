@@ -18,6 +18,8 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 COMMANDS = {
     'calibrate': 'a lens from measured observations: poses unknown, no start values',
     'localize': 'a pose a frame, without start values: residuals, covariance',
+    'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
+    'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
 }
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it

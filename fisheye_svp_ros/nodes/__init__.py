@@ -1,1 +1,10 @@
-"""The ROS 2 nodes: parameters and messages in, one call into the core, messages out."""
+"""The nodes: parameters and messages in, one call into the core, messages out."""
+
+NODES = (
+    'synthetic_camera',
+    'measured_camera',
+    'localizer',
+    'stereo_calibrator',
+    'stereo_depth',
+    'model_critic',
+)

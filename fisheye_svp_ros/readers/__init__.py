@@ -37,6 +37,8 @@ READERS = (
     Reader('a .csv file', lambda path: path.suffix == '.csv', 'observations_csv'),
     Reader('an .orpc file', lambda path: path.suffix == '.orpc', 'orpc'),
     Reader('a folder of .orpc files', _holds('*.orpc'), 'orpc'),
+    Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap', 'bag'),
+    Reader('a folder of one', _holds('*.mcap'), 'bag'),
 )
 
 

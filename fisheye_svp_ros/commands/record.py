@@ -1,0 +1,53 @@
+"""`fisheye-svp record`: topics of the node graph to a rosbag2 recording (MCAP)."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+# What the nodes tell, and what they were told; markers and diagnostics are left out.
+TOPICS = (
+    r'.*/(scenario|landmarks|camera_info|image_points|true_pose|pose|position_error'
+    r'|rotation_error|residuals|points|rig|metrics/[^/]+|result)'
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('-o', '--output', type=Path, required=True, metavar='BAG',
+                        help='folder to make; it must not exist')
+    parser.add_argument('--topics', type=_pattern, default=TOPICS, metavar='REGEX',
+                        help='full names of the topics; by default all that the nodes publish, '
+                        'but for markers and diagnostics')
+    parser.add_argument('arguments', nargs=argparse.REMAINDER, metavar='--ros-args ...',
+                        help='as for `ros2 run`')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Record until interrupted."""
+    from fisheye_svp_ros.bags import BagWriter
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.run import supply_rclpy
+
+    supply_rclpy()
+    import rclpy
+
+    from fisheye_svp_ros.nodes.recorder import Recorder
+
+    rclpy.init(args=args.arguments)
+    try:
+        with BagWriter(args.output) as bag:
+            recorder = Recorder(bag, args.topics)
+            recorder.spin()
+            recorder.destroy_node()
+        say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
+    finally:
+        rclpy.try_shutdown()
+
+
+def _pattern(text: str) -> re.Pattern[str]:
+    try:
+        return re.compile(text)
+    except re.error as cause:
+        raise argparse.ArgumentTypeError(f'{text!r} is no regular expression: {cause}') from cause

@@ -1,0 +1,172 @@
+"""What the solving nodes share: one set of inputs by stamp in, one result by stamp out."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, ClassVar
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64
+
+from fisheye_svp_ros import messages
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.messages import ImagePoints, LandmarkSet
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode, Settings
+from fisheye_svp_ros.nodes.join import StampJoin
+from fisheye_svp_ros.observations import Views, views_of
+from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.scenario import true_lens
+
+Items = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class SolverSettings(Settings):
+    """Parameters of every node that solves."""
+
+    lens: str = parameter(
+        '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
+        '`scenario` names'
+    )
+    svp: bool = parameter(True, 'Solve with the single-viewpoint approximation of the lens')
+    sigma_px: float = parameter(
+        1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
+    )
+    patience: float = parameter(
+        2.0, 'How long image points wait for what shares their stamp on other topics', 's',
+        (0.0, 3600.0)
+    )
+
+
+class SolverNode(BaseNode):
+    """Joins landmarks, image points, true poses and scenario by stamp; `solve` does the rest.
+
+    CAMERAS: the namespaces of the cameras, each with its slash; METRICS: all names in results.
+    """
+
+    CAMERAS: ClassVar[tuple[str, ...]] = ('',)
+    METRICS: ClassVar[tuple[str, ...]]
+    settings: SolverSettings
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._result = self.announce(DiagnosticArray, '~/result', wait=True)
+        self._metrics = {
+            name: self.announce(Float64, f'~/metrics/{name}', wait=True) for name in self.METRICS
+        }
+        points = [f'{camera}image_points' for camera in self.CAMERAS]
+        poses = [f'{camera}true_pose' for camera in self.CAMERAS]
+        self._join = StampJoin(points, [*poses, 'landmarks', 'scenario'])
+        self._standing: LandmarkSet | None = None
+        self.listen(
+            PointCloud2, 'landmarks', messages.read_landmarks, self._hear_landmarks, LATCHED_INPUT
+        )
+        self._collect(DiagnosticArray, 'scenario', messages.read_key_values)
+        for topic in poses:
+            self._collect(PoseStamped, topic, messages.read_pose)
+        # Last, because a camera that sees this subscription counts on the others.
+        for topic in points:
+            self._collect(PointCloud2, topic, messages.read_image_points)
+        self.create_timer(0.1, self._work)
+
+    @abstractmethod
+    def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
+        """Solve one set and publish what comes out; items by topic."""
+
+    def model(self, items: Items) -> ForwardModel:
+        """Return the lens to solve with; raise ParameterError where nobody names one."""
+        return model_of(*self._lens(items), self.settings.svp)
+
+    def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
+        """Return image points as one view; raise ObservationError for an unknown landmark."""
+        points, known = landmarks.landmarks.lookup(seen.landmark)
+        if not known.all():
+            raise ObservationError(
+                f'image_points: landmark {seen.landmark[~known][0]} is not among the landmarks'
+            )
+        weight = np.full((1, len(known)), 1 / self.settings.sigma_px)
+        views = views_of(points, seen.uv[None], weight)
+        time_s = np.full_like(weight, stamp * 1e-9)
+        return views._replace(landmark=seen.landmark[None], t=time_s, frame=np.array([stamp]))
+
+    def publish_result(
+        self, stamp: int, metrics: Mapping[str, float], text: str = '', warn: bool = False
+    ) -> None:
+        """Publish the metrics of one set, together and one by one."""
+        name = self.get_fully_qualified_name()
+        for key, value in metrics.items():
+            self._metrics[key].publish(messages.number_message(value))
+        self._result.publish(messages.key_values_message(name, metrics, stamp, text, warn))
+
+    def _lens(self, items: Items) -> tuple[str, float]:
+        if self.settings.lens:
+            return self.settings.lens, 1.0
+        scenario = items.get('scenario', {})
+        if 'lens' not in scenario:
+            raise ParameterError('no scenario names a lens; set the parameter lens')
+        return scenario['lens'], float(scenario.get('shift_scale', 1.0))
+
+    def _collect(self, kind: Any, topic: str, read: Any) -> None:
+        def use(stamp: int, item: Any) -> None:
+            self._join.add(topic, stamp, item, time.monotonic())
+            self._work()
+
+        self.listen(kind, topic, read, use)
+
+    def _hear_landmarks(self, stamp: int, landmarks: LandmarkSet) -> None:
+        if stamp:
+            self._join.add('landmarks', stamp, landmarks, time.monotonic())
+        else:
+            self._standing = landmarks
+            self._join.expect_no_more('landmarks')
+        self._work()
+
+    def _work(self) -> None:
+        if not self.has_listeners():
+            return
+        now, patience = time.monotonic(), self.settings.patience
+        for stamp, items in self._join.ready(now, patience):
+            self._attempt(stamp, items)
+        for _, items in self._join.given_up(now, patience):
+            self._give_up(items)
+
+    def _attempt(self, stamp: int, items: Items) -> None:
+        topic = f'{self.CAMERAS[0]}image_points'
+        own: LandmarkSet | None = items.get('landmarks')
+        if own is not None:
+            # Landmarks come set by set: those of another set must never stand in.
+            self._standing = None
+        landmarks = own or self._standing
+        try:
+            if landmarks is None:
+                raise ObservationError(f'{topic}: no landmarks; publish them on `landmarks`')
+            self.solve(stamp, landmarks, items)
+        except FisheyeSvpError as error:
+            self.drop(topic, error)
+            self.publish_result(stamp, {}, str(error), warn=True)
+
+    def _give_up(self, items: Items) -> None:
+        if 'landmarks' in items:
+            # No image points claimed them: they were published once and hold until the next.
+            self._standing = items['landmarks']
+        for topic in (f'{camera}image_points' for camera in self.CAMERAS):
+            if topic in items:
+                self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
+
+
+@lru_cache(maxsize=64)
+def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
+    """Return the forward model of a lens given by file or name.
+
+    Raises LensError where there is none.
+    """
+    loaded = true_lens(lens, shift_scale)
+    return ForwardModel(loaded.svp() if svp else loaded)
