@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.solve.least_squares import levenberg_marquardt, solve_damped
+from fisheye_svp_ros.solve.least_squares import dense_step, levenberg_marquardt, solve_damped
 
 # NIST StRD, Misra1a (lower difficulty): y = b1 (1 - exp(-b2 x)), certified values.
 MISRA_X = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8,
@@ -31,8 +31,7 @@ class Curves:
         return np.where(outside, np.inf, cost), (hessian, gradient)
 
     def step(self, normal, damping):
-        step = solve_damped(*normal, damping)
-        return (step,), np.einsum('si,sij,sj->s', step, normal[0], step)
+        return dense_step(normal, damping)
 
     def retract(self, state, step):
         return (state[0] + step[0],)
@@ -116,3 +115,20 @@ def test_a_parameter_nothing_depends_on_stays():
     hessian = np.array([[[4.0, 0.0], [0.0, 0.0]]])
     step = solve_damped(hessian, np.array([[2.0, 0.0]]), np.zeros(1))
     np.testing.assert_allclose(step, [[-0.5, 0.0]])
+
+
+def test_rounded_residuals_do_not_stop_the_iteration():
+    """Nearest points of a circle: small residuals as differences of large, rounded numbers."""
+    rng = np.random.default_rng(42)
+    angle = rng.uniform(0, 2 * np.pi, 400)
+    target = 600 + (100 + rng.normal(size=(400, 1)) * 0.01) * np.stack(
+        [np.cos(angle), np.sin(angle)], axis=-1)
+
+    def circle(a, index):
+        c, s = np.cos(a[:, 0]), np.sin(a[:, 0])
+        residual = 600 + 100 * np.stack([c, s], axis=-1) - target[index]
+        return residual, 100 * np.stack([-s, c], axis=-1)[..., None]
+
+    solved = levenberg_marquardt(Curves(circle), ((angle + 0.2)[:, None],))
+    assert solved.converged.all()
+    np.testing.assert_allclose(solved.state[0][:, 0], angle, rtol=0, atol=1e-13)

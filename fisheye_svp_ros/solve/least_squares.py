@@ -14,6 +14,8 @@ MAX_ITERATIONS = 60
 # A step that would move the whitened residuals by less than this (their 2-norm) is the last one.
 STEP_TOLERANCE = 1e-9
 _ROUNDING = 1e-13
+# Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
+_NOISE = 1e-11
 _STUCK = 1e12
 
 
@@ -66,7 +68,7 @@ def levenberg_marquardt(
         trial = problem.retract(_take(state, active), step)
         cost, fresh = problem.linearise(trial, active)
         before = total[active]
-        better = cost <= before * (1 + _ROUNDING)
+        better = cost <= before * (1 + _ROUNDING) + _NOISE * np.sqrt(before)
         done = (moved <= STEP_TOLERANCE**2 + _ROUNDING * before) & (damping[active] < 1)
         accepted = active[better]
         for array, new in zip(state, trial, strict=True):
@@ -97,6 +99,13 @@ def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
     scaled[..., size, size] = (1 + 1e-15 + damping)[..., None]
     step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
     return step
+
+
+def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+    """`Problem.step` for normal equations (H (A, P, P), g (A, P)) without structure."""
+    hessian, gradient = normal
+    step = solve_damped(hessian, gradient, damping)
+    return (step,), np.einsum('si,sij,sj->s', step, hessian, step)
 
 
 def _adjusted(damping: Array, growth: Array, better: Mask, ratio: Array) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt, solve_damped
+from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
 
 MIN_POINTS = 4
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
@@ -107,9 +107,7 @@ class _Localization:
         return normal_equations(linear.uv, linear.d_pose, views)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        hessian, gradient = normal
-        step = solve_damped(hessian, gradient, damping)
-        return (step,), np.einsum('si,sij,sj->s', step, hessian, step)
+        return dense_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return tuple(Pose(*state).retract(step[0]))
