@@ -1,8 +1,10 @@
-"""What both cameras share: the topics of one camera, and the scenario that tags each set."""
+"""What both cameras share: their topics, and the pace at which they step through their sets."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,26 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode
+from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Finished, Settings
 from fisheye_svp_ros.observations import Observations
+from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
 
 WORLD = 'world'
+
+
+@dataclass(frozen=True)
+class CameraSettings(Settings):
+    """Parameters of every camera."""
+
+    rate: float = parameter(10.0, 'Sets a second', 'Hz', (1e-3, 1e4))
+    repeat: bool = parameter(True, 'Start over after the last set; otherwise the node ends')
+    lock_step: str = parameter(
+        '', 'Result topics, separated by blanks: each set waits until all of them have answered '
+        'the one before; then `rate` does not count. Empty: do not wait'
+    )
 
 
 class CameraTopics:
@@ -44,14 +60,35 @@ class CameraTopics:
 
 
 class CameraNode(BaseNode):
-    """A node that publishes landmarks, scenarios and what one or two cameras see."""
+    """Publishes sets one after the other, at a rate or in lock-step with those who answer."""
+
+    settings: CameraSettings
 
     def __init__(self) -> None:
         super().__init__()
         self._landmarks = self.announce(PointCloud2, 'landmarks', LATCHED)
         self._scenario = self.announce(DiagnosticArray, 'scenario')
         self._cameras: dict[str, CameraTopics] = {}
-        self._last_stamp = 0
+        self._timer: Any = None
+        self._steps: Iterator[Any] = iter(())
+        self._answering: set[str] = set()
+        self._unanswered: set[str] = set()
+        self._stamp = 0
+
+    @abstractmethod
+    def publish_set(self, step: Any) -> int:
+        """Publish one set and return its stamp, ns."""
+
+    def play(self, steps: Iterator[Any]) -> None:
+        """Start stepping through other sets."""
+        self._steps = steps
+        self._unanswered.clear()
+        for topic in self.settings.lock_step.split():
+            if topic not in self._answering:
+                self._hear_answers_on(topic)
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
+        self._timer = self.create_timer(1 / self.settings.rate, self._tick)
 
     def camera(self, name: str) -> CameraTopics:
         """Return the topics of a camera."""
@@ -63,14 +100,39 @@ class CameraNode(BaseNode):
         """Say which scenario the set of a stamp belongs to."""
         self._scenario.publish(messages.key_values_message('scenario', values, stamp, text))
 
-    def publish_landmarks(self, landmarks: Any, stamp: int) -> None:
+    def publish_landmarks(self, landmarks: Landmarks, stamp: int) -> None:
         """Publish landmarks; stamp 0: they hold for every set."""
         self._landmarks.publish(messages.landmarks_message(landmarks, stamp, WORLD))
 
     def new_stamp(self) -> int:
         """Return the time, ns, never the same twice."""
-        self._last_stamp = max(self.get_clock().now().nanoseconds, self._last_stamp + 1)
-        return self._last_stamp
+        return int(max(self.get_clock().now().nanoseconds, self._stamp + 1))
+
+    def _hear_answers_on(self, topic: str) -> None:
+        def use(stamp: int, _: Any) -> None:
+            if stamp == self._stamp and topic in self._unanswered:
+                self._unanswered.discard(topic)
+                if not self._unanswered:
+                    self._advance()
+
+        self._answering.add(topic)
+        self.listen(DiagnosticArray, topic, messages.read_key_values, use)
+
+    def _tick(self) -> None:
+        if self._unanswered:
+            waiting = ' '.join(sorted(self._unanswered))
+            self.get_logger().info(
+                f'waiting for {waiting}', throttle_duration_sec=5.0, skip_first=True
+            )
+        elif self.has_listeners():
+            self._advance()
+
+    def _advance(self) -> None:
+        step = next(self._steps, None)
+        if step is None:
+            raise Finished('all sets are published')
+        self._unanswered = set(self.settings.lock_step.split())
+        self._stamp = self.publish_set(step)
 
 
 def rows_by_frame(observations: Observations) -> dict[tuple[int, str], Index]:

@@ -94,7 +94,7 @@ class SolverNode(BaseNode):
             )
         weight = np.full((1, len(known)), 1 / self.settings.sigma_px)
         views = views_of(points, seen.uv[None], weight)
-        time_s = np.full_like(weight, stamp * 1e-9)
+        time_s = np.full_like(weight, stamp / 1e9)
         return views._replace(landmark=seen.landmark[None], t=time_s, frame=np.array([stamp]))
 
     def publish_result(

@@ -8,18 +8,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterDescriptor
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.nodes.base import LATCHED, Finished, Settings, run
-from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, rows_by_frame
+from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, CameraSettings, rows_by_frame
 from fisheye_svp_ros.nodes.shapes import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.observations import Observations
 from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
-from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, parameter, rows, sweep_of
+from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, rows, sweep_of
 from fisheye_svp_ros.scenario import Scenario, Simulation, camera_names, simulate_scenario
 
 # Sweeping one of these may name a file that cannot be read: found out before anything runs.
@@ -27,17 +26,8 @@ _READ_FILES = ('lens', 'environment', 'poses_file')
 
 
 @dataclass(frozen=True)
-class SyntheticCameraSettings(Settings, Scenario):
+class SyntheticCameraSettings(CameraSettings, Scenario):
     """Parameters of the synthetic camera."""
-
-    rate: float = parameter(10.0, 'Sets a second', 'Hz', (1e-3, 1e4))
-    repeat: bool = parameter(
-        True, 'Start over after the last set, with new noise; otherwise the node ends'
-    )
-    lock_step: str = parameter(
-        '', 'Result topics, separated by blanks: each set waits until all of them have answered '
-        'the one before, as fast as they can, and `rate` does not count; empty: do not wait'
-    )
 
 
 class Step(NamedTuple):
@@ -56,11 +46,10 @@ class Step(NamedTuple):
 
 
 class SyntheticCamera(CameraNode):
-    """Publishes simulated sets at a rate, or in lock-step with those who answer."""
+    """Publishes the simulated sets of every scenario of its sweep."""
 
     NAME = 'synthetic_camera'
     SETTINGS = SyntheticCameraSettings
-    settings: SyntheticCameraSettings
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,10 +58,6 @@ class SyntheticCamera(CameraNode):
         for name, values in self._sweep.lists.items():
             self.declare_parameter(SWEEP + name, values, ParameterDescriptor(read_only=True))
         self._markers = self.announce(MarkerArray, 'markers', LATCHED)
-        self._timer: Any = None
-        self._answering: set[str] = set()
-        self._unanswered: set[str] = set()
-        self._steps: Iterator[Step] = iter(())
         self.start()
 
     def prepare(self, settings: SyntheticCameraSettings) -> SyntheticCameraSettings:
@@ -80,8 +65,7 @@ class SyntheticCamera(CameraNode):
         for name in _READ_FILES:
             for value in self._sweep.lists.get(name, ()):
                 simulate_scenario(changed(settings, {name: value}))
-        first = next(iter(self._sweep))
-        simulate_scenario(changed(settings, first))
+        simulate_scenario(changed(settings, next(iter(self._sweep))))
         return settings
 
     def configure(self, settings: SyntheticCameraSettings) -> None:
@@ -89,63 +73,34 @@ class SyntheticCamera(CameraNode):
         for style in self._sweep.lists.get('style', (settings.style,)):
             for name in camera_names(style):
                 self.camera(name)
-        self._steps = steps(settings, self._sweep)
-        self._unanswered.clear()
-        for topic in settings.lock_step.split():
-            if topic not in self._answering:
-                self._hear_answers_on(topic)
-        if self._timer is not None:
-            self.destroy_timer(self._timer)
-        self._timer = self.create_timer(1 / settings.rate, self._tick)
+        self.play(steps(settings, self._sweep))
 
-    def _hear_answers_on(self, topic: str) -> None:
-        def use(stamp: int, _: Any) -> None:
-            if stamp == self._last_stamp and topic in self._unanswered:
-                self._unanswered.discard(topic)
-                if not self._unanswered:
-                    self._advance()
-
-        self._answering.add(topic)
-        self.listen(DiagnosticArray, topic, messages.read_key_values, use)
-
-    def _tick(self) -> None:
-        if self._unanswered:
-            waiting = ' '.join(sorted(self._unanswered))
-            self.get_logger().info(f'waiting for {waiting}', throttle_duration_sec=5.0,
-                                   skip_first=True)
-        elif self.has_listeners():
-            self._advance()
-
-    def _advance(self) -> None:
-        step = next(self._steps, None)
-        if step is None:
-            raise Finished('all sets are published')
-        self._unanswered = set(self.settings.lock_step.split())
-        self._publish(step)
-
-    def _publish(self, step: Step) -> None:
+    def publish_set(self, step: Step) -> int:
+        """Publish a set under the present time."""
         stamp = self.new_stamp()
-        simulation, swept = step.simulation, step.swept
+        simulation = step.simulation
         place = {'scenario': step.number, 'scenarios': len(self._sweep),
                  'set': step.frame, 'sets': len(simulation.poses[0].position)}
-        text = ', '.join(f'{name} {value}' for name, value in swept.items())
+        text = ', '.join(f'{name} {value}' for name, value in step.swept.items())
         self.tag(stamp, {**place, **scalars(step.scenario)}, text)
         self.publish_landmarks(simulation.landmarks, stamp)
         for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):
             self.camera(name).publish(stamp, seen, poses.take(step.frame), step.svp_lens)
         if self._markers.get_subscription_count():
             self._markers.publish(messages.markers_message(_shapes(step), stamp, WORLD))
+        return stamp
 
 
 def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
     """Yield all sets of all scenarios, over and over where the settings say so."""
+    nothing = np.array([], dtype=np.int64)
     for repetition in itertools.count():
         for number, swept in enumerate(sweep):
             scenario = changed(settings, swept)
             simulation = simulate_scenario(scenario, repetition)
             svp_lens = kannala_brandt_equivalent(simulation.lens)
             table = simulation.observations
-            rows_of, nothing = rows_by_frame(table), np.array([], dtype=np.int64)
+            rows_of = rows_by_frame(table)
             for frame in range(len(simulation.poses[0].position)):
                 seen = {
                     camera: table.take(rows_of.get((frame, camera), nothing))

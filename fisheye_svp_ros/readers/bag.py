@@ -27,7 +27,7 @@ class _Set(NamedTuple):
 def read(path: str | Path) -> Observations:
     """Read a recording; a frame is a stamp, a camera the namespace of its image points.
 
-    t is counted from the first frame, s.  Raises BagError for a recording that cannot be read and
+    t is the stamp, s.  Raises BagError for a recording that cannot be read and
     ObservationError, naming the topic, where it does not hold one world's observations.
     """
     bag = Bag(path)
@@ -71,7 +71,7 @@ def _table(
         np.concatenate(uv),
         np.concatenate([_places(one, landmarks, source) for one in sets]),
         camera=np.repeat(names, counts),
-        t=np.repeat([(one.stamp - stamps[0]) * 1e-9 for one in sets], counts),
+        t=np.repeat([one.stamp / 1e9 for one in sets], counts),
         cameras=cameras,
         source=source,
     )
