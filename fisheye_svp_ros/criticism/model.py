@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
 from fisheye_svp_ros.lens import INTRINSICS, Lens
 from fisheye_svp_ros.observations import Observations, Views, group_views
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
-from fisheye_svp_ros.solve.arrow import arrow_of_views, arrow_step
+from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import localize
 
@@ -94,15 +94,8 @@ def start(data: Data, lens: Lens) -> State:
     Raises GeometryError, naming the frame, where a view has too few points.
     """
     model = ForwardModel(lens)
-    terms = model.terms
     solved = localize(model, data.views).pose
-    first = data.camera_of == 0
-    pose = identity(data.frames)
-    pose.rotation[data.frame_of], pose.position[data.frame_of] = solved
-    pose.rotation[data.frame_of[first]] = solved.rotation[first]
-    pose.position[data.frame_of[first]] = solved.position[first]
-    if data.poses is not None:
-        pose = data.poses
+    pose = data.poses or _frame_poses(data, solved, identity(data.cameras))
     rig = identity(data.cameras)
     for camera in range(1, data.cameras):
         mine = np.flatnonzero(data.camera_of == camera)
@@ -110,7 +103,21 @@ def start(data: Data, lens: Lens) -> State:
         middle = np.argsort(np.linalg.norm(relative.position, axis=1))[len(mine) // 2]
         rig.rotation[camera] = relative.rotation[middle]
         rig.position[camera] = relative.position[middle]
-    return State(pose, rig, replace(lens, effects={}), terms)
+    return State(pose, rig, replace(lens, effects={}), model.terms)
+
+
+def start_poses(data: Data, trained: State) -> State:
+    """Return a state fitted to other data with the poses of these frames; all else is kept."""
+    solved = localize(ForwardModel(trained.lens, trained.terms), data.views).pose
+    pose = data.poses or _frame_poses(data, solved, trained.rig)
+    return fit_poses(data, replace(trained, pose=pose))
+
+
+def _frame_poses(data: Data, solved: Pose, rig: Pose) -> Pose:
+    """Return frame poses (F,) from those of the views, from the first camera where it saw."""
+    body = solved.compose(rig.take(data.camera_of).inverse())
+    first = np.unique(data.frame_of, return_index=True)[1]
+    return body.take(first)
 
 
 class Linearised:
@@ -227,11 +234,20 @@ def fit(data: Data, state: State, free: Sequence[str], max_iterations: int = 30)
     return problem.unpack(solved.state)
 
 
+def fit_poses(data: Data, state: State) -> State:
+    """Refit the poses of the frames alone."""
+    problem = _Fit(data, state, (), poses_only=True)
+    return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
+
+
 class _Fit:
     """One arrow system: frames are the blocks; rig, intrinsics and effects are shared."""
 
-    def __init__(self, data: Data, template: State, free: Sequence[str]) -> None:
+    def __init__(
+        self, data: Data, template: State, free: Sequence[str], poses_only: bool = False
+    ) -> None:
         self._data, self._template, self._free = data, template, tuple(free)
+        self._poses_only = poses_only
 
     def pack(self, state: State) -> Arrays:
         lens = [state.lens.parameters[name] for name in self._free]
@@ -256,7 +272,9 @@ class _Fit:
         if not len(index):
             return np.zeros(0), ()
         linear = Linearised(self._data, self.unpack(state), self._free)
-        return _equations(linear.residual, linear.frame_columns, linear.shared_columns)
+        # A column of zeros leaves its parameter where it is.
+        shared = linear.shared_columns * (0.0 if self._poses_only else 1.0)
+        return _equations(linear.residual, linear.frame_columns, shared)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         return arrow_step(normal, damping)
@@ -305,16 +323,20 @@ class _SurveyFit(_Fit):
 
 def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arrays]:
     """Return cost (1,) and arrow of rows (V, M) with columns (V, M, B) and (V, M, K)."""
-    jacobian = np.concatenate([block, shared], axis=-1)
-    cost = (residual**2).sum(axis=-1)
-    outside = ~np.isfinite(cost)
-    if outside.any():
-        residual, jacobian = np.zeros_like(residual), np.zeros_like(jacobian)
-    transposed = np.swapaxes(jacobian, -1, -2)
-    gradient = -(transposed @ residual[..., None])[..., 0]
-    cost = np.where(outside, np.inf, cost)
-    hessian = transposed @ jacobian
-    return arrow_of_views(cost[None], hessian[None], gradient[None], block.shape[-1])
+    cost = float((residual**2).sum())
+    if not np.isfinite(cost):
+        residual, block, shared = (np.zeros_like(a) for a in (residual, block, shared))
+        cost = np.inf
+    flat = shared.reshape(-1, shared.shape[-1])
+    transposed = np.ascontiguousarray(np.swapaxes(block, -1, -2))
+    equations = ArrowEquations(
+        (transposed @ block)[None],
+        (transposed @ shared)[None],
+        (flat.T @ flat)[None],
+        -(transposed @ residual[..., None])[None, ..., 0],
+        -(flat.T @ residual.ravel())[None],
+    )
+    return np.array([cost]), tuple(equations)
 
 
 def landmark_groups(landmark: Index, used: Mask) -> Index:

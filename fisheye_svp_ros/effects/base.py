@@ -36,11 +36,12 @@ class Untestable(Exception):  # noqa: N818 - not an error: an answer
 
 
 class Parameter(NamedTuple):
-    """One number of an effect: its name, unit and a size that would be large in practice."""
+    """One number of an effect: its name, unit, a size that would be large, whether >= 0."""
 
     name: str
     unit: str
     large: float
+    positive: bool = False
 
 
 @dataclass
@@ -131,6 +132,10 @@ class Effect(ABC):
     def displacement(self, scene: Scene, values: Array) -> Array:
         """Displacement (S, N, D) at this effect's stage."""
         return np.asarray(self.columns(scene) @ values)
+
+    def joined(self, other: Effect) -> Effect:
+        """Return the form that holds this one and another of the same effect."""
+        return other
 
     @property
     def key(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -41,6 +41,9 @@ class BoardPoseEffect(Effect):
         ]
         forms: list[Effect] = [cls((one,)) for one in others]
         return forms if len(others) == 1 else [cls(tuple(others)), *forms]
+
+    def joined(self, other: Effect) -> Effect:
+        return replace(self, boards=tuple(dict.fromkeys((*self.boards, *other.boards))))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

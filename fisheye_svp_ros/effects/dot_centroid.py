@@ -37,7 +37,7 @@ class DotCentroidEffect(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('radius_squared', 'm^2', 1e-4),)
+        return (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 
     def columns(self, scene: Scene) -> Array:
         views = scene.views

@@ -37,7 +37,7 @@ class FlatPortEffect(Effect):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('thickness', 'm', 0.005),)
+        return (Parameter('thickness', 'm', 0.005, positive=True),)
 
     def columns(self, scene: Scene) -> Array:
         shift = FlatPort(1.0, self.refractive_index).columns(scene.theta)[..., :1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -39,6 +39,11 @@ class LandmarkSurveyEffect(Effect):
         if not often.size:
             raise Untestable(f'no landmark is seen {MIN_VIEWS} times')
         return [cls(tuple(int(i) for i in often), everywhere=True)]
+
+    def joined(self, other: Effect) -> Effect:
+        if not isinstance(other, LandmarkSurveyEffect) or other.everywhere:
+            return other
+        return replace(self, landmarks=tuple(dict.fromkeys((*self.landmarks, *other.landmarks))))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

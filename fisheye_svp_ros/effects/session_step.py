@@ -40,9 +40,9 @@ class SessionStepEffect(Effect):
             raise Untestable('fewer than six frames')
         return [cls((float(start),), timed) for start in instants[2:-1]]
 
-    def extended(self, start: float) -> SessionStepEffect:
-        """Return the effect with one more step."""
-        return replace(self, starts=(*self.starts, start))
+    def joined(self, other: Effect) -> Effect:
+        more = getattr(other, 'starts', ())
+        return replace(self, starts=tuple(dict.fromkeys((*self.starts, *more))))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

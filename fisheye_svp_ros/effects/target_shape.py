@@ -42,6 +42,10 @@ class TargetShapeEffect(Effect):
             forms.extend(cls(2, (one,)) for one in every)
         return forms
 
+    def joined(self, other: Effect) -> Effect:
+        boards = tuple(dict.fromkeys((*self.boards, *other.boards)))
+        return TargetShapeEffect(max(self.degree, other.degree), boards)
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(

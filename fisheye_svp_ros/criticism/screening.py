@@ -1,0 +1,162 @@
+"""Screening: every effect of the catalogue, in all its forms, by score test."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.criticism.correlation import Correlation
+from fisheye_svp_ros.criticism.model import Linearised, gather, landmark_groups
+from fisheye_svp_ros.criticism.projection import Nuisance, Score, p_value, score
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One form of one effect with its test.
+
+    corrected: the p-value times the number of effects and of this effect's forms; merit: how much
+    better the data are described, less what that many parameters do by chance (BIC).
+    """
+
+    effect: Effect
+    score: Score
+    corrected: float
+    merit: float
+
+
+@dataclass(frozen=True)
+class Screening:
+    """All candidates, best merit first; effects that cannot be tested, with the reason."""
+
+    candidates: tuple[Candidate, ...]
+    untestable: dict[str, str]
+
+    def eligible(self, significance: float) -> list[Candidate]:
+        """Return the candidates whose corrected p-value is below the significance."""
+        return [c for c in self.candidates if c.corrected < significance]
+
+    def best(self, name: str) -> Candidate | None:
+        """Return the form of an effect with the best merit."""
+        return next((c for c in self.candidates if c.effect.name == name), None)
+
+
+def screen(
+    linear: Linearised, nuisance: Nuisance, correlation: Correlation,
+    names: Sequence[str] | None = None,
+) -> Screening:
+    """Test every effect that moves predictions (or only those named) on top of a state."""
+    forms: dict[str, Sequence[Effect]] = {}
+    untestable: dict[str, str] = {}
+    for name, kind in CATALOGUE.items():
+        if kind.stage == 'noise' or (names is not None and name not in names):
+            continue
+        try:
+            forms[name] = kind.candidates(linear.scene)
+        except Untestable as why:
+            untestable[name] = str(why)
+    effects = len(CATALOGUE) - len(untestable) if names is None else len(names)
+    found: list[Candidate] = []
+    for name, several in forms.items():
+        tested = [
+            (effect, _test(linear, nuisance, correlation, effect), len(several))
+            for effect in several
+        ]
+        if name == LandmarkSurveyEffect.name and nuisance.frame_basis is not None:
+            tested = [(effect, result, 2) for effect, result, _ in tested]
+            tested += single_landmarks(linear, nuisance, correlation)
+        if all(result.rank == 0 for _, result, _ in tested):
+            untestable[name] = 'what it would do is taken up by what is free already'
+        for effect, result, count in tested:
+            corrected = min(1.0, result.p_value * effects * count)
+            found.append(Candidate(effect, result, corrected, merit(nuisance, result)))
+    found.sort(key=lambda candidate: -candidate.merit)
+    return Screening(tuple(found), untestable)
+
+
+def merit(nuisance: Nuisance, result: Score) -> float:
+    """Return twice the gain in log likelihood less the charge of the Bayesian criterion."""
+    left = max(nuisance.misfit - result.statistic, 1e-12 * nuisance.misfit)
+    gain = nuisance.freedom * np.log(nuisance.misfit / left)
+    return float(gain / result.inflation - result.rank * np.log(nuisance.rows))
+
+
+def _test(
+    linear: Linearised, nuisance: Nuisance, correlation: Correlation, effect: Effect
+) -> Score:
+    if isinstance(effect, LandmarkSurveyEffect) and effect.everywhere:
+        return _all_landmarks(linear, nuisance, correlation, effect)
+    columns = linear.effect_columns(effect)
+    result = score(nuisance, columns, correlation.inflation)
+    bounded = [
+        value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
+        if parameter.positive
+    ]
+    # A size that comes out negative where only a positive one has a meaning explains nothing.
+    return result._replace(p_value=1.0, statistic=0.0) if any(bounded) else result
+
+
+def _all_landmarks(
+    linear: Linearised, nuisance: Nuisance, correlation: Correlation,
+    effect: LandmarkSurveyEffect,
+) -> Score:
+    nothing = np.zeros(len(effect.parameters))
+    if nuisance.frame_basis is None or nuisance.freedom < 1.5 * len(nothing):
+        return Score(0.0, 0, 1.0, nothing, 1.0)
+    freed = nuisance.with_survey(effect)
+    statistic = nuisance.misfit - freed.misfit
+    rank = freed.rank - nuisance.rank
+    inflation = correlation.pooled
+    return Score(
+        statistic, rank, p_value(nuisance, statistic, rank, inflation), nothing, inflation
+    )
+
+
+def single_landmarks(
+    linear: Linearised, nuisance: Nuisance, correlation: Correlation
+) -> list[tuple[Effect, Score, int]]:
+    """Test the displacement of each landmark by itself, all at once.
+
+    Every score needs only the rows of its own landmark: the nuisance enters through its basis.
+    """
+    assert nuisance.frame_basis is not None
+    rows, (frames, height) = linear.rows, nuisance.shape
+    place = linear.whitened(linear.linear.d_target)
+    group = landmark_groups(rows.landmark, rows.used)
+    mine = gather(place, group)
+    shared = np.einsum('lma,lmk->lak', mine, gather(nuisance.shared_basis, group))
+    own = np.einsum('lma,lmb->lab', mine, mine) - shared @ np.swapaxes(shared, -1, -2)
+    label, row = np.nonzero(group < frames * height)
+    frame = group[label, row] // height
+    crossed = np.zeros((len(group), frames, 3, nuisance.frame_basis.shape[-1]))
+    flat = nuisance.frame_basis.reshape(frames * height, -1)[group[label, row]]
+    np.add.at(crossed, (label, frame), mine[label, row][:, :, None] * flat[:, None, :])
+    own -= np.einsum('lfak,lfbk->lab', crossed, crossed)
+    gradient = np.einsum('lma,lm->la', mine, gather(nuisance.residual[..., None], group)[..., 0])
+    estimate = (np.linalg.pinv(own, rcond=1e-6, hermitian=True) @ gradient[..., None])[..., 0]
+    statistic = np.einsum('la,la->l', estimate, gradient)
+    ids = rows.landmark.ravel()[group[:, 0]]
+    views = np.array([len(np.unique(frame[label == i])) for i in range(len(group))])
+    inflation = correlation.pooled
+    return [
+        (
+            LandmarkSurveyEffect((int(ids[i]),)),
+            Score(
+                float(statistic[i]), 3, p_value(nuisance, float(statistic[i]), 3, inflation),
+                estimate[i], inflation,
+            ),
+            2 * len(group),
+        )
+        for i in np.flatnonzero(views >= MIN_VIEWS)
+    ]
+
+
+def transferred(old: Effect, values: Array, new: Effect) -> Array:
+    """Return start values of a form of an effect from another form's, by parameter name."""
+    known = dict(zip((p.name for p in old.parameters), values, strict=True))
+    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])

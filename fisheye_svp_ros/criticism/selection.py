@@ -1,0 +1,192 @@
+"""Selection: which effects, one at a time, and which others the data cannot tell from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.criticism.correlation import Correlation, judge_correlation
+from fisheye_svp_ros.criticism.held_out import held_out_gain
+from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit
+from fisheye_svp_ros.criticism.projection import Nuisance, score
+from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transferred
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+
+# False alarms: this much for all effects together, the same again for what is left.
+SIGNIFICANCE = 0.01
+# An effect is in the class of another unless, with it in the model, the other is still needed.
+CLASS_SIGNIFICANCE = 0.002
+MAX_STEPS = 12
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the trace: what was tried, its evidence, and what came of it."""
+
+    effect: str
+    statistic: float
+    rank: int
+    p_value: float
+    corrected: float
+    held_out: dict[str, float]
+    accepted: bool
+    why: str
+
+
+@dataclass
+class Selection:
+    """The state with its effects; the trace; what could not be tested; the last correlation."""
+
+    state: State
+    trace: list[Step]
+    untestable: dict[str, str]
+    correlation: Correlation
+    evidence: dict[str, Candidate]
+
+
+def select(data: Data, state: State, free: Sequence[str]) -> Selection:
+    """Add effects to a fitted state for as long as each is significant and predicts better.
+
+    Every candidate must have a corrected p-value below SIGNIFICANCE and lower the misfit of
+    frames, landmarks and range bands that were held out.
+    """
+    trace: list[Step] = []
+    refused: set[str] = set()
+    evidence: dict[str, Candidate] = {}
+    while True:
+        linear = Linearised(data, state, free)
+        correlation = judge_correlation(linear, generic_columns(linear))
+        screening = screen(linear, Nuisance(linear), correlation)
+        if len(evidence) == 0 and not trace:
+            first = screening
+        eligible = [c for c in screening.eligible(SIGNIFICANCE) if c.effect.key not in refused]
+        if not eligible or len(trace) >= MAX_STEPS:
+            break
+        chosen = eligible[0]
+        gains = held_out_gain(data, linear, free, chosen.effect)
+        good = gains['frames'] > 0 and sum(gains.values()) > 0
+        trace.append(_step(chosen, gains, good))
+        if not good:
+            refused.add(chosen.effect.key)
+            continue
+        state = fit(data, with_effect(state, chosen.effect, chosen.score.estimate), free)
+        evidence.setdefault(chosen.effect.name, chosen)
+    return Selection(state, trace, first.untestable, correlation, evidence)
+
+
+def generic_columns(linear: Linearised) -> Array:
+    """Columns (F, M, P) of the catalogue's effects, each in its richest form of few parameters."""
+    blocks = []
+    for kind in CATALOGUE.values():
+        if kind.stage == 'noise' or kind.name in ('landmark_survey', 'session_step'):
+            continue
+        try:
+            forms = kind.candidates(linear.scene)
+        except Untestable:
+            continue
+        richest = max(forms, key=lambda form: len(form.parameters))
+        blocks.append(linear.effect_columns(richest))
+    return np.concatenate(blocks, axis=-1)
+
+
+def with_effect(state: State, effect: Effect, values: Array | None = None) -> State:
+    """Return the state with one more effect, joined with an earlier form of the same."""
+    start = np.zeros(len(effect.parameters)) if values is None else values
+    for i, (old, known) in enumerate(state.terms):
+        if old.name == effect.name:
+            joined = old.joined(effect)
+            both = transferred(old, known, joined) + transferred(effect, start, joined)
+            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
+    return replace(state, terms=(*state.terms, (effect, start)))
+
+
+def without_effect(state: State, name: str) -> State:
+    """Return the state without one effect."""
+    return replace(state, terms=tuple(term for term in state.terms if term[0].name != name))
+
+
+def settle(data: Data, selection: Selection, free: Sequence[str]) -> Selection:
+    """Ask of each effect again, given the others, whether it is needed and the best of its kind.
+
+    A first choice may have been a compromise between two causes that only together explain.
+    """
+    state, trace = selection.state, selection.trace
+    for name in [effect.name for effect, _ in state.terms if effect.stage != 'noise']:
+        if len(state.terms) < 2 and len(trace) > 1:
+            break
+        effect, values = next(term for term in state.terms if term[0].name == name)
+        rest = fit(data, without_effect(state, name), free)
+        linear = Linearised(data, rest, free)
+        screening = screen(linear, Nuisance(linear), selection.correlation)
+        eligible = screening.eligible(SIGNIFICANCE)
+        own = [c for c in eligible if c.effect.name == name]
+        if not own:
+            state = rest
+            trace.append(_gone(name, 'the other causes explain it'))
+            selection.evidence.pop(name, None)
+        elif eligible[0].effect.name != name and not _in_model(state, eligible[0].effect.name):
+            better = eligible[0]
+            if better.merit > own[0].merit + 6 and len(state.terms) > 1:
+                state = fit(data, with_effect(rest, better.effect, better.score.estimate), free)
+                trace.append(_gone(name, f'{better.effect.name} explains more'))
+                selection.evidence.pop(name, None)
+                selection.evidence[better.effect.name] = better
+    return replace(selection, state=state)
+
+
+def indistinguishable(
+    data: Data, state: State, name: str, free: Sequence[str], correlation: Correlation
+) -> tuple[Candidate, list[str]]:
+    """Return the evidence for an effect given the others, and the effects it may be mistaken for.
+
+    Another effect is in its class where, with the other one in the model, this one is no longer
+    needed (p above CLASS_SIGNIFICANCE): then the data cannot refuse the other one.
+    """
+    effect, _ = next(term for term in state.terms if term[0].name == name)
+    rest = fit(data, without_effect(state, name), free)
+    linear = Linearised(data, rest, free)
+    nuisance = Nuisance(linear)
+    own = screen(linear, nuisance, correlation, [name]).candidates[0]
+    columns = None if _is_survey(effect) else linear.effect_columns(effect)
+    alone = None if columns is None else score(nuisance, columns, correlation.inflation)
+    strength = own.score.statistic if alone is None else alone.statistic
+    same = []
+    for other in screen(linear, nuisance, correlation).candidates:
+        known = other.effect.name in same or other.effect.name == name
+        if known or _in_model(rest, other.effect.name) or columns is None:
+            continue
+        if other.score.statistic < 0.3 * strength or _is_survey(other.effect):
+            continue
+        extended = Nuisance(linear, linear.effect_columns(other.effect))
+        left = score(extended, columns, correlation.inflation)
+        if left.p_value > CLASS_SIGNIFICANCE:
+            same.append(other.effect.name)
+    if alone is not None:
+        own = replace(own, effect=effect, score=alone, merit=merit(nuisance, alone))
+    return own, same
+
+
+def _is_survey(effect: Effect) -> bool:
+    return bool(getattr(effect, 'everywhere', False))
+
+
+def _in_model(state: State, name: str) -> bool:
+    return any(effect.name == name for effect, _ in state.terms)
+
+
+def _step(candidate: Candidate, gains: dict[str, float], accepted: bool) -> Step:
+    result = candidate.score
+    why = 'significant and predicts better' if accepted else 'does not predict better'
+    return Step(
+        candidate.effect.key, result.statistic, result.rank, result.p_value,
+        candidate.corrected, gains, accepted, why,
+    )
+
+
+def _gone(name: str, why: str) -> Step:
+    return Step(name, 0.0, 0, 1.0, 1.0, {}, False, f'removed: {why}')
+
