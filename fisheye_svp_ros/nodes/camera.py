@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
 
 WORLD = 'world'
+_LONG = 5.0  # s without an answer that are worth a word
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,7 @@ class CameraNode(BaseNode):
         self._answering: set[str] = set()
         self._unanswered: set[str] = set()
         self._stamp = 0
+        self._sent = 0.0
 
     @abstractmethod
     def publish_set(self, step: Any) -> int:
@@ -120,10 +123,9 @@ class CameraNode(BaseNode):
 
     def _tick(self) -> None:
         if self._unanswered:
-            waiting = ' '.join(sorted(self._unanswered))
-            self.get_logger().info(
-                f'waiting for {waiting}', throttle_duration_sec=5.0, skip_first=True
-            )
+            if time.monotonic() - self._sent > _LONG:
+                waiting = ' '.join(sorted(self._unanswered))
+                self.get_logger().warning(f'no answer on {waiting}', throttle_duration_sec=_LONG)
         elif self.has_listeners():
             self._advance()
 
@@ -132,6 +134,7 @@ class CameraNode(BaseNode):
         if step is None:
             raise Finished('all sets are published')
         self._unanswered = set(self.settings.lock_step.split())
+        self._sent = time.monotonic()
         self._stamp = self.publish_set(step)
 
 

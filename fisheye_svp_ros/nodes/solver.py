@@ -16,13 +16,15 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
 from fisheye_svp_ros import messages
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.messages import ImagePoints, LandmarkSet
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode, Settings
 from fisheye_svp_ros.nodes.join import StampJoin
-from fisheye_svp_ros.observations import Views, views_of
+from fisheye_svp_ros.observations import STEREO, Views, views_of
 from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scenario import true_lens
 
 Items = Mapping[str, Any]
@@ -87,24 +89,21 @@ class SolverNode(BaseNode):
 
     def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
         """Return image points as one view; raise ObservationError for an unknown landmark."""
-        points, known = landmarks.landmarks.lookup(seen.landmark)
-        if not known.all():
-            raise ObservationError(
-                f'image_points: landmark {seen.landmark[~known][0]} is not among the landmarks'
-            )
-        weight = np.full((1, len(known)), 1 / self.settings.sigma_px)
+        points = known_points(landmarks, seen)
+        weight = np.full((1, len(points)), 1 / self.settings.sigma_px)
         views = views_of(points, seen.uv[None], weight)
         time_s = np.full_like(weight, stamp / 1e9)
         return views._replace(landmark=seen.landmark[None], t=time_s, frame=np.array([stamp]))
 
     def publish_result(
-        self, stamp: int, metrics: Mapping[str, float], text: str = '', warn: bool = False
+        self, stamp: int, metrics: Mapping[str, Array], text: str = '', warn: bool = False
     ) -> None:
-        """Publish the metrics of one set, together and one by one."""
+        """Publish the metrics (1,) of one set, together and one by one."""
         name = self.get_fully_qualified_name()
-        for key, value in metrics.items():
+        values = {key: float(value[0]) for key, value in metrics.items()}
+        for key, value in values.items():
             self._metrics[key].publish(messages.number_message(value))
-        self._result.publish(messages.key_values_message(name, metrics, stamp, text, warn))
+        self._result.publish(messages.key_values_message(name, values, stamp, text, warn))
 
     def _lens(self, items: Items) -> tuple[str, float]:
         if self.settings.lens:
@@ -160,6 +159,21 @@ class SolverNode(BaseNode):
         for topic in (f'{camera}image_points' for camera in self.CAMERAS):
             if topic in items:
                 self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
+
+
+def known_points(landmarks: LandmarkSet, seen: ImagePoints) -> Array:
+    """Return the landmarks (N, 3), m, of image points; raise ObservationError for an unknown."""
+    points, known = landmarks.landmarks.lookup(seen.landmark)
+    if not known.all():
+        unknown = seen.landmark[~known][0]
+        raise ObservationError(f'image_points: landmark {unknown} is not among the landmarks')
+    return points
+
+
+def true_rig(items: Items) -> Pose | None:
+    """Return the left camera in the right one where both true poses are known."""
+    left, right = (items.get(f'{camera}/true_pose') for camera in STEREO)
+    return None if left is None or right is None else right.inverse().compose(left)
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,76 @@
+"""Finds the pose of a camera from image points of known landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from fisheye_svp_ros import messages
+from fisheye_svp_ros.camera import incidence
+from fisheye_svp_ros.clouds import RESIDUALS, Points, structured
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS, localization_metrics
+from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.shapes import camera_shape
+from fisheye_svp_ros.nodes.solver import Items, SolverNode, SolverSettings
+from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.localization import Localization, localize
+
+
+class Localizer(SolverNode):
+    """Publishes a pose, its residuals and, where the true pose is known, its errors."""
+
+    NAME = 'localizer'
+    SETTINGS = SolverSettings
+    METRICS = LOCALIZATION_METRICS
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pose = self.announce(PoseWithCovarianceStamped, '~/pose', wait=True)
+        self._position_error = self.announce(Vector3Stamped, '~/position_error', wait=True)
+        self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error', wait=True)
+        self._residuals = self.announce(PointCloud2, '~/residuals', wait=True)
+        self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
+        self.start()
+
+    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+        """Localize the camera of one set; raise GeometryError where its points fix no pose."""
+        seen: messages.ImagePoints = items['image_points']
+        views, model = self.views(stamp, landmarks, seen), self.model(items)
+        solution = localize(model, views)
+        if not solution.converged[0]:
+            raise GeometryError('image_points: they do not fix a pose (all near one line?)')
+        pose, world = solution.pose.take(0), landmarks.frame
+        self._pose.publish(
+            messages.pose_with_covariance_message(pose, solution.covariance[0], stamp, world)
+        )
+        self._residuals.publish(
+            messages.cloud_message(residuals(model, views, solution), stamp, seen.frame)
+        )
+        true: Pose | None = items.get('true_pose')
+        if true is not None:
+            error = pose.difference(true)
+            self._position_error.publish(messages.vector_message(error[:3], stamp, world))
+            self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
+        self.publish_result(stamp, localization_metrics(solution.pose, solution.residual, true))
+        if self._markers.get_subscription_count():
+            shape = camera_shape(pose, 'estimated', alpha=0.6)
+            self._markers.publish(messages.markers_message([shape], stamp, world))
+
+
+def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:
+    """Return the residuals of one view: px; incidence angle, rad, and range, m, as solved."""
+    points = solution.pose.into_body(views.points)[0]
+    theta = incidence(model.lens, points, limited=False).theta
+    distance = np.linalg.norm(points, axis=-1)
+    columns = (*views.uv[0].T, *solution.residual[0].T, theta, distance)
+    return structured(RESIDUALS, views.landmark[0], *columns)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(Localizer, args)

@@ -1,0 +1,104 @@
+"""Measures landmarks with a stereo rig that is known: epipolar offsets and 3-D points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from sensor_msgs.msg import PointCloud2
+
+from fisheye_svp_ros import messages
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.clouds import LANDMARKS, structured
+from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.evaluation.errors import STEREO_DEPTH_METRICS, stereo_depth_metrics
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, run
+from fisheye_svp_ros.nodes.solver import (
+    Items,
+    SolverNode,
+    SolverSettings,
+    known_points,
+    true_rig,
+)
+from fisheye_svp_ros.observations import STEREO
+from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.stereo_depth import (
+    epipolar_offset,
+    triangulate,
+    triangulate_optimally,
+)
+
+
+@dataclass(frozen=True)
+class StereoDepthSettings(SolverSettings):
+    """Parameters of stereo depth."""
+
+    rig: str = parameter(
+        'true', 'The rig to measure with: the true one, or the latest on the topic `rig`, as the '
+        'stereo calibrator publishes it', choices=('true', 'topic')
+    )
+    optimal: bool = parameter(
+        False, 'Find the point of least reprojection error rather than the one halfway between '
+        'the two rays'
+    )
+
+
+class StereoDepth(SolverNode):
+    """Publishes a point for each landmark that both cameras see."""
+
+    NAME = 'stereo_depth'
+    SETTINGS = StereoDepthSettings
+    METRICS = STEREO_DEPTH_METRICS
+    CAMERAS = tuple(f'{name}/' for name in STEREO)
+    settings: StereoDepthSettings
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._points = self.announce(PointCloud2, '~/points', wait=True)
+        self._latest: Pose | None = None
+        self.listen(TransformStamped, 'rig', messages.read_transform, self._hear, LATCHED_INPUT)
+        self.start()
+
+    def _hear(self, _: int, rig: Pose) -> None:
+        self._latest = rig
+
+    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+        """Measure one set; raise GeometryError where no landmark is in both images."""
+        model, rig = self.model(items), self._rig(items)
+        left, right = (items[f'{camera}image_points'] for camera in self.CAMERAS)
+        ids, in_left, in_right = np.intersect1d(
+            left.landmark, right.landmark, assume_unique=True, return_indices=True
+        )
+        if not len(ids):
+            raise GeometryError('image_points: no landmark is in both images')
+        uv = left.uv[in_left], right.uv[in_right]
+        offset = epipolar_offset(model, model, rig, *uv)
+        solve = triangulate_optimally if self.settings.optimal else triangulate
+        solved = solve(model, model, rig, *uv)
+        cloud = structured(LANDMARKS, ids[solved.valid], *solved.points[solved.valid].T)
+        self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
+        self.publish_result(stamp, stereo_depth_metrics(
+            offset.distance[None], offset.vertical[None], solved.points[None],
+            _true_points(known_points(landmarks, right)[in_right], items),
+        ))
+
+    def _rig(self, items: Items) -> Pose:
+        known = true_rig(items) if self.settings.rig == 'true' else self._latest
+        if known is None:
+            raise ObservationError(
+                'no rig: true poses of both cameras are needed, or rig:=topic and a calibrated one'
+            )
+        return known
+
+
+def _true_points(points: Array, items: Items) -> Array | None:
+    """Return landmarks (N, 3) in the frame of the right camera where its pose is known."""
+    pose: Pose | None = items.get('right/true_pose')
+    return None if pose is None else pose.into_body(points)[None]
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(StereoDepth, args)
