@@ -48,6 +48,8 @@ def run(args: argparse.Namespace) -> None:
         result = calibrate(observations, args.model, args.image_size, args.free, name)
     _print(result)
     note_left_out(result.left_out)
+    if not result.adjusted.converged:
+        say('the adjustment has not converged; take the lens for a rough one')
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')

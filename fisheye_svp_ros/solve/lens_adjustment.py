@@ -57,8 +57,8 @@ def adjust(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> Adjust
     solved = adjust_batch(lens, views, Pose(*(array[None] for array in pose)), start, names)
     if not np.isfinite(solved.cost[0]):
         raise GeometryError(
-            f'lens {lens.name!r} cannot image all points from the start poses; check the target '
-            'and its units (m)'
+            f'lens {lens.name!r} cannot image all landmarks from the start poses; check that '
+            'landmarks, image points and image size belong together'
         )
     rotation, position, values = (array[0] for array in solved.state)
     fitted, pose = lens.with_parameters(names, values.tolist()), Pose(rotation, position)
@@ -74,13 +74,14 @@ def adjust(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> Adjust
 
 
 def adjust_batch(
-    lens: Lens, views: Views, pose: Pose, values: Array, names: Sequence[str]
+    lens: Lens, views: Views, pose: Pose, values: Array, names: Sequence[str],
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Solved:
     """Adjust from S starts at once: pose (S, V), values (S, K) of the named parameters.
 
     The state is (rotation, position, values); a start outside the lens's domain costs inf.
     """
-    return levenberg_marquardt(_Adjustment(lens, views, names), (*pose, values), MAX_ITERATIONS)
+    return levenberg_marquardt(_Adjustment(lens, views, names), (*pose, values), max_iterations)
 
 
 def parameter_values(lens: Lens, names: Sequence[str]) -> list[float]:

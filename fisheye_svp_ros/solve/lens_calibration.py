@@ -11,10 +11,11 @@ import numpy as np
 from fisheye_svp_ros.camera import back_project, incidence
 from fisheye_svp_ros.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import GeometryError, LensError
+from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
 from fisheye_svp_ros.lens import INTRINSICS, Lens, check_lens
 from fisheye_svp_ros.observations import Observations, Views
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import (
     Adjusted,
@@ -28,11 +29,13 @@ from fisheye_svp_ros.solve.lens_start import (
     monotone_limit,
     thinned,
 )
-from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px, sigma_known
 
+OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
 _CANDIDATES = 4
+_START_ITERATIONS = 40
 _ROUNDS = 4
 _SHIFT_STARTS: tuple[ViewpointShift, ...] = (Gennery(), FlatPort(0.0, 1.5))
 
@@ -67,11 +70,13 @@ def calibrate(
     a viewpoint shift gives the lens that shift.  What is not freed stays neutral: the centre in
     the middle of the image, coefficients at 0.
     Raises LensError for an impossible model, image size or name; ObservationError for rows of
-    several cameras; GeometryError where the views do not determine the lens.
+    several cameras or far outside the image; GeometryError where the views do not determine the
+    lens.
     """
     start = _start_lens(model, image_size, free or (), name)
     names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
     _check_names(start, names)
+    _check_inside(observations, image_size)
     views, left_out = posable_views(observations)
     rows, unknowns = 2 * int(views.used.sum()), 6 * len(views.frame) + len(names)
     if rows <= unknowns:
@@ -123,6 +128,15 @@ def _check_names(lens: Lens, names: tuple[str, ...]) -> None:
         raise LensError('free must name f, or fx and fy: a calibration starts without them')
 
 
+def _check_inside(observations: Observations, image_size: tuple[int, int]) -> None:
+    outside = np.maximum(-observations.uv, observations.uv - image_size).max(axis=0) / image_size
+    if outside.max() > OUTSIDE:
+        raise ObservationError(
+            f'{observations.source}: image points lie far outside an image of '
+            f'{image_size[0]}x{image_size[1]}; check the image size'
+        )
+
+
 def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
     """Scan the focal length, adjust the best candidates to few points, then to everything."""
     shift = start.viewpoint_shift
@@ -133,7 +147,7 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
     values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
-    solved = adjust_batch(start.svp(), few, pose, values, svp_names)
+    solved = adjust_batch(start.svp(), few, pose, values, svp_names, _START_ITERATIONS)
     best = solved.state[2][np.argmin(solved.cost)].tolist()
     adjusted = _settled(start.svp().with_parameters(svp_names, best), views, svp_names)
     if shift is None:
@@ -148,6 +162,8 @@ def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
     for _ in range(_ROUNDS):
         adjusted = adjust(lens, views, pose, names)
         lens, pose = adjusted.lens, adjusted.pose
+        if not adjusted.converged:
+            break
         fresh = _posed(lens, views)
         better = fresh.cost < adjusted.cost * (1 - 1e-6)
         if not better.any():
@@ -164,7 +180,7 @@ def _posed(lens: Lens, views: Views) -> Localization:
     lens = _with_corner(lens)
     rays = back_project(lens, views.uv)
     start = initial_poses(views.points, rays.direction, np.where(rays.valid, views.weight, 0.0))
-    return localize(ForwardModel(lens), views, start)
+    return localize_both_sides(ForwardModel(lens), views, start)
 
 
 def _with_corner(lens: Lens) -> Lens:
@@ -187,6 +203,7 @@ def _check_focal(adjusted: Adjusted, source: str) -> None:
             relative = float(np.sqrt(adjusted.covariance[i, i])) / adjusted.lens.fx
             if not relative < FOCAL_UNCERTAINTY:
                 raise GeometryError(
-                    f'{source}: {name} is known to {100 * relative:.0f} % only; add views in '
-                    'which the target is tilted and covers the image'
+                    f'{source}: {name} is known to {100 * relative:.0f} % only, rms '
+                    f'{rms_px(adjusted.residual):.3g} px; add views in which the target is tilted '
+                    'and covers the image; check that image points and landmarks belong together'
                 )

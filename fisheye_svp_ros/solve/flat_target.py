@@ -1,0 +1,58 @@
+"""Flat targets seen small: tilted to one side they look like tilted to the other.
+
+The misfit has a minimum on either side and a start may lead to the wrong one (Schweighofer and
+Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.localization import Localization, localize
+
+_FLAT = 0.1  # thickness of a target relative to its length
+
+
+def localize_both_sides(model: ForwardModel, views: Views, start: Pose) -> Localization:
+    """Return the better of the poses that the starts (S,) and their reflections lead to.
+
+    Raises GeometryError as `localize` does.
+    """
+    found = localize(model, views, start)
+    centred, centre = _centred(views)
+    extent, axes = np.linalg.eigh(np.swapaxes(centred, -1, -2) @ centred)
+    flat = np.flatnonzero(extent[:, 0] < _FLAT**2 * extent[:, 2])
+    if not flat.size:
+        return found
+    reflected = _reflected(found.pose.take(flat), centre[flat], axes[flat, :, 0])
+    other = localize(model, views.take(flat), reflected)
+    better = other.cost < found.cost[flat]
+    rows = flat[better]
+    for old, new in zip((*found.pose, *found[1:]), (*other.pose, *other[1:]), strict=True):
+        old[rows] = new[better]
+    return found
+
+
+def _centred(views: Views) -> tuple[Array, Array]:
+    """Return the points (S, N, 3) about their centre, 0 where there is none; centres (S, 3)."""
+    used = views.weight[..., None] > 0
+    centre = (views.points * used).sum(axis=1) / used.sum(axis=1)
+    return np.where(used, views.points - centre[:, None], 0.0), centre
+
+
+def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
+    """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
+    sight = pose.inverse().transform(centre)
+    along = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+    to_camera = _mirror(along) @ np.swapaxes(pose.rotation, -1, -2) @ _mirror(normal)
+    rotation = np.swapaxes(to_camera, -1, -2)
+    return Pose(rotation, centre - (rotation @ sight[..., None])[..., 0])
+
+
+def _mirror(normal: Array) -> Array:
+    mirror: Array = np.eye(3) - 2 * normal[..., :, None] * normal[..., None, :]
+    return mirror
