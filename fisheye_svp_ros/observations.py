@@ -209,6 +209,6 @@ def views_of(points: Array, uv: Array, weight: Array | None = None) -> Views:
         board=zeros,
         t=np.full(shape, np.nan),
         frame=np.arange(shape[0]),
-        camera=zeros[:, 0],
+        camera=np.zeros(shape[0], dtype=np.int64),
         row=np.where(seen, flat, -1),
     )

@@ -118,10 +118,10 @@ def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, A
     weight = views.weight[..., None]
     with np.errstate(invalid='ignore'):
         residual = np.where(weight > 0, (uv - views.uv) * weight, 0.0)
-    systems, columns = len(uv), jacobian.shape[-1]
+    systems, rows, columns = len(uv), 2 * uv.shape[1], jacobian.shape[-1]
     j = np.where(weight[..., None] > 0, jacobian * weight[..., None], 0.0)
-    j = j.reshape(systems, -1, columns)
-    r = residual.reshape(systems, -1, 1)
+    j = j.reshape(systems, rows, columns)
+    r = residual.reshape(systems, rows, 1)
     transposed = np.swapaxes(j, -1, -2)
     cost = (r**2).sum(axis=(1, 2))
     outside = ~np.isfinite(cost)

@@ -148,18 +148,19 @@ def triangulate_optimally(
     solved = levenberg_marquardt(problem, (start.points[valid],))
     _, (hessian, _) = problem.linearise(solved.state, np.arange(len(solved.cost)))
     uv, _ = problem.image(solved.state[0], np.arange(len(solved.cost)))
-    fields = [
-        solved.state[0], np.linalg.inv(hessian),
-        solved_pairs.left - uv[:, 0], solved_pairs.right - uv[:, 1],
-    ]
-    filled = []
-    for field in fields:
-        whole = np.full((len(valid), *field.shape[1:]), np.nan)
-        field[~solved.converged] = np.nan
-        whole[valid] = field
-        filled.append(whole.reshape(*pairs.shape, *field.shape[1:]))
+    found = np.flatnonzero(valid)[solved.converged]
     valid[valid] = solved.converged
-    return OptimalPoints(*filled, valid.reshape(pairs.shape))
+
+    def filled(field: Array) -> Array:
+        whole = np.full((len(valid), *field.shape[1:]), np.nan)
+        whole[found] = field[solved.converged]
+        return whole.reshape(*pairs.shape, *field.shape[1:])
+
+    return OptimalPoints(
+        filled(solved.state[0]), filled(np.asarray(np.linalg.inv(hessian), dtype=float)),
+        filled(solved_pairs.left - uv[:, 0]), filled(solved_pairs.right - uv[:, 1]),
+        valid.reshape(pairs.shape),
+    )
 
 
 class _Pairs:
@@ -205,7 +206,8 @@ class _Curve:
 
     def image(self, inverse: Array) -> Array:
         """Return the image points (M, 2) of all rays at inverse distances (M, 1)."""
-        return _linearise(self._model, self._origin + self._direction / inverse).uv[0]
+        points = self._origin + self._direction / inverse
+        return np.asarray(_linearise(self._model, points).uv[0])
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         direction, inverse = self._direction[index], state[0]
