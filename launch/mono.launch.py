@@ -1,54 +1,48 @@
-"""One camera and its localizer; arguments: lens, svp, namespace, camera, *_params."""
+"""One camera, simulated or measured, and its localizer."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import LaunchConfigurationEquals
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'fisheye_svp_ros'
+CAMERAS = ['synthetic_camera', 'measured_camera']
+ARGUMENTS = {
+    'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
+    'svp': 'true or false: solve with the SVP model; empty: as the parameter file has it',
+    'namespace': 'namespace of the nodes',
+}
 
 
-def config(name):
-    return PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', name])
+def nodes(context):
+    """Return the nodes; what the arguments leave empty is left to the parameter files."""
+    def value(name):
+        return LaunchConfiguration(name).perform(context)
 
-
-def node(executable, parameters, **options):
-    return Node(
-        package=PACKAGE,
-        executable=executable,
-        namespace=LaunchConfiguration('namespace'),
-        parameters=parameters,
-        output='screen',
-        **options,
-    )
+    lens = {'lens': value('lens')} if value('lens') else {}
+    svp = {'svp': value('svp').lower() == 'true'} if value('svp') else {}
+    return [
+        Node(package=PACKAGE, executable=name, namespace=value('namespace'), output='screen',
+             parameters=[value(f'{name}_params'), given])
+        for name, given in ((value('camera'), lens), ('localizer', {**lens, **svp}))
+    ]
 
 
 def generate_launch_description():
-    lens = {'lens': ParameterValue(LaunchConfiguration('lens'), value_type=str)}
-    svp = {'svp': ParameterValue(LaunchConfiguration('svp'), value_type=bool)}
+    """Return arguments and nodes."""
+    config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config'])
     return LaunchDescription([
-        DeclareLaunchArgument('lens', default_value='fish214',
-                              description='lens file, or name in config/lenses'),
-        DeclareLaunchArgument('svp', default_value='true',
-                              description='solve with the single-viewpoint approximation'),
-        DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
-        DeclareLaunchArgument('camera', default_value='synthetic_camera',
-                              choices=['synthetic_camera', 'measured_camera'],
+        *(
+            DeclareLaunchArgument(name, default_value='', description=text)
+            for name, text in ARGUMENTS.items()
+        ),
+        DeclareLaunchArgument('camera', default_value=CAMERAS[0], choices=CAMERAS,
                               description='simulated or measured image points'),
-        DeclareLaunchArgument('synthetic_camera_params',
-                              default_value=config('synthetic_camera.yaml'),
-                              description='parameter file of the synthetic camera'),
-        DeclareLaunchArgument('measured_camera_params',
-                              default_value=config('measured_camera.yaml'),
-                              description='parameter file of the measured camera'),
-        DeclareLaunchArgument('localizer_params', default_value=config('localizer.yaml'),
-                              description='parameter file of the localizer'),
-        node('synthetic_camera', [LaunchConfiguration('synthetic_camera_params'), lens],
-             condition=LaunchConfigurationEquals('camera', 'synthetic_camera')),
-        node('measured_camera', [LaunchConfiguration('measured_camera_params'), lens],
-             condition=LaunchConfigurationEquals('camera', 'measured_camera')),
-        node('localizer', [LaunchConfiguration('localizer_params'), lens, svp]),
+        *(
+            DeclareLaunchArgument(f'{name}_params', description=f'parameter file of {name}',
+                                  default_value=PathJoinSubstitution([config, f'{name}.yaml']))
+            for name in (*CAMERAS, 'localizer')
+        ),
+        OpaqueFunction(function=nodes),
     ])

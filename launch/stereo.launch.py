@@ -1,50 +1,52 @@
-"""A synthetic rig, its calibration and its depth; arguments: lens, svp, style, namespace, ..."""
+"""A synthetic rig, its calibration and its depth."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 PACKAGE = 'fisheye_svp_ros'
+STYLES = ['parallel', 'vergent', 'divergent']
+NODES = ['synthetic_camera', 'stereo_calibrator', 'stereo_depth']
+ARGUMENTS = {
+    'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
+    'svp': 'true or false: solve with the SVP model; empty: as the parameter files have it',
+    'namespace': 'namespace of the nodes',
+}
 
 
-def config(name):
-    return PathJoinSubstitution([FindPackageShare(PACKAGE), 'config', name])
+def nodes(context):
+    """Return the nodes; what the arguments leave empty is left to the parameter files."""
+    def value(name):
+        return LaunchConfiguration(name).perform(context)
 
-
-def node(executable, parameters, **options):
-    return Node(
-        package=PACKAGE,
-        executable=executable,
-        namespace=LaunchConfiguration('namespace'),
-        parameters=[LaunchConfiguration(f'{executable}_params'), *parameters],
-        output='screen',
-        **options,
-    )
+    lens = {'lens': value('lens')} if value('lens') else {}
+    svp = {'svp': value('svp').lower() == 'true'} if value('svp') else {}
+    rig = {'style': value('style'), 'poses_file': 'calibration'}
+    given = {'synthetic_camera': {**lens, **rig}}
+    return [
+        Node(package=PACKAGE, executable=name, namespace=value('namespace'), output='screen',
+             parameters=[value(f'{name}_params'), given.get(name, {**lens, **svp})],
+             remappings=[('rig', 'stereo_calibrator/rig')])
+        for name in NODES
+    ]
 
 
 def generate_launch_description():
-    lens = {'lens': ParameterValue(LaunchConfiguration('lens'), value_type=str)}
-    svp = {'svp': ParameterValue(LaunchConfiguration('svp'), value_type=bool)}
-    rig = {'style': ParameterValue(LaunchConfiguration('style'), value_type=str),
-           'poses_file': 'calibration'}
+    """Return arguments and nodes."""
+    config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config'])
     return LaunchDescription([
-        DeclareLaunchArgument('lens', default_value='fish214',
-                              description='lens file, or name in config/lenses'),
-        DeclareLaunchArgument('svp', default_value='true',
-                              description='solve with the single-viewpoint approximation'),
-        DeclareLaunchArgument('style', default_value='parallel',
-                              choices=['parallel', 'vergent', 'divergent'],
-                              description='how the cameras of the rig stand'),
-        DeclareLaunchArgument('namespace', default_value='', description='namespace of the nodes'),
         *(
-            DeclareLaunchArgument(f'{name}_params', default_value=config(f'{name}.yaml'),
-                                  description=f'parameter file of {name}')
-            for name in ('synthetic_camera', 'stereo_calibrator', 'stereo_depth')
+            DeclareLaunchArgument(name, default_value='', description=text)
+            for name, text in ARGUMENTS.items()
         ),
-        node('synthetic_camera', [lens, rig]),
-        node('stereo_calibrator', [lens, svp]),
-        node('stereo_depth', [lens, svp], remappings=[('rig', 'stereo_calibrator/rig')]),
+        DeclareLaunchArgument('style', default_value=STYLES[0], choices=STYLES,
+                              description='how the cameras of the rig stand'),
+        *(
+            DeclareLaunchArgument(f'{name}_params', description=f'parameter file of {name}',
+                                  default_value=PathJoinSubstitution([config, f'{name}.yaml']))
+            for name in NODES
+        ),
+        OpaqueFunction(function=nodes),
     ])

@@ -1,27 +1,34 @@
-"""Everything: one camera below mono/, a rig below stereo/; arguments: lens, svp, style."""
+"""Everything: one camera below mono/, a rig below stereo/."""
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
+SHARED = {
+    'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
+    'svp': 'true or false: solve with the SVP model; empty: as the parameter files have it',
+}
+STYLES = ['parallel', 'vergent', 'divergent']
 
-def include(name, *arguments, **values):
+
+def include(name, arguments, namespace):
+    """Return a launch file in a scope of its own: both declare arguments of the same names."""
     path = PathJoinSubstitution([FindPackageShare('fisheye_svp_ros'), 'launch', name])
-    given = {argument: LaunchConfiguration(argument) for argument in arguments} | values
-    # A scope of its own: the two graphs declare arguments of the same names.
+    given = {argument: LaunchConfiguration(argument) for argument in arguments}
+    given['namespace'] = namespace
     return GroupAction([IncludeLaunchDescription(path, launch_arguments=given.items())])
 
 
 def generate_launch_description():
+    """Return arguments and both graphs."""
     return LaunchDescription([
-        DeclareLaunchArgument('lens', default_value='fish214',
-                              description='lens file, or name in config/lenses'),
-        DeclareLaunchArgument('svp', default_value='true',
-                              description='solve with the single-viewpoint approximation'),
-        DeclareLaunchArgument('style', default_value='parallel',
-                              choices=['parallel', 'vergent', 'divergent'],
+        *(
+            DeclareLaunchArgument(name, default_value='', description=text)
+            for name, text in SHARED.items()
+        ),
+        DeclareLaunchArgument('style', default_value=STYLES[0], choices=STYLES,
                               description='how the cameras of the rig stand'),
-        include('mono.launch.py', 'lens', 'svp', namespace='mono'),
-        include('stereo.launch.py', 'lens', 'svp', 'style', namespace='stereo'),
+        include('mono.launch.py', SHARED, 'mono'),
+        include('stereo.launch.py', [*SHARED, 'style'], 'stereo'),
     ])
