@@ -45,12 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, purpose in COMMANDS.items():
         commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
     named = next((word for word in arguments if not word.startswith('-')), '')
-    if named in COMMANDS:
-        module = import_module(f'fisheye_svp_ros.commands.{named}')
-        module.add_arguments(commands.choices[named])
-        commands.choices[named].set_defaults(run=module.run)
-    parsed = parser.parse_args(arguments)
     try:
+        if named in COMMANDS:
+            module = import_module(f'fisheye_svp_ros.commands.{named}')
+            module.add_arguments(commands.choices[named])
+            commands.choices[named].set_defaults(run=module.run)
+        parsed = parser.parse_args(arguments)
         parsed.run(parsed)
         sys.stdout.flush()
     except FisheyeSvpError as error:

@@ -20,8 +20,8 @@ class MeasuredPoses(NamedTuple):
     """The views of a table that can be posed, and their poses.
 
     result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
-    the residuals (NaN where they leave nothing for it), None where the observations bring their
-    own; left_out: frames whose points do not fix a pose.
+    the residuals, None where the observations bring their own; left_out: frames whose points do
+    not fix a pose.
     """
 
     views: Views
@@ -92,11 +92,8 @@ def sigma_known(observations: Observations) -> bool:
 
 
 def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
-    """Return the standard deviation of unit-weight rows from the sum of their squared residuals.
-
-    NaN where there are no more rows than unknowns.
-    """
-    return float(np.sqrt(cost / (rows - unknowns))) if rows > unknowns else float('nan')
+    """Return the noise of rows of unit weight, more than unknowns, from their sum of squares."""
+    return float(np.sqrt(cost / (rows - unknowns)))
 
 
 def rms_px(residual: Array) -> float:
