@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -210,6 +211,8 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
         print(f'{kind.NAME}: {error}', file=sys.stderr)
         return 2
     finally:
+        # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
