@@ -16,9 +16,9 @@ def progress(description: str, total: int | None = None) -> Iterator[Callable[[]
 
     Without a total the bar only says that the work goes on.
     """
-    bar = Progress(
-        console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty()
-    )
-    with bar:
+    if not sys.stderr.isatty():
+        yield lambda: None
+        return
+    with Progress(console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(description, total=total)
         yield lambda: bar.advance(task)

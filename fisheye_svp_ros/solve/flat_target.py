@@ -47,7 +47,7 @@ def _centred(views: Views) -> tuple[Array, Array]:
 def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
     """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
     sight = pose.inverse().transform(centre)
-    along = sight / np.linalg.norm(sight, axis=-1, keepdims=True)
+    along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
     to_camera = _mirror(along) @ np.swapaxes(pose.rotation, -1, -2) @ _mirror(normal)
     rotation = np.swapaxes(to_camera, -1, -2)
     return Pose(rotation, centre - (rotation @ sight[..., None])[..., 0])
