@@ -10,7 +10,6 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, is_shared, start_poses
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.pose import Pose
 
 FRAME_FOLDS = 5
 LANDMARK_FOLDS = 5
@@ -28,7 +27,7 @@ def held_out_gain(
     if not is_shared(effect):
         return {'frames': _survey_gain(data, linear.state, free, effect)}
     extra = linear.effect_columns(effect)
-    frames = np.broadcast_to(_frame_folds(data)[:, None], linear.residual.shape)
+    frames = np.broadcast_to(frame_folds(data)[:, None], linear.residual.shape)
     landmarks = np.unique(linear.rows.landmark, return_inverse=True)[1] % LANDMARK_FOLDS
     both = [linear.shared_columns, np.concatenate([linear.shared_columns, extra], axis=-1)]
     gains = {}
@@ -37,12 +36,16 @@ def held_out_gain(
         ('landmarks', landmarks.reshape(frames.shape), False),
         ('range_bands', _range_bands(linear), False),
     ):
-        before, after = (_misfit(linear, columns, folds, whole_frames) for columns in both)
+        before, after = (
+            float((predicted_residuals(linear, columns, folds, whole_frames) ** 2).sum())
+            for columns in both
+        )
         gains[name] = before - after
     return gains
 
 
-def _frame_folds(data: Data) -> Index:
+def frame_folds(data: Data) -> Index:
+    """Return the fold (F,) of each frame."""
     return np.asarray(np.arange(data.frames) % min(FRAME_FOLDS, data.frames))
 
 
@@ -55,25 +58,28 @@ def _range_bands(linear: Linearised) -> Index:
     return np.searchsorted(edges, blocks)
 
 
-def _misfit(linear: Linearised, columns: Array, folds: Index, whole_frames: bool) -> float:
-    """Sum of squared residuals of rows in turn held out, the rest fitted.
+def predicted_residuals(
+    linear: Linearised, columns: Array, folds: Index, whole_frames: bool
+) -> Array:
+    """Return residuals (F, M) of rows in turn held out, the rest fitted, whitened.
 
     whole_frames: held-out frames fit their own pose (all else fixed); otherwise every frame's
     pose comes from the rows that were kept.
     """
-    total = 0.0
+    predicted = np.zeros_like(linear.residual)
     stacked = np.concatenate([columns, linear.residual[..., None]], axis=-1)
     clean = _less_poses(linear, stacked, np.ones(folds.shape, dtype=bool))
     for fold in np.unique(folds[linear.rows.used]):
         kept = folds != fold
         if not whole_frames:
             clean = _less_poses(linear, stacked, kept)
-        flat = clean.reshape(-1, clean.shape[-1])
-        train, test = flat[(kept & linear.rows.used).ravel()], flat[(~kept).ravel()]
+        train, test = clean[kept & linear.rows.used], clean[~kept]
         norms = np.maximum(np.sqrt((train[:, :-1] ** 2).sum(axis=0)), 1e-12)
-        values = np.linalg.lstsq(train[:, :-1] / norms, train[:, -1], rcond=1e-6)[0] / norms
-        total += float(((test[:, -1] - test[:, :-1] @ values) ** 2).sum())
-    return total
+        scaled = train[:, :-1] / norms
+        gram = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
+        values = gram @ (scaled.T @ train[:, -1]) / norms
+        predicted[~kept] = test[:, -1] - test[:, :-1] @ values
+    return predicted
 
 
 def _less_poses(linear: Linearised, columns: Array, kept: Mask) -> Array:
@@ -82,41 +88,35 @@ def _less_poses(linear: Linearised, columns: Array, kept: Mask) -> Array:
     return np.asarray(columns - poses @ (inverse @ (columns * kept[..., None])))
 
 
-def _survey_gain(data: Data, state: State, free: Sequence[str], effect: Effect) -> float:
-    term = (effect, np.zeros(len(effect.parameters)))
-    extended = replace(state, terms=(*state.terms, term))
-    return sum(
-        misfit(test, fit(train, _part(state, mine), free, 6))
-        - misfit(test, fit(train, _part(extended, mine), free, 6))
-        for mine, train, test in _splits(data, 3)
-    )
-
-
 def misfit(test: Data, trained: State) -> float:
     """Whitened misfit of other frames: their poses are fitted, all else is as trained."""
     return float((Linearised(test, start_poses(test, trained), ()).residual ** 2).sum())
 
 
-def _splits(data: Data, count: int) -> list[tuple[Index, Data, Data]]:
+def splits(data: Data, state: State, count: int) -> list[tuple[State, Data, Data]]:
+    """Return, for frames held out in turn, the state of the others, the others, the held out."""
     folds = np.arange(data.frames) % min(count, data.frames)
-    return [
-        (np.flatnonzero(folds != fold), *_split(data, folds == fold))
-        for fold in range(int(folds.max()) + 1)
-    ]
-
-
-def _split(data: Data, held: Mask) -> tuple[Data, Data]:
     parts = []
-    for chosen in (~held, held):
-        views = chosen[data.frame_of]
-        frame_of = np.unique(data.frame_of[views], return_inverse=True)[1].reshape(-1)
-        poses = None if data.poses is None else data.poses.take(np.flatnonzero(chosen))
-        parts.append(
-            Data(data.observations, data.views.take(views), frame_of, data.camera_of[views], poses)
-        )
-    return parts[0], parts[1]
+    for fold in range(int(folds.max()) + 1):
+        kept = np.flatnonzero(folds != fold)
+        part = replace(state, pose=state.pose.take(kept))
+        parts.append((part, _chosen(data, folds != fold), _chosen(data, folds == fold)))
+    return parts
 
 
-def _part(state: State, frames: Index) -> State:
-    return replace(state, pose=Pose(*state.pose).take(frames))
+def _survey_gain(data: Data, state: State, free: Sequence[str], effect: Effect) -> float:
+    gain = 0.0
+    for part, train, test in splits(data, state, 3):
+        term = (effect, np.zeros(len(effect.parameters)))
+        extended = replace(part, terms=(*part.terms, term))
+        gain += misfit(test, fit(train, part, free)) - misfit(test, fit(train, extended, free))
+    return gain
 
+
+def _chosen(data: Data, frames: Mask) -> Data:
+    views = frames[data.frame_of]
+    frame_of = np.unique(data.frame_of[views], return_inverse=True)[1].reshape(-1)
+    poses = None if data.poses is None else data.poses.take(frames)
+    return Data(
+        data.observations, data.views.take(views), frame_of, data.camera_of[views], poses
+    )

@@ -12,8 +12,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.camera import lens_columns
 from fisheye_svp_ros.effects.base import Effect, Scene
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.lens import INTRINSICS, Lens
 from fisheye_svp_ros.observations import Observations, Views, group_views
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
@@ -49,7 +49,8 @@ class Data:
         shape = (self.frames, self.cameras, *values.shape[1:])
         blocks = np.zeros(shape)
         blocks[self.frame_of, self.camera_of] = values
-        return blocks.reshape(self.frames, -1, *values.shape[3:])
+        rows = self.cameras * values.shape[1] * values.shape[2]
+        return blocks.reshape(self.frames, rows, *values.shape[3:])
 
 
 @dataclass(frozen=True)
@@ -223,15 +224,17 @@ def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
     return scale
 
 
-def fit(data: Data, state: State, free: Sequence[str], max_iterations: int = 30) -> State:
+def fit(data: Data, state: State, free: Sequence[str]) -> State:
     """Refit poses, rig, free intrinsics and effect values together (maximum likelihood).
 
     The frames are the blocks of one arrow; with all landmarks free, the landmarks are.
     """
-    survey = survey_of(state.terms)
-    problem = _Fit(data, state, free) if survey is None else _SurveyFit(data, state, free)
-    solved = levenberg_marquardt(problem, problem.pack(state), max_iterations)
-    return problem.unpack(solved.state)
+    problem: _Fit = _Fit(data, state, free)
+    iterations = 30
+    if survey_of(state.terms) is not None:
+        # Free landmarks leave the target's own place open: after a few steps only that moves.
+        problem, iterations = _SurveyFit(data, state, free), 6
+    return problem.unpack(levenberg_marquardt(problem, problem.pack(state), iterations).state)
 
 
 def fit_poses(data: Data, state: State) -> State:
@@ -327,7 +330,7 @@ def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arr
     if not np.isfinite(cost):
         residual, block, shared = (np.zeros_like(a) for a in (residual, block, shared))
         cost = np.inf
-    flat = shared.reshape(-1, shared.shape[-1])
+    flat = flat_rows(shared)
     transposed = np.ascontiguousarray(np.swapaxes(block, -1, -2))
     equations = ArrowEquations(
         (transposed @ block)[None],
@@ -352,8 +355,13 @@ def landmark_groups(landmark: Index, used: Mask) -> Index:
 
 def gather(columns: Array, group: Index) -> Array:
     """Return columns (F, M, P) by group, (L, m, P), zero for padding."""
-    flat = columns.reshape(-1, columns.shape[-1])
+    flat = flat_rows(columns)
     return np.concatenate([flat, np.zeros_like(flat[:1])])[group]
+
+
+def flat_rows(columns: Array) -> Array:
+    """Return columns (..., P) as (rows, P), also where P is 0."""
+    return columns.reshape(int(np.prod(columns.shape[:-1])), columns.shape[-1])
 
 
 def dense_frames(columns: Array) -> Array:

@@ -12,6 +12,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.criticism.model import (
     Linearised,
     dense_frames,
+    flat_rows,
     gather,
     landmark_groups,
     survey_of,
@@ -61,8 +62,8 @@ class Nuisance:
             place = linear.whitened(linear.linear.d_target)
             self._blocks = _block_basis(gather(place, self._group))
             shared = np.concatenate([dense_frames(linear.frame_columns), shared], axis=-1)
-        self.shared_basis = basis(self._outside_blocks(shared), _norms(shared)).reshape(
-            *self.shape, -1
+        self.shared_basis = _in_rows(
+            basis(self.outside_blocks(shared), _norms(shared)), self.shape
         )
         blocks = int((np.abs(self._blocks).sum(axis=1) > 0).sum())
         self.rank = blocks + self.shared_basis.shape[-1]
@@ -89,29 +90,30 @@ class Nuisance:
 
     def outside(self, columns: Array) -> Array:
         """Return columns (F, M, P) less their part inside the nuisance space."""
-        flat = self._outside_blocks(columns).reshape(-1, columns.shape[-1])
-        shared = self.shared_basis.reshape(len(flat), -1)
+        flat = flat_rows(self.outside_blocks(columns))
+        shared = flat_rows(self.shared_basis)
         flat = flat - shared @ (shared.T @ flat)
         return flat.reshape(columns.shape)
 
     def leverage(self, first: Array, second: Array) -> Array:
         """Return sums (K,) of the hat matrix over pairs of rows (flat indices)."""
-        shared = self.shared_basis.reshape(-1, self.shared_basis.shape[-1])
+        shared = flat_rows(self.shared_basis)
         inside = np.einsum('kr,kr->k', shared[first], shared[second])
         rows = self.shape[1]
         if self._group is None:
-            frame = self._blocks.reshape(-1, self._blocks.shape[-1])
+            frame = flat_rows(self._blocks)
             same = first // rows == second // rows
             inside = inside + same * np.einsum('kr,kr->k', frame[first], frame[second])
         return np.asarray(inside)
 
-    def _outside_blocks(self, columns: Array) -> Array:
+    def outside_blocks(self, columns: Array) -> Array:
+        """Return columns (F, M, P) less what poses (or free landmarks) take up of them."""
         if self._group is None:
             q = self._blocks
             return columns - q @ (np.swapaxes(q, -1, -2) @ columns)
         q, grouped = self._blocks, gather(columns, self._group)
         inside = q @ (np.swapaxes(q, -1, -2) @ grouped)
-        flat = columns.reshape(-1, columns.shape[-1]).copy()
+        flat = flat_rows(columns).copy()
         mine = self._group < len(flat)
         flat[self._group[mine]] -= inside[mine]
         return flat.reshape(columns.shape)
@@ -128,13 +130,13 @@ def score(
     """
     projected = nuisance.outside(columns)
     norms = np.maximum(_norms(columns), 1e-300)
-    q = basis(projected, norms).reshape(*nuisance.shape, -1)
+    q = _in_rows(basis(projected, norms), nuisance.shape)
     rank = q.shape[-1]
     if rank == 0:
         return Score(0.0, 0, 1.0, np.zeros(columns.shape[-1]))
     explained = np.einsum('fmr,fm->r', q, nuisance.residual)
     statistic = float((explained**2).sum())
-    flat = projected.reshape(-1, columns.shape[-1]) / norms
+    flat = flat_rows(projected) / norms
     gram = np.linalg.pinv(flat.T @ flat, rcond=IDENTIFIABLE**2, hermitian=True)
     estimate = gram @ (flat.T @ nuisance.residual.ravel()) / norms
     factor = inflation(q)
@@ -147,7 +149,9 @@ def p_value(nuisance: Nuisance, statistic: float, rank: int, inflation: float = 
     if left < 1 or rank == 0:
         return 1.0
     variance = max(nuisance.misfit - statistic, 1e-300) / left
-    return float(stats.f.sf(statistic / rank / variance / inflation, rank, left))
+    # An inflation is itself measured, on as many independent sums as there are frames.
+    known = left if inflation == 1.0 else max(min(left, nuisance.shape[0] - 1), 1)
+    return float(stats.f.sf(statistic / rank / variance / inflation, rank, known))
 
 
 def basis(columns: Array, norms: Array) -> Array:
@@ -155,7 +159,7 @@ def basis(columns: Array, norms: Array) -> Array:
 
     What has less than IDENTIFIABLE of its norm left is taken as nothing.
     """
-    flat = columns.reshape(-1, columns.shape[-1]) / np.maximum(norms, 1e-300)
+    flat = flat_rows(columns) / np.maximum(norms, 1e-300)
     if not flat.shape[1]:
         return flat
     # Orthonormal by eigenvectors of the Gram matrix, twice: as good as a QR, and it shows the rank.
@@ -164,6 +168,10 @@ def basis(columns: Array, norms: Array) -> Array:
     q = flat @ (vectors[:, kept] / np.sqrt(values[kept]))
     values, vectors = np.linalg.eigh(q.T @ q)
     return np.asarray(q @ (vectors / np.sqrt(np.maximum(values, 1e-30))))
+
+
+def _in_rows(flat: Array, shape: tuple[int, ...]) -> Array:
+    return flat.reshape(*shape, flat.shape[-1])
 
 
 def _norms(columns: Array) -> Array:

@@ -118,7 +118,7 @@ def _all_landmarks(
 
 
 def single_landmarks(
-    linear: Linearised, nuisance: Nuisance, correlation: Correlation
+    linear: Linearised, nuisance: Nuisance, correlation: Correlation | None
 ) -> list[tuple[Effect, Score, int]]:
     """Test the displacement of each landmark by itself, all at once.
 
@@ -142,7 +142,7 @@ def single_landmarks(
     statistic = np.einsum('la,la->l', estimate, gradient)
     ids = rows.landmark.ravel()[group[:, 0]]
     views = np.array([len(np.unique(frame[label == i])) for i in range(len(group))])
-    inflation = correlation.pooled
+    inflation = 1.0 if correlation is None else correlation.pooled
     return [
         (
             LandmarkSurveyEffect((int(ids[i]),)),

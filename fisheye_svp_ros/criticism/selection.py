@@ -68,7 +68,7 @@ def select(data: Data, state: State, free: Sequence[str]) -> Selection:
             break
         chosen = eligible[0]
         gains = held_out_gain(data, linear, free, chosen.effect)
-        good = gains['frames'] > 0 and sum(gains.values()) > 0
+        good = _worth(chosen, gains, linear, correlation)
         trace.append(_step(chosen, gains, good))
         if not good:
             refused.add(chosen.effect.key)
@@ -168,6 +168,19 @@ def indistinguishable(
     if alone is not None:
         own = replace(own, effect=effect, score=alone, merit=merit(nuisance, alone))
     return own, same
+
+
+def _worth(
+    candidate: Candidate, gains: dict[str, float], linear: Linearised, correlation: Correlation
+) -> bool:
+    """Whether held-out data gain a fair part of what the fitted data gain.
+
+    Where residuals depend on each other, a cause must also explain a hundredth of the misfit.
+    """
+    explained = candidate.score.statistic
+    fair = gains['frames'] > 0.2 * explained and sum(gains.values()) > 0
+    material = explained > 0.01 * float((linear.residual**2).sum())
+    return fair and (material or not correlation.dependent)
 
 
 def _is_survey(effect: Effect) -> bool:

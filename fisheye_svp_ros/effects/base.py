@@ -31,7 +31,7 @@ from fisheye_svp_ros.pose import Pose
 STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 
 
-class Untestable(Exception):  # noqa: N818 - not an error: an answer
+class Untestable(Exception):
     """The data lacks what an effect needs; the text says what."""
 
 
