@@ -15,12 +15,14 @@ _WIDE = 200  # columns where no terminal says how many it has
 
 def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table: the first column flush left, the others, numbers, flush right."""
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify='left')
+    table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(header):
         table.add_column(name, justify='right' if i else 'left', no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    console().print(table)
+    out = console()
+    out.print(title)
+    out.print(table)
 
 
 def console() -> Console:
