@@ -132,6 +132,7 @@ class CameraNode(BaseNode):
     def _advance(self) -> None:
         step = next(self._steps, None)
         if step is None:
+            self._timer.cancel()
             raise Finished('all sets are published')
         self._unanswered = set(self.settings.lock_step.split())
         self._sent = time.monotonic()

@@ -6,7 +6,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -51,10 +50,12 @@ class SolverSettings(Settings):
 class SolverNode(BaseNode):
     """Joins landmarks, image points, true poses and scenario by stamp; `solve` does the rest.
 
-    CAMERAS: the namespaces of the cameras, each with its slash; METRICS: all names in results.
+    CAMERAS: the namespaces of the cameras, each with its slash; METRICS: all names in results;
+    BY_SCENARIO: the scenario matters even where the lens is given.
     """
 
     CAMERAS: ClassVar[tuple[str, ...]] = ('',)
+    BY_SCENARIO: ClassVar[bool] = False
     METRICS: ClassVar[tuple[str, ...]]
     settings: SolverSettings
 
@@ -68,6 +69,7 @@ class SolverNode(BaseNode):
         poses = [f'{camera}true_pose' for camera in self.CAMERAS]
         self._join = StampJoin(points, [*poses, 'landmarks', 'scenario'])
         self._standing: LandmarkSet | None = None
+        self._in_series = False
         self.listen(
             PointCloud2, 'landmarks', messages.read_landmarks, self._hear_landmarks, LATCHED_INPUT
         )
@@ -78,6 +80,17 @@ class SolverNode(BaseNode):
         for topic in points:
             self._collect(PointCloud2, topic, messages.read_image_points)
         self.create_timer(0.1, self._work)
+
+    def prepare(self, settings: SolverSettings) -> SolverSettings:
+        """Refuse a lens that cannot be loaded."""
+        if settings.lens:
+            model_of(settings.lens, 1.0, settings.svp)
+        return settings
+
+    def configure(self, settings: SolverSettings) -> None:
+        """Do not wait for a scenario that nobody needs."""
+        if settings.lens and not self.BY_SCENARIO:
+            self._join.expect_no_more('scenario')
 
     @abstractmethod
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
@@ -124,8 +137,10 @@ class SolverNode(BaseNode):
         if stamp:
             self._join.add('landmarks', stamp, landmarks, time.monotonic())
         else:
-            self._standing = landmarks
             self._join.expect_no_more('landmarks')
+            self._in_series = False
+        if not self._in_series:
+            self._standing = landmarks
         self._work()
 
     def _work(self) -> None:
@@ -139,11 +154,10 @@ class SolverNode(BaseNode):
 
     def _attempt(self, stamp: int, items: Items) -> None:
         topic = f'{self.CAMERAS[0]}image_points'
-        own: LandmarkSet | None = items.get('landmarks')
-        if own is not None:
-            # Landmarks come set by set: those of another set must never stand in.
-            self._standing = None
-        landmarks = own or self._standing
+        landmarks: LandmarkSet | None = items.get('landmarks', self._standing)
+        if 'landmarks' in items:
+            # Landmarks come set by set: from now on those of another set never stand in.
+            self._in_series, self._standing = True, None
         try:
             if landmarks is None:
                 raise ObservationError(f'{topic}: no landmarks; publish them on `landmarks`')
@@ -153,9 +167,6 @@ class SolverNode(BaseNode):
             self.publish_result(stamp, {}, str(error), warn=True)
 
     def _give_up(self, items: Items) -> None:
-        if 'landmarks' in items:
-            # No image points claimed them: they were published once and hold until the next.
-            self._standing = items['landmarks']
         for topic in (f'{camera}image_points' for camera in self.CAMERAS):
             if topic in items:
                 self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
@@ -176,7 +187,6 @@ def true_rig(items: Items) -> Pose | None:
     return None if left is None or right is None else right.inverse().compose(left)
 
 
-@lru_cache(maxsize=64)
 def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
     """Return the forward model of a lens given by file or name.
 

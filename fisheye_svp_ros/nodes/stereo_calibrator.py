@@ -62,6 +62,7 @@ class StereoCalibrator(SolverNode):
     SETTINGS = StereoCalibratorSettings
     METRICS = STEREO_CALIBRATION_METRICS
     CAMERAS = tuple(f'{name}/' for name in STEREO)
+    BY_SCENARIO = True
     settings: StereoCalibratorSettings
 
     def __init__(self) -> None:
