@@ -69,7 +69,7 @@ def screen(
         ]
         if name == LandmarkSurveyEffect.name and nuisance.frame_basis is not None:
             tested = [(effect, result, 2) for effect, result, _ in tested]
-            tested += single_landmarks(linear, nuisance, correlation)
+            tested += single_landmarks(linear, nuisance)
         if all(result.rank == 0 for _, result, _ in tested):
             untestable[name] = 'what it would do is taken up by what is free already'
         for effect, result, count in tested:
@@ -90,7 +90,7 @@ def _test(
     linear: Linearised, nuisance: Nuisance, correlation: Correlation, effect: Effect
 ) -> Score:
     if isinstance(effect, LandmarkSurveyEffect) and effect.everywhere:
-        return _all_landmarks(linear, nuisance, correlation, effect)
+        return _all_landmarks(nuisance, effect)
     columns = linear.effect_columns(effect)
     result = score(nuisance, columns, correlation.inflation)
     bounded = [
@@ -101,28 +101,23 @@ def _test(
     return result._replace(p_value=1.0, statistic=0.0) if any(bounded) else result
 
 
-def _all_landmarks(
-    linear: Linearised, nuisance: Nuisance, correlation: Correlation,
-    effect: LandmarkSurveyEffect,
-) -> Score:
+def _all_landmarks(nuisance: Nuisance, effect: LandmarkSurveyEffect) -> Score:
     nothing = np.zeros(len(effect.parameters))
     if nuisance.frame_basis is None or nuisance.freedom < 1.5 * len(nothing):
         return Score(0.0, 0, 1.0, nothing, 1.0)
     freed = nuisance.with_survey(effect)
     statistic = nuisance.misfit - freed.misfit
     rank = freed.rank - nuisance.rank
-    inflation = correlation.pooled
-    return Score(
-        statistic, rank, p_value(nuisance, statistic, rank, inflation), nothing, inflation
-    )
+    return Score(statistic, rank, p_value(nuisance, statistic, rank), nothing)
 
 
 def single_landmarks(
-    linear: Linearised, nuisance: Nuisance, correlation: Correlation | None
+    linear: Linearised, nuisance: Nuisance
 ) -> list[tuple[Effect, Score, int]]:
     """Test the displacement of each landmark by itself, all at once.
 
     Every score needs only the rows of its own landmark: the nuisance enters through its basis.
+    Each frame shows a landmark once, so what a frame's residuals share does not add up here.
     """
     assert nuisance.frame_basis is not None
     rows, (frames, height) = linear.rows, nuisance.shape
@@ -142,13 +137,11 @@ def single_landmarks(
     statistic = np.einsum('la,la->l', estimate, gradient)
     ids = rows.landmark.ravel()[group[:, 0]]
     views = np.array([len(np.unique(frame[label == i])) for i in range(len(group))])
-    inflation = 1.0 if correlation is None else correlation.pooled
     return [
         (
             LandmarkSurveyEffect((int(ids[i]),)),
             Score(
-                float(statistic[i]), 3, p_value(nuisance, float(statistic[i]), 3, inflation),
-                estimate[i], inflation,
+                float(statistic[i]), 3, p_value(nuisance, float(statistic[i]), 3), estimate[i]
             ),
             2 * len(group),
         )

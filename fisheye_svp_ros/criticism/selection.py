@@ -10,7 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.criticism.correlation import Correlation, judge_correlation
 from fisheye_svp_ros.criticism.held_out import held_out_gain
-from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit
+from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, survey_of
 from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transferred
 from fisheye_svp_ros.effects.base import Effect, Untestable
@@ -20,7 +20,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
-MAX_STEPS = 12
+MAX_STEPS = 20
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def select(data: Data, state: State, free: Sequence[str]) -> Selection:
         eligible = [c for c in screening.eligible(SIGNIFICANCE) if c.effect.key not in refused]
         if not eligible or len(trace) >= MAX_STEPS:
             break
-        chosen = eligible[0]
+        chosen = _first(eligible)
         gains = held_out_gain(data, linear, free, chosen.effect)
         good = _worth(chosen, gains, linear, correlation)
         trace.append(_step(chosen, gains, good))
@@ -115,10 +115,9 @@ def settle(data: Data, selection: Selection, free: Sequence[str]) -> Selection:
     A first choice may have been a compromise between two causes that only together explain.
     """
     state, trace = selection.state, selection.trace
-    for name in [effect.name for effect, _ in state.terms if effect.stage != 'noise']:
-        if len(state.terms) < 2 and len(trace) > 1:
-            break
-        effect, values = next(term for term in state.terms if term[0].name == name)
+    if len(state.terms) < 2 or survey_of(state.terms) is not None:
+        return selection
+    for name in [effect.name for effect, _ in state.terms]:
         rest = fit(data, without_effect(state, name), free)
         linear = Linearised(data, rest, free)
         screening = screen(linear, Nuisance(linear), selection.correlation)
@@ -130,7 +129,7 @@ def settle(data: Data, selection: Selection, free: Sequence[str]) -> Selection:
             selection.evidence.pop(name, None)
         elif eligible[0].effect.name != name and not _in_model(state, eligible[0].effect.name):
             better = eligible[0]
-            if better.merit > own[0].merit + 6 and len(state.terms) > 1:
+            if better.merit > own[0].merit + 6:
                 state = fit(data, with_effect(rest, better.effect, better.score.estimate), free)
                 trace.append(_gone(name, f'{better.effect.name} explains more'))
                 selection.evidence.pop(name, None)
@@ -147,7 +146,11 @@ def indistinguishable(
     needed (p above CLASS_SIGNIFICANCE): then the data cannot refuse the other one.
     """
     effect, _ = next(term for term in state.terms if term[0].name == name)
-    rest = fit(data, without_effect(state, name), free)
+    rest = without_effect(state, name)
+    if effect.stage == 'target' and not _is_survey(effect):
+        # Free landmarks contain every other effect on the target: ask without them.
+        rest = without_effect(rest, 'landmark_survey')
+    rest = fit(data, rest, free)
     linear = Linearised(data, rest, free)
     nuisance = Nuisance(linear)
     own = screen(linear, nuisance, correlation, [name]).candidates[0]
@@ -170,15 +173,29 @@ def indistinguishable(
     return own, same
 
 
+def _first(eligible: Sequence[Candidate]) -> Candidate:
+    """Return the candidate to try: the best, but freeing every landmark explains nearly anything.
+
+    It comes last, when single landmarks are all that is left to name.
+    """
+    few = [c for c in eligible if not _is_survey(c.effect)]
+    named = [c for c in few if c.effect.name != 'landmark_survey']
+    return named[0] if named else eligible[0]
+
+
 def _worth(
     candidate: Candidate, gains: dict[str, float], linear: Linearised, correlation: Correlation
 ) -> bool:
     """Whether held-out data gain a fair part of what the fitted data gain.
 
-    Where residuals depend on each other, a cause must also explain a hundredth of the misfit.
+    Held-out landmarks say nothing of an effect on single landmarks or boards, and range bands
+    nothing of what only one band shows: they may object, frames decide.  Where residuals depend
+    on each other, a cause must also explain a hundredth of the misfit.
     """
     explained = candidate.score.statistic
-    fair = gains['frames'] > 0.2 * explained and sum(gains.values()) > 0
+    fair = gains['frames'] > 0.2 * explained
+    if candidate.effect.stage != 'target':
+        fair = fair and gains['landmarks'] > 0 and gains['range_bands'] > -explained
     material = explained > 0.01 * float((linear.residual**2).sum())
     return fair and (material or not correlation.dependent)
 

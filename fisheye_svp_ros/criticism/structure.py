@@ -149,7 +149,7 @@ def _frame_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
 
 def _landmark_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
     """Displacements of single landmarks, summed over the landmarks."""
-    found = single_landmarks(linear, nuisance, None)
+    found = single_landmarks(linear, nuisance)
     statistic = sum(result.statistic for _, result, _ in found)
     rank = sum(result.rank for _, result, _ in found)
     if not found:
