@@ -9,7 +9,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import STEREO, Observations, make_observations, views_of
+from fisheye_svp_ros.observations import STEREO, Observations, Views, make_observations, views_of
 from fisheye_svp_ros.pose import Pose
 
 
@@ -25,9 +25,10 @@ def simulate(
 ) -> Observations:
     """Return the image points of landmarks (N,) from poses (S,) of the camera in the world.
 
-    sigma: of Gaussian noise on u and on v, px; t (S,): time of each frame, s; board (N,): the
-    rigid piece of the target that carries each landmark.  Frames count from 0; what lies outside
-    the field of view or the image, or has no ray through the lens, is absent.
+    sigma: of Gaussian noise on u and on v, px, before the model's effects act on it; t (S,): time
+    of each frame, s; board (N,): the rigid piece of the target that carries each landmark.  Frames
+    count from 0; what lies outside the field of view or the image, or has no ray through the
+    lens, is absent.
     Raises ParameterError for a sigma below 0.
     """
     seen = _image_points(model, landmarks, poses, sigma, rng, t, board, camera=0)
@@ -72,8 +73,18 @@ def _image_points(
         t=np.broadcast_to(np.nan if t is None else t[:, None], shape),
     )
     uv = model.predict(poses, views).uv
-    uv = uv + sigma * rng.standard_normal(uv.shape)
-    return np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
+    uv = uv + sigma * _noise_scale(model, poses, views) * rng.standard_normal(uv.shape)
+    uv = np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
+    for effect, values in model.noise_terms:
+        uv = effect.recorded(uv, values, rng)
+    return uv
+
+
+def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array | float:
+    if not model.noise_terms:
+        return 1.0
+    scene = model.scene(poses, views, model.linearise(poses, views))
+    return np.broadcast_to(model.noise_scale(scene), views.uv.shape[:2])[..., None]
 
 
 def _inside(lens: Lens, uv: Array) -> Array:

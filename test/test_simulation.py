@@ -7,6 +7,9 @@ import pytest
 
 from fisheye_svp_ros.camera import project
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
+from fisheye_svp_ros.effects.quantisation import QuantisationEffect
+from fisheye_svp_ros.effects.wrong_ids import WrongIdsEffect
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.landmarks import Landmarks, environment
 from fisheye_svp_ros.lens import load_lens
@@ -88,3 +91,37 @@ def test_stereo_is_one_table_of_two_cameras():
         expected = project(lens, pose.into_body(mine.points)).uv
         np.testing.assert_array_equal(mine.uv[mine.used], expected[mine.used])
         np.testing.assert_array_equal(np.unique(mine.t[mine.used]), np.arange(10.0))
+
+
+def noisy(effect, values, sigma=0.2, frames=300):
+    """Return clean and noisy image points (frames, N, 2) with one effect of the noise."""
+    landmarks = environment('inner', 2.0)
+    terms = ((effect, np.array(values)),)
+    tables = (
+        simulate(ForwardModel(FISH180, some), landmarks, paper_pose(frames), noise, rng())
+        for some, noise in (((), 0.0), (terms, sigma))
+    )
+    return tuple(table.uv.reshape(frames, -1, 2) for table in tables)
+
+
+def test_noise_that_grows_with_the_angle():
+    clean, seen = noisy(NoiseVsAngleEffect(), [0.8], sigma=0.1)
+    points = paper_pose(1).into_body(environment('inner', 2.0).points)[0]
+    theta = np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2])
+    scatter = (seen - clean).std(axis=(0, 2))
+    np.testing.assert_allclose(scatter, 0.1 * np.exp(0.8 * theta**2), rtol=0.15)
+
+
+def test_rounded_image_points():
+    clean, seen = noisy(QuantisationEffect(), [0.25])
+    np.testing.assert_array_equal(seen / 0.25, np.round(seen / 0.25))
+    assert (seen - clean).std() == pytest.approx(np.hypot(0.2, 0.25 / np.sqrt(12)), rel=0.03)
+
+
+def test_image_points_swapped_with_others_of_their_view():
+    clean, seen = noisy(WrongIdsEffect(), [0.1], sigma=0.0)
+    wrong = np.any(seen != clean, axis=-1)
+    assert wrong.mean() == pytest.approx(0.1, abs=0.02)
+    assert (wrong.sum(axis=1) % 2 == 0).all()
+    for before, after in zip(clean, seen, strict=True):
+        assert sorted(map(tuple, before)) == sorted(map(tuple, after))

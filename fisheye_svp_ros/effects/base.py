@@ -178,6 +178,14 @@ class NoiseEffect(Effect):
     def columns(self, scene: Scene) -> Array:
         return np.empty((*scene.uv.shape[:2], 0, len(self.parameters)))
 
+    def noise_scale(self, scene: Scene, values: Array) -> Array | float:
+        """Factor (S, N) on the standard deviation of the noise."""
+        return 1.0
+
+    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
+        """Return noisy image points (S, N, 2), px, NaN for none, as a table would have them."""
+        return uv
+
 
 def require_time(scene: Scene, minimum: int) -> Array:
     """Return the times (S,) of the views; raise Untestable for fewer than `minimum` instants."""

@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.camera import Image, LinearImage, Rays, back_project, project
 from fisheye_svp_ros.camera import project_with_jacobian as _linear
-from fisheye_svp_ros.effects.base import Effect, Scene
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
@@ -51,6 +51,11 @@ class ForwardModel:
         self.terms = load_effects(lens.effects, lens.name) if terms is None else tuple(terms)
         self.lens = _extended(lens, self.terms)
 
+    @property
+    def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
+        """The effects that move no prediction, and their values."""
+        return [(e, values) for e, values in self.terms if isinstance(e, NoiseEffect)]
+
     def predict(self, pose: Pose, views: Views, limited: bool = True) -> Image:
         """Predict image points of views (S, N) from poses (S,) of the camera in the world.
 
@@ -84,6 +89,13 @@ class ForwardModel:
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
         """Return what effects may look at once the views are linearised."""
         return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
+
+    def noise_scale(self, scene: Scene) -> Array | float:
+        """Factor (S, N) on the standard deviation of the noise of each point."""
+        scale: Array | float = 1.0
+        for effect, values in self.noise_terms:
+            scale = scale * effect.noise_scale(scene, values)
+        return scale
 
     def effect_columns(self, effect: Effect, scene: Scene, linear: LinearViews) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""

@@ -29,6 +29,5 @@ class QuantisationEffect(NoiseEffect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('step', 'px', 1.0),)
 
-    def detected(self, uv: Array, values: Array) -> Array:
-        """Return the image points as the table would hold them."""
+    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         return np.asarray(np.round(uv / values[0]) * values[0])

@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
 
 
@@ -25,3 +28,12 @@ class WrongIdsEffect(NoiseEffect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('fraction', '1', 0.02),)
+
+    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
+        swapped = uv.copy()
+        for view, seen in enumerate(np.isfinite(uv).all(axis=-1)):
+            points = rng.permutation(np.flatnonzero(seen))
+            pairs = points[: len(points) // 2 * 2].reshape(-1, 2)
+            pairs = pairs[rng.random(len(pairs)) < values[0]]
+            swapped[view, pairs] = uv[view, pairs[:, ::-1]]
+        return swapped
