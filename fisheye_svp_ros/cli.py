@@ -17,9 +17,11 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 
 COMMANDS = {
     'calibrate': 'a lens from measured observations: poses unknown, no start values',
+    'demo': 'the whole node graph as processes, recorded, summarised and plotted',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
+    'table': 'a recording to a table, one row an input stamp',
 }
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it

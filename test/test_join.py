@@ -10,7 +10,7 @@ from fisheye_svp_ros.nodes import join
 from fisheye_svp_ros.nodes.join import StampJoin
 
 
-@pytest.mark.parametrize('order', itertools.permutations('lrt'))
+@pytest.mark.parametrize('order', list(itertools.permutations('lrt')))
 def test_a_set_is_ready_with_its_last_item(order: tuple[str, ...]) -> None:
     sets = StampJoin(('l', 'r'), ('t',))
     for n, topic in enumerate(order):

@@ -1,0 +1,149 @@
+"""`fisheye-svp demo`: the whole node graph as processes, recorded, summarised and plotted."""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.evaluation.demonstration import Shown
+
+_PATIENCE = 900.0  # s; only a hang takes this long
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    from fisheye_svp_ros.evaluation.paper_tables import LENSES
+    from fisheye_svp_ros.landmarks import RADII
+
+    parser.add_argument('-o', '--output', type=Path, default=Path('demo'), metavar='DIR',
+                        help='folder for the recording (an earlier one is replaced), demo.json, '
+                        'table.csv, table.parquet and pictures; default: demo')
+    parser.add_argument('--lenses', nargs='+', default=list(LENSES), choices=LENSES,
+                        metavar='LENS', help=f"the paper's lenses to run: {' '.join(LENSES)}")
+    parser.add_argument('--radii', nargs='+', type=float, default=list(RADII), choices=RADII,
+                        metavar='M', help="the paper's landmark distances to run, m: "
+                        + ' '.join(map(str, RADII)))
+
+
+def run(args: argparse.Namespace) -> None:
+    """Run the graph; make everything else from its recording."""
+    from fisheye_svp_ros.bags import Bag
+    from fisheye_svp_ros.evaluation.demonstration import shown
+    from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
+    from fisheye_svp_ros.reporting.columns import write_columns
+    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.reporting.results import write_json
+
+    bag = args.output / 'recording'
+    with progress('running the nodes'):
+        record(bag, args.output / 'logs', args.lenses, args.radii)
+    columns = tabulate(Bag(bag).records(is_tabulated))
+    rows = shown(columns, args.lenses, args.radii)
+    write_columns(args.output / 'table', columns)
+    write_json(args.output / 'demo.json', {
+        'recording': str(bag), 'rows': [row._asdict() for row in rows],
+    })
+    _print(rows)
+    _draw(args.output, bag, rows)
+    print(f'  recording, table, pictures: {args.output}')
+
+
+def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:
+    """Run the node graph through its scenarios, in lock-step, into a recording."""
+    from fisheye_svp_ros.commands.processes import Processes
+    from fisheye_svp_ros.evaluation.demonstration import TASKS
+
+    if bag.is_dir():
+        shutil.rmtree(bag)
+    cameras = []
+    with Processes(logs) as processes:
+        processes.start('recorder', ['record', '-o', str(bag)])
+        for task in TASKS:
+            processes.start(task.node, [
+                'run', task.node, *_ros(task.name, wait_for_subscribers=1, patience=_PATIENCE)
+            ])
+            cameras.append(f'camera_{task.name}')
+            processes.start(cameras[-1], ['run', 'synthetic_camera', *_ros(
+                task.name, **dict(_scenarios(task.name, lenses, radii)),
+                # The solver and the recorder.
+                wait_for_subscribers=2, lock_step=f'{task.node}/result', repeat='false',
+            )])
+        processes.wait(cameras, _PATIENCE)
+        processes.stop('recorder')
+        for task in TASKS:
+            processes.stop(task.node)
+
+
+def _scenarios(
+    task: str, lenses: Sequence[str], radii: Sequence[float]
+) -> Iterator[tuple[str, Any]]:
+    """Yield the camera's parameters for the scenarios of a task."""
+    from fisheye_svp_ros.evaluation.demonstration import DEPTH_POSES, TASKS
+
+    swept, values = next((t.swept, t.values) for t in TASKS if t.name == task)
+    yield 'sweep.lens', _list(lenses)
+    yield 'sweep.radius', _list(radii)
+    yield f'sweep.{swept}', _list(values)
+    if task == 'calibration':
+        yield 'poses_file', 'calibration'
+    if task == 'depth':
+        yield 'poses', _list([number for pose in DEPTH_POSES for number in pose])
+
+
+def _ros(namespace: str, **parameters: Any) -> list[str]:
+    words = ['--ros-args', '-r', f'__ns:=/{namespace}']
+    for name, value in parameters.items():
+        words += ['-p', f'{name}:={value}']
+    return words
+
+
+def _list(values: Sequence[Any]) -> str:
+    return '[' + ', '.join(map(str, values)) + ']'
+
+
+def _print(rows: Sequence[Shown]) -> None:
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    print_table(
+        'What the SVP approximation costs, beside the published numbers.  error: along the axis '
+        '(localization), of the left camera (calibration), of points (depth); image: mean '
+        'residual, for depth the distance from the epipolar curve',
+        ('', 'lens', 'radius m', 'where', 'error mm', 'published', 'axis deg', 'published',
+         'image px', 'published'),
+        [_cells(row) for row in rows],
+    )
+
+
+def _cells(row: Shown) -> tuple[str, ...]:
+    import numpy as np
+
+    def number(value: float, digits: int) -> str:
+        return '' if np.isnan(value) else f'{value:.{digits}f}'
+
+    def span(values: tuple[float, float], scale: float, digits: int) -> str:
+        low, high = (number(scale * value, digits) for value in values)
+        return low if low == high else f'{low} to {high}'
+
+    return (
+        row.task, row.lens, f'{row.radius:g}', row.where,
+        number(1e3 * row.error, 4), span(row.published_error, 1e3, 4),
+        number(np.degrees(row.axis_error), 4), number(np.degrees(row.published_axis_error), 4),
+        number(row.pixels, 4), span(row.published_pixels, 1, 4),
+    )
+
+
+def _draw(folder: Path, bag: Path, rows: Sequence[Shown]) -> None:
+    from fisheye_svp_ros.bags import Bag
+    from fisheye_svp_ros.evaluation.demonstration import has_residuals, residual_fields
+    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.reporting.plots import draw_comparison, draw_residual_fields
+    from fisheye_svp_ros.share import lens_path
+
+    fields = residual_fields(Bag(bag).records(has_residuals))
+    lenses = {name: load_lens(lens_path(name)) for name in {field.lens for field in fields}}
+    draw_comparison(rows, folder / 'errors.png')
+    draw_residual_fields(fields, lenses, folder / 'residuals.png')

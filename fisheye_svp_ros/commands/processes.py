@@ -1,0 +1,100 @@
+"""Commands of this package as processes of their own: started together, ended in order."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+
+from fisheye_svp_ros.errors import StandaloneError
+
+_POLL = 0.05  # s
+_GRACE = 10.0  # s to end after a signal
+
+
+class Processes:
+    """A context manager that leaves no process behind; each writes DIR/NAME.log."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._environment = {**os.environ, 'ROS_DOMAIN_ID': domain(), 'PYTHONUNBUFFERED': '1'}
+        self._environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def __enter__(self) -> Processes:
+        self._logs.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for process in self._running.values():
+            process.terminate()
+        for process in self._running.values():
+            try:
+                process.wait(_GRACE)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+    def start(self, name: str, arguments: Sequence[str]) -> None:
+        """Start `fisheye-svp ARGUMENTS`."""
+        command = [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments]
+        with self._log(name).open('wb') as log:
+            self._running[name] = subprocess.Popen(
+                command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+            )
+
+    def wait(self, names: Sequence[str], patience: float) -> None:
+        """Wait until some have ended well; raise StandaloneError where one does not in time."""
+        end = time.monotonic() + patience
+        waiting = set(names)
+        while waiting:
+            for name, process in list(self._running.items()):
+                status = process.poll()
+                if status is None:
+                    continue
+                if status or name not in waiting:
+                    raise StandaloneError(f'{name} ended with status {status}: {self._last(name)}')
+                waiting.discard(name)
+                del self._running[name]
+            if time.monotonic() > end:
+                raise StandaloneError(f'{", ".join(sorted(waiting))} took more than '
+                                      f'{patience:g} s: {self._last(min(waiting))}')
+            time.sleep(_POLL)
+
+    def stop(self, name: str) -> None:
+        """End one with SIGINT; raise StandaloneError unless it ends well."""
+        self._running[name].send_signal(signal.SIGINT)
+        self.wait([name], _GRACE * 6)
+
+    def _log(self, name: str) -> Path:
+        return self._logs / f'{name}.log'
+
+    def _last(self, name: str) -> str:
+        lines = self._log(name).read_text(encoding='utf-8', errors='replace').splitlines()
+        return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
+
+
+def domain() -> str:
+    """Return the user's ROS domain, or one that nobody on this machine is on."""
+    given = os.environ.get('ROS_DOMAIN_ID')
+    if given:
+        return given
+    for number in random.sample(range(1, 102), 101):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                # The port of the first participant of a domain (DDS-RTPS, section 9.6.1.1).
+                probe.bind(('127.0.0.1', 7400 + 250 * number + 10))
+            except OSError:
+                continue
+        return str(number)
+    raise StandaloneError('all ROS domains from 1 to 101 are taken; set ROS_DOMAIN_ID')
