@@ -132,6 +132,15 @@ def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
     return loaded.with_parameters(lengths, [shift_scale * values[name] for name in lengths])
 
 
+def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
+    """Return the forward model of a lens given by file or name.
+
+    Raises LensError where there is none.
+    """
+    loaded = true_lens(lens, shift_scale)
+    return ForwardModel(loaded.svp() if svp else loaded)
+
+
 def scenario_landmarks(scenario: Scenario) -> Landmarks:
     """Return the landmarks of a scenario, m, in the world."""
     path = Path(scenario.environment)

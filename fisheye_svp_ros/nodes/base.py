@@ -23,22 +23,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.parameters import Row, changed, parameter, rows
+from fisheye_svp_ros.parameters import Row, changed, rows
+from fisheye_svp_ros.settings import Settings
 
 # All topics are reliable; deep enough for a burst of inputs while a solver is busy.
 RELIABLE = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED_INPUT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Parameters that every node has."""
-
-    wait_for_subscribers: int = parameter(
-        0, 'Hold back what this node has to tell until so many subscriptions are there, '
-        'so that a recorder misses nothing', span=(0, 1000)
-    )
 
 
 S = TypeVar('S', bound=Settings)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,25 +16,13 @@ from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Finished, Settings
+from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Finished
 from fisheye_svp_ros.observations import Observations
-from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.settings import CameraSettings
 
 WORLD = 'world'
 _LONG = 5.0  # s without an answer that are worth a word
-
-
-@dataclass(frozen=True)
-class CameraSettings(Settings):
-    """Parameters of every camera."""
-
-    rate: float = parameter(10.0, 'Sets a second', 'Hz', (1e-3, 1e4))
-    repeat: bool = parameter(True, 'Start over after the last set; otherwise the node ends')
-    lock_step: str = parameter(
-        '', 'Result topics, separated by blanks: each set waits until all of them have answered '
-        'the one before; then `rate` does not count. Empty: do not wait'
-    )
 
 
 class CameraTopics:

@@ -15,9 +15,10 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS, localization_metrics
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.shapes import camera_shape
-from fisheye_svp_ros.nodes.solver import Items, SolverNode, SolverSettings
+from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.settings import SolverSettings
 from fisheye_svp_ros.solve.localization import Localization, localize
 
 

@@ -14,12 +14,13 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.lens import Lens, load_lens
 from fisheye_svp_ros.nodes.base import run
-from fisheye_svp_ros.nodes.camera import CameraNode, CameraSettings, rows_by_frame
+from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.observations import Observations
 from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
 from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.readers import read_observations, read_poses
+from fisheye_svp_ros.settings import CameraSettings
 from fisheye_svp_ros.share import lens_path
 
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*')

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,32 +18,14 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.messages import ImagePoints, LandmarkSet
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode, Settings
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode
 from fisheye_svp_ros.nodes.join import StampJoin
 from fisheye_svp_ros.observations import STEREO, Views, views_of
-from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scenario import true_lens
+from fisheye_svp_ros.scenario import model_of
+from fisheye_svp_ros.settings import SolverSettings
 
 Items = Mapping[str, Any]
-
-
-@dataclass(frozen=True)
-class SolverSettings(Settings):
-    """Parameters of every node that solves."""
-
-    lens: str = parameter(
-        '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
-        '`scenario` names'
-    )
-    svp: bool = parameter(True, 'Solve with the single-viewpoint approximation of the lens')
-    sigma_px: float = parameter(
-        1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
-    )
-    patience: float = parameter(
-        2.0, 'How long image points wait for what shares their stamp on other topics', 's',
-        (0.0, 3600.0)
-    )
 
 
 class SolverNode(BaseNode):
@@ -185,12 +166,3 @@ def true_rig(items: Items) -> Pose | None:
     """Return the left camera in the right one where both true poses are known."""
     left, right = (items.get(f'{camera}/true_pose') for camera in STEREO)
     return None if left is None or right is None else right.inverse().compose(left)
-
-
-def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
-    """Return the forward model of a lens given by file or name.
-
-    Raises LensError where there is none.
-    """
-    loaded = true_lens(lens, shift_scale)
-    return ForwardModel(loaded.svp() if svp else loaded)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +18,6 @@ from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
-    SolverSettings,
     known_points,
     true_rig,
 )
@@ -29,7 +27,7 @@ from fisheye_svp_ros.observations import (
     make_observations,
     stereo_views,
 )
-from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.settings import StereoCalibratorSettings
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 
 # What tells the sets of one scenario from each other; all else tells scenarios apart.
@@ -43,16 +41,6 @@ class _Seen(NamedTuple):
     uv: Array
     xyz: Array
     camera: Index
-
-
-@dataclass(frozen=True)
-class StereoCalibratorSettings(SolverSettings):
-    """Parameters of the stereo calibrator."""
-
-    views: int = parameter(
-        10, 'Calibrate from this many of the last sets of a scenario, or as many as there are',
-        span=(1, 1000)
-    )
 
 
 class StereoCalibrator(SolverNode):

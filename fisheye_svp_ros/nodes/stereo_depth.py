@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import PointCloud2
@@ -17,32 +15,17 @@ from fisheye_svp_ros.nodes.base import LATCHED_INPUT, run
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
-    SolverSettings,
     known_points,
     true_rig,
 )
 from fisheye_svp_ros.observations import STEREO
-from fisheye_svp_ros.parameters import parameter
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.settings import StereoDepthSettings
 from fisheye_svp_ros.solve.stereo_depth import (
     epipolar_offset,
     triangulate,
     triangulate_optimally,
 )
-
-
-@dataclass(frozen=True)
-class StereoDepthSettings(SolverSettings):
-    """Parameters of stereo depth."""
-
-    rig: str = parameter(
-        'true', 'The rig to measure with: the true one, or the latest on the topic `rig`, as the '
-        'stereo calibrator publishes it', choices=('true', 'topic')
-    )
-    optimal: bool = parameter(
-        False, 'Find the point of least reprojection error rather than the one halfway between '
-        'the two rays'
-    )
 
 
 class StereoDepth(SolverNode):

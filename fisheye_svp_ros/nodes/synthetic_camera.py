@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,20 +13,16 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, CameraSettings, rows_by_frame
+from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.shapes import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.observations import Observations
 from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
 from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, rows, sweep_of
 from fisheye_svp_ros.scenario import Scenario, Simulation, camera_names, simulate_scenario
+from fisheye_svp_ros.settings import SyntheticCameraSettings
 
 # Sweeping one of these may name a file that cannot be read: found out before anything runs.
 _READ_FILES = ('lens', 'environment', 'poses_file')
-
-
-@dataclass(frozen=True)
-class SyntheticCameraSettings(CameraSettings, Scenario):
-    """Parameters of the synthetic camera."""
 
 
 class Step(NamedTuple):
