@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -92,8 +91,15 @@ class Sweep:
         return math.prod(map(len, self.lists.values()))
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        for point in itertools.product(*self.lists.values()):
-            yield dict(zip(self.lists, point, strict=True))
+        return map(self.point, range(len(self)))
+
+    def point(self, number: int) -> dict[str, Any]:
+        """Return one combination of values, counted from 0."""
+        values = {}
+        for name in reversed(tuple(self.lists)):
+            number, place = divmod(number, len(self.lists[name]))
+            values[name] = self.lists[name][place]
+        return {name: values[name] for name in self.lists}
 
 
 def sweep_of(table: Any, parameters: Mapping[str, Any]) -> Sweep:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.landmarks import Landmarks, environment, load_landmarks
 from fisheye_svp_ros.lens import Lens, load_lens
 from fisheye_svp_ros.observations import STEREO, Observations
-from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.parameters import Sweep, changed, parameter, rows
 from fisheye_svp_ros.pose import (
     Pose,
     rotation_from_quaternion,
@@ -31,6 +31,8 @@ from fisheye_svp_ros.simulation import simulate, simulate_stereo
 
 MONO = 'mono'
 CALIBRATION = 'calibration'
+# Sweeping one of these may name a file that cannot be read: found out before anything runs.
+_READ_FILES = ('lens', 'environment', 'poses_file')
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,9 @@ class Scenario:
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
 
 
+SCALARS = tuple(row.name for row in rows(Scenario) if not isinstance(row.default, tuple))
+
+
 class Simulation(NamedTuple):
     """What the cameras of a scenario see.
 
@@ -88,10 +93,11 @@ class Simulation(NamedTuple):
     rig: Pose | None
 
 
-def simulate_scenario(scenario: Scenario, repetition: int = 0) -> Simulation:
+def simulate_scenario(scenario: Scenario, number: int = 0, repetition: int = 0) -> Simulation:
     """Simulate all sets of a scenario.
 
-    repetition: draws other noise.  Raises FisheyeSvpError for a lens, landmarks or poses that
+    number: of the scenario in its sweep; repetition: of the sweep; each draws noise of its own.
+    Raises FisheyeSvpError for a lens, landmarks or poses that
     cannot be used.
     """
     lens = true_lens(scenario.lens, scenario.shift_scale)
@@ -99,12 +105,30 @@ def simulate_scenario(scenario: Scenario, repetition: int = 0) -> Simulation:
         scenario_landmarks(scenario), scenario_rig(scenario), scenario_poses(scenario)
     )
     model, sigma = ForwardModel(lens), scenario.noise_px
-    rng = np.random.default_rng([scenario.seed, repetition])
+    rng = noise_generator(scenario.seed, number, repetition)
     if rig is None:
         seen = simulate(model, landmarks, poses, sigma, rng)
         return Simulation(lens, landmarks, seen, (poses,), None)
     seen = simulate_stereo(model, model, landmarks, rig, poses, sigma, rng)
     return Simulation(lens, landmarks, seen, (poses.compose(rig), poses), rig)
+
+
+def noise_generator(seed: int, number: int, repetition: int = 0) -> np.random.Generator:
+    """Return the source of a scenario's noise: its own for each scenario and repetition."""
+    return np.random.default_rng([seed, number, repetition])
+
+
+def check_sweep(base: Scenario, sweep: Sweep) -> None:
+    """Raise FisheyeSvpError where a sweep names a lens, landmarks or poses that are unusable."""
+    for name in _READ_FILES:
+        for value in sweep.lists.get(name, ()):
+            simulate_scenario(changed(base, {name: value}))
+    simulate_scenario(changed(base, sweep.point(0)))
+
+
+def scalars(scenario: Scenario) -> dict[str, Any]:
+    """Return the parameters of a scenario that are single values, as `scenario` tells them."""
+    return {name: getattr(scenario, name) for name in SCALARS}
 
 
 def camera_names(style: str) -> tuple[str, ...]:

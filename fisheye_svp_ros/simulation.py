@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
@@ -31,7 +33,8 @@ def simulate(
     lens, is absent.
     Raises ParameterError for a sigma below 0.
     """
-    seen = _image_points(model, landmarks, poses, sigma, rng, t, board, camera=0)
+    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
+    seen = recorded(model, predicted(model, poses, views), sigma, rng)
     return _table(seen[:, None], landmarks, sigma, t, board, ('',))
 
 
@@ -51,38 +54,55 @@ def simulate_stereo(
 
     rig: left camera in the right one; poses (S,) of the right camera in the world.
     """
+    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
     seen = [
-        _image_points(model, landmarks, place, sigma, rng, t, board, camera)
+        recorded(model, predicted(model, place, views._replace(camera=views.camera + camera)),
+                 sigma, rng)
         for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
     ]
     return _table(np.stack(seen, axis=1), landmarks, sigma, t, board, STEREO)
 
 
-def _image_points(
-    model: ForwardModel, landmarks: Landmarks, poses: Pose, sigma: float,
-    rng: np.random.Generator, t: Array | None, board: Index | None, camera: int,
-) -> Array:
-    """Return image points (S, N, 2), px, NaN where there is none."""
-    if not (np.isfinite(sigma) and sigma >= 0):
-        raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
-    shape = (len(poses.position), len(landmarks.ids))
-    views = views_of(landmarks.points, np.zeros((*shape, 2)))._replace(
-        landmark=np.broadcast_to(landmarks.ids, shape),
-        camera=np.full(shape[0], camera),
+class Predicted(NamedTuple):
+    """Image points (S, N, 2), px, without noise; scale: factor (S, N, 1) on the noise."""
+
+    uv: Array
+    scale: Array
+
+
+def blank_views(
+    ids: Index, points: Array, count: int, t: Array | None = None, board: Index | None = None
+) -> Views:
+    """Return `count` views to be filled of landmarks (N,) or (S, N) at points (..., N, 3), m."""
+    shape = (count, ids.shape[-1])
+    return views_of(points, np.zeros((*shape, 2)))._replace(
+        landmark=np.broadcast_to(ids, shape),
         board=np.broadcast_to(0 if board is None else board, shape),
         t=np.broadcast_to(np.nan if t is None else t[:, None], shape),
     )
-    uv = model.predict(poses, views).uv
-    uv = uv + sigma * _noise_scale(model, poses, views) * rng.standard_normal(uv.shape)
+
+
+def predicted(model: ForwardModel, poses: Pose, views: Views) -> Predicted:
+    """Return what a camera at poses (S,) sees of views (S, N) before the noise."""
+    return Predicted(model.predict(poses, views).uv, _noise_scale(model, poses, views))
+
+
+def recorded(
+    model: ForwardModel, seen: Predicted, sigma: float, rng: np.random.Generator
+) -> Array:
+    """Return image points (S, N, 2), px, with noise; NaN where there is none."""
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
+    uv = seen.uv + sigma * seen.scale * rng.standard_normal(seen.uv.shape)
     uv = np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
     for effect, values in model.noise_terms:
         uv = effect.recorded(uv, values, rng)
     return uv
 
 
-def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array | float:
+def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array:
     if not model.noise_terms:
-        return 1.0
+        return np.ones((*views.uv.shape[:2], 1))
     scene = model.scene(poses, views, model.linearise(poses, views))
     return np.broadcast_to(model.noise_scale(scene), views.uv.shape[:2])[..., None]
 

@@ -99,7 +99,7 @@ def test_the_noise_is_that_of_the_seed_and_new_in_each_repetition(
     g.start(SyntheticCamera)
     g.until(lambda: len(points) >= 3)
     for repetition in range(3):
-        wanted = simulate_scenario(Scenario(noise_px=0.5, seed=7), repetition).observations.uv
+        wanted = simulate_scenario(Scenario(noise_px=0.5, seed=7), 0, repetition).observations.uv
         assert np.array_equal(messages.read_image_points(points[repetition]).uv, wanted)
 
 

@@ -17,12 +17,16 @@ from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.shapes import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.observations import Observations
 from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
-from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, rows, sweep_of
-from fisheye_svp_ros.scenario import Scenario, Simulation, camera_names, simulate_scenario
+from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, sweep_of
+from fisheye_svp_ros.scenario import (
+    Scenario,
+    Simulation,
+    camera_names,
+    check_sweep,
+    scalars,
+    simulate_scenario,
+)
 from fisheye_svp_ros.settings import SyntheticCameraSettings
-
-# Sweeping one of these may name a file that cannot be read: found out before anything runs.
-_READ_FILES = ('lens', 'environment', 'poses_file')
 
 
 class Step(NamedTuple):
@@ -57,10 +61,7 @@ class SyntheticCamera(CameraNode):
 
     def prepare(self, settings: SyntheticCameraSettings) -> SyntheticCameraSettings:
         """Refuse settings of which a scenario cannot be simulated."""
-        for name in _READ_FILES:
-            for value in self._sweep.lists.get(name, ()):
-                simulate_scenario(changed(settings, {name: value}))
-        simulate_scenario(changed(settings, next(iter(self._sweep))))
+        check_sweep(settings, self._sweep)
         return settings
 
     def configure(self, settings: SyntheticCameraSettings) -> None:
@@ -92,7 +93,7 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
     for repetition in itertools.count():
         for number, swept in enumerate(sweep):
             scenario = changed(settings, swept)
-            simulation = simulate_scenario(scenario, repetition)
+            simulation = simulate_scenario(scenario, number, repetition)
             svp_lens = kannala_brandt_equivalent(simulation.lens)
             table = simulation.observations
             rows_of = rows_by_frame(table)
@@ -104,12 +105,6 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
                 yield Step(number, frame, scenario, swept, simulation, seen, svp_lens)
         if not settings.repeat:
             return
-
-
-def scalars(scenario: Scenario) -> dict[str, Any]:
-    """Return the parameters of a scenario that are single values."""
-    names = [row.name for row in rows(Scenario) if not isinstance(row.default, tuple)]
-    return {name: getattr(scenario, name) for name in names}
 
 
 def _shapes(step: Step) -> Iterator[messages.Segments]:
