@@ -17,7 +17,9 @@ from fisheye_svp_ros.arrays import Array
 class ImageHeight(Protocol):
     """An image-height curve for unit focal length; monotone from 0 up to `limit`."""
 
-    coefficient_names: ClassVar[tuple[str, ...]]
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
 
     @property
     def coefficients(self) -> tuple[float, ...]:
@@ -40,7 +42,9 @@ class ImageHeight(Protocol):
 class ViewpointShift(Protocol):
     """A viewpoint-shift curve s(theta), m."""
 
-    coefficient_names: ClassVar[tuple[str, ...]]
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """Names of the coefficients."""
 
     @property
     def coefficients(self) -> tuple[float, ...]:

@@ -11,7 +11,8 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.criticism.model import Linearised
-from fisheye_svp_ros.criticism.projection import Nuisance, basis
+from fisheye_svp_ros.criticism.projection import Nuisance
+from fisheye_svp_ros.criticism.projection import p_value as p_value_of
 from fisheye_svp_ros.effects.base import Untestable
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
@@ -23,14 +24,13 @@ _DEPENDENT = 1e-3
 class Correlation:
     """Neighbour correlation of residuals and the inflation of sums that follows from it.
 
-    coefficient: mean product of neighbours' residuals over the variance; p_value: of independence,
-    one-sided; inflation: of a test's directions (F, M, R); pooled: over generic directions.
+    coefficient: mean product of neighbours' residuals over the variance; p_value: of independence
+    of neighbours, or of points that share a frame; inflation: of a test's directions (F, M, R).
     """
 
     coefficient: float
     p_value: float
     inflation: Callable[[Array], float]
-    pooled: float
 
     @property
     def dependent(self) -> bool:
@@ -47,8 +47,9 @@ def judge_correlation(linear: Linearised, generic: Array) -> Correlation:
     """
     saturated = Nuisance(linear, generic)
     coefficient, p_value = neighbour_correlation(linear, saturated)
+    p_value = min(p_value, frame_fields(linear, saturated)[0])
     if p_value >= _DEPENDENT:
-        return Correlation(coefficient, p_value, lambda _: 1.0, 1.0)
+        return Correlation(coefficient, p_value, lambda _: 1.0)
     survey = everywhere(linear)
     if survey is not None and saturated.frame_basis is not None:
         saturated = Nuisance(linear, generic, survey)
@@ -64,9 +65,7 @@ def judge_correlation(linear: Linearised, generic: Array) -> Correlation:
         by_landmark = (sums**2).sum() / rank / variance
         return float(max(1.0, by_frame, by_frame + by_landmark - 1.0))
 
-    shape = generic.shape
-    q = basis(generic, np.sqrt((generic**2).sum(axis=(0, 1)))).reshape(*shape[:2], -1)
-    return Correlation(coefficient, p_value, inflation, inflation(q))
+    return Correlation(coefficient, p_value, inflation)
 
 
 def everywhere(linear: Linearised) -> LandmarkSurveyEffect | None:
@@ -100,6 +99,38 @@ def neighbour_correlation(linear: Linearised, nuisance: Nuisance) -> tuple[float
     return (products - expected) / variance / count, float(stats.norm.sf(z))
 
 
+def frame_fields(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
+    """Test for smooth second-degree fields over the image, each frame with one of its own.
+
+    Returns the p-value of their sum and the share of the residual's squares that they hold.
+    """
+    x, y = np.moveaxis(np.nan_to_num(linear.scene.normalised()), -1, 0)
+    field = linear.whitened(np.stack(both_axes(monomials(x, y, 2)), axis=-1))
+    free = nuisance.frame_basis
+    if free is not None:
+        field = field - free @ (np.swapaxes(free, -1, -2) @ field)
+    norms = np.sqrt((field**2).sum(axis=1, keepdims=True))
+    u, s, _ = np.linalg.svd(field / np.maximum(norms, 1e-12), full_matrices=False)
+    u = u * (s > 1e-3)[:, None, :]
+    statistic = float((np.einsum('fmr,fm->fr', u, nuisance.residual) ** 2).sum())
+    # The shared parameters take their part out of these directions: count what is left.
+    taken = np.einsum('fmr,fmk->frk', u, nuisance.shared_basis)
+    rank = round(float((s > 1e-3).sum() - (taken**2).sum()))
+    return p_value_of(nuisance, statistic, max(rank, 1)), statistic / nuisance.misfit
+
+
+def monomials(x: Array, y: Array, degree: int) -> list[Array]:
+    """Return x^i y^j up to a degree, the constant first."""
+    return [x**i * y ** (total - i) for total in range(degree + 1) for i in range(total + 1)]
+
+
+def both_axes(scalars: list[Array]) -> list[Array]:
+    """Return fields (..., 2): each scalar (...) along u, and along v."""
+    zero = np.zeros_like(scalars[0])
+    pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
+    return [np.stack(pair, axis=-1) for pair in pairs]
+
+
 def neighbours(linear: Linearised) -> tuple[Index, Index]:
     """Return pairs of rows (u of each point) that are nearest to each other in the same view."""
     views = linear.data.views
@@ -115,7 +146,8 @@ def neighbours(linear: Linearised) -> tuple[Index, Index]:
         mine = np.flatnonzero(linear.weight[view] > 0)
         if len(mine) < 3:
             continue
-        nearest = cKDTree(views.uv[view, mine]).query(views.uv[view, mine], k=2)[1][:, 1]
+        seen = views.uv[view, mine]
+        nearest = np.asarray(cKDTree(seen).query(seen, k=2)[1])[:, 1]
         both = np.sort(np.stack([mine, mine[nearest]], axis=1), axis=1)
         pairs.append(np.unique(both, axis=0) + view * views.uv.shape[1] + 1)
     if not pairs:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -110,26 +110,31 @@ class Diagnosis:
 def diagnose(
     observations: Observations, lens: Lens, *, free_intrinsics: bool | None = None,
     poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
-    poses: true poses by frame; held_out: other frames of the same camera and target.
+    poses: true poses by frame; held_out: other frames of the same camera and target;
+    progress: told what is being done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     if free_intrinsics is None:
         free_intrinsics = lens.calibration is not None
     free = intrinsic_names(lens) if free_intrinsics else ()
+    progress('fitting the simulation as it is')
     everything = prepare(observations, poses)
     data, gross = find_gross_errors(everything, start(everything, lens))
     base = fit(data, start(data, lens), free)
-    selection = settle(data, select(data, base, free), free)
+    selection = settle(data, select(data, base, free, progress), free)
+    progress('looking at what is left')
     stated = bool(np.isfinite(observations.sigma).all())
     state, noise_causes, left = _noise_causes(data, selection, free, stated)
     after = Linearised(data, state, free)
     nuisance = Nuisance(after)
     test = None if held_out is None else prepare(held_out)
     noise = noise_px(after, nuisance)
+    progress('measuring the gain on held-out data')
     prefixes = _prefixes(data, base, state, selection, free)
     measured = [held_out_misfit(data, prefix, free, test) for prefix in prefixes]
     causes = _mean_causes(data, state, selection, free, measured, noise) + noise_causes
@@ -247,7 +252,8 @@ def _table_causes(
         swapped = int(gross.swapped.sum())
         if 2 * swapped >= len(gross.rows):
             fraction = swapped / len(observations)
-            value = {'value': fraction, 'stderr': np.sqrt(swapped) / len(observations), 'unit': '1'}
+            stderr = fraction / np.sqrt(swapped)
+            value = {'value': fraction, 'stderr': stderr, 'unit': '1'}
             causes.append(_plain_cause('wrong_ids', {'fraction': value}, 0.0))
         if swapped < len(gross.rows):
             left = [*left, Structure('outliers', 0.0, 1 - swapped / len(gross.rows))]

@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.camera import lens_columns
-from fisheye_svp_ros.effects.base import Effect, Scene
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.lens import INTRINSICS, Lens
@@ -219,7 +219,7 @@ def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
     """Return the factor (S, N) by which noise effects lower the weight of observations."""
     scale: Array | float = 1.0
     for effect, values in terms:
-        if effect.stage == 'noise':
+        if isinstance(effect, NoiseEffect):
             scale = scale / effect.noise_scale(scene, values)
     return scale
 
@@ -308,7 +308,7 @@ class _SurveyFit(_Fit):
         linear = Linearised(self._data, self.unpack(state), self._free)
         place = linear.whitened(linear.linear.d_target)
         group = landmark_groups(linear.rows.landmark, linear.rows.used)
-        slot = gather(linear.rows.survey[..., None], group)[:, :1]
+        slot = gather(linear.rows.survey[..., None].astype(float), group)[:, :1].astype(int)
         block = np.where(slot >= 0, gather(place, group), 0.0)
         others = np.concatenate([dense_frames(linear.frame_columns), linear.shared_columns], -1)
         self._slots = slot[:, 0, 0]

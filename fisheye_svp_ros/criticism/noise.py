@@ -15,11 +15,14 @@ from fisheye_svp_ros.criticism.structure import standardised_squares
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.observations import Views
-from fisheye_svp_ros.solve.localization import MIN_POINTS, localize
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.localization import localize
 
 _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
 _GATE = 6.0  # and within which it belongs to another one
-_ROUNDS = 6
+_SUSPECT = 6.0  # below this no point is worth a robust fit
+_FADE = 2.0
+_ROUNDS = 8
 
 
 class Gross(NamedTuple):
@@ -37,36 +40,43 @@ class NoiseCause(NamedTuple):
     p_value: float
 
 
-def find_gross_errors(data: Data, state_lens: State) -> tuple[Data, Gross]:
+def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     """Return the data without gross errors, and what they were.
 
-    Views are localized again and again without the points that lie far from their prediction, on
-    the scale of the median residual, and with those that have come back to it.
+    Every view is localized with weights that fade for points far from their prediction (Cauchy),
+    on the scale of the median residual of that view or of all, whichever is larger: a view that
+    a model error bends as a whole holds no gross error.
     """
-    model = ForwardModel(state_lens.lens, state_lens.terms)
-    views = data.views
-    kept = views.used
-    far = np.zeros_like(kept)
-    for _ in range(_ROUNDS):
-        solved = localize(model, views._replace(weight=np.where(kept, views.weight, 0.0)))
-        predicted = model.linearise(solved.pose, views).uv
-        offset = np.linalg.norm(views.uv - predicted, axis=-1)
-        scale = 1.0 / 1.1774 * np.nanmedian(np.where(views.used, offset, np.nan))
-        far = views.used & ~(offset < _GROSS * scale)
-        enough = (views.used & ~far).sum(axis=1) >= MIN_POINTS
-        # A view that would lose nearly all its points keeps the better half of them.
-        half = offset <= np.nanmedian(np.where(views.used, offset, np.nan), axis=1)[:, None]
-        trial = np.where(enough[:, None], views.used & ~far, views.used & half)
-        if np.array_equal(trial, kept):
-            break
-        kept = trial
-    swapped = _fits_another(model, solved.pose, views, far, _GATE * scale)
+    model = ForwardModel(state.lens, state.terms)
+    views, pose = data.views, state.view_poses(data)
+    scale, offset = _scale(views, _offset(model, pose, views))
+    if np.nanmax(offset / scale) > _SUSPECT:
+        for _ in range(_ROUNDS):
+            fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
+            weight = np.where(views.used, views.weight * fading, 0.0)
+            pose = localize(model, views._replace(weight=weight), pose).pose
+            scale, offset = _scale(views, _offset(model, pose, views))
+    far = views.used & (offset > _GROSS * scale)
+    swapped = _fits_another(model, pose, views, far, _GATE * float(np.median(scale)))
     rows = views.row[far]
     order = np.argsort(rows)
-    clean = data.views._replace(
+    clean = views._replace(
         weight=np.where(far, 0.0, views.weight), row=np.where(far, -1, views.row)
     )
     return replace(data, views=clean), Gross(rows[order], swapped[far][order])
+
+
+def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
+    """Distances (S, N) of the points from their predictions, px; NaN for padding."""
+    distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
+    return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
+
+
+def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
+    """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
+    median = np.nanmedian(offset, axis=1, keepdims=True)
+    # The median of the norm of two normal coordinates is 1.1774 of their standard deviation.
+    return np.maximum(median, np.nanmedian(offset)) / 1.1774, offset
 
 
 def quantisation_step(uv: Array) -> float:
@@ -104,7 +114,7 @@ def with_noise_growth(state: State, growth: float) -> State:
 
 
 def _fits_another(
-    model: ForwardModel, pose: object, views: Views, far: Mask, gate: float
+    model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
     """Which far points (S, N) lie where another landmark of the table is predicted."""
     ids, first = np.unique(views.landmark[views.used], return_index=True)
@@ -116,7 +126,8 @@ def _fits_another(
             landmark=ids[None], t=np.full((1, len(ids)), np.nan),
             uv=np.zeros((1, len(ids), 2)), row=np.arange(len(ids))[None],
         )
-        seen = model.linearise(pose.take(slice(view, view + 1)), single).uv[0]  # type: ignore
+        here = pose.take(slice(view, view + 1))
+        seen = model.linearise(here, single).uv[0]
         for point in np.flatnonzero(far[view]):
             other = ids != views.landmark[view, point]
             off = np.linalg.norm(seen - views.uv[view, point], axis=-1)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.criticism.model import (
     Linearised,
     dense_frames,
@@ -81,7 +81,7 @@ class Nuisance:
     @property
     def freedom(self) -> int:
         """Degrees of freedom of the residual."""
-        return self.rows - self.rank
+        return int(self.rows - self.rank)
 
     @property
     def misfit(self) -> float:
@@ -95,7 +95,7 @@ class Nuisance:
         flat = flat - shared @ (shared.T @ flat)
         return flat.reshape(columns.shape)
 
-    def leverage(self, first: Array, second: Array) -> Array:
+    def leverage(self, first: Index, second: Index) -> Array:
         """Return sums (K,) of the hat matrix over pairs of rows (flat indices)."""
         shared = flat_rows(self.shared_basis)
         inside = np.einsum('kr,kr->k', shared[first], shared[second])
@@ -162,7 +162,7 @@ def basis(columns: Array, norms: Array) -> Array:
     flat = flat_rows(columns) / np.maximum(norms, 1e-300)
     if not flat.shape[1]:
         return flat
-    # Orthonormal by eigenvectors of the Gram matrix, twice: as good as a QR, and it shows the rank.
+    # Eigenvectors of the Gram matrix, twice: as orthonormal as a QR, and the rank shows.
     values, vectors = np.linalg.eigh(flat.T @ flat)
     kept = values > max(IDENTIFIABLE**2, 1e-13 * values[-1])
     q = flat @ (vectors[:, kept] / np.sqrt(values[kept]))

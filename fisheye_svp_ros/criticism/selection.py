@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,12 +15,14 @@ from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transferred
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.session_step import SessionStepEffect
 
 # False alarms: this much for all effects together, the same again for what is left.
 SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
 MAX_STEPS = 20
+_GAPS = 4
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,9 @@ class Selection:
     evidence: dict[str, Candidate]
 
 
-def select(data: Data, state: State, free: Sequence[str]) -> Selection:
+def select(
+    data: Data, state: State, free: Sequence[str], progress: Callable[[str], None]
+) -> Selection:
     """Add effects to a fitted state for as long as each is significant and predicts better.
 
     Every candidate must have a corrected p-value below SIGNIFICANCE and lower the misfit of
@@ -58,6 +62,7 @@ def select(data: Data, state: State, free: Sequence[str]) -> Selection:
     refused: set[str] = set()
     evidence: dict[str, Candidate] = {}
     while True:
+        progress(f'screening {len(CATALOGUE)} effects, step {len(trace) + 1}')
         linear = Linearised(data, state, free)
         correlation = judge_correlation(linear, generic_columns(linear))
         screening = screen(linear, Nuisance(linear), correlation)
@@ -80,7 +85,7 @@ def select(data: Data, state: State, free: Sequence[str]) -> Selection:
 
 def generic_columns(linear: Linearised) -> Array:
     """Columns (F, M, P) of the catalogue's effects, each in its richest form of few parameters."""
-    blocks = []
+    blocks = [linear.effect_columns(step) for step in _session_gaps(linear)]
     for kind in CATALOGUE.values():
         if kind.stage == 'noise' or kind.name in ('landmark_survey', 'session_step'):
             continue
@@ -91,6 +96,17 @@ def generic_columns(linear: Linearised) -> Array:
         richest = max(forms, key=lambda form: len(form.parameters))
         blocks.append(linear.effect_columns(richest))
     return np.concatenate(blocks, axis=-1)
+
+
+def _session_gaps(linear: Linearised) -> list[Effect]:
+    """Return steps at the longest pauses between frames, where sessions are likely to change."""
+    try:
+        steps = list(CATALOGUE['session_step'].candidates(linear.scene))
+    except Untestable:
+        return []
+    starts = np.array([step.starts[0] for step in steps if isinstance(step, SessionStepEffect)])
+    pauses = np.diff(starts, prepend=starts[:1])
+    return [steps[i] for i in np.sort(np.argsort(-pauses, kind='stable')[:_GAPS])]
 
 
 def with_effect(state: State, effect: Effect, values: Array | None = None) -> State:
@@ -188,14 +204,15 @@ def _worth(
 ) -> bool:
     """Whether held-out data gain a fair part of what the fitted data gain.
 
-    Held-out landmarks say nothing of an effect on single landmarks or boards, and range bands
-    nothing of what only one band shows: they may object, frames decide.  Where residuals depend
-    on each other, a cause must also explain a hundredth of the misfit.
+    Frames decide; landmarks may object, except to an effect on the target itself, of which those
+    left out say nothing.  Range bands are told in the trace only: what is free extrapolates badly
+    from one band to another.  Where residuals depend on each other, a cause must also explain a
+    hundredth of the misfit.
     """
     explained = candidate.score.statistic
     fair = gains['frames'] > 0.2 * explained
     if candidate.effect.stage != 'target':
-        fair = fair and gains['landmarks'] > 0 and gains['range_bands'] > -explained
+        fair = fair and gains['landmarks'] > 0
     material = explained > 0.01 * float((linear.residual**2).sum())
     return fair and (material or not correlation.dependent)
 

@@ -8,10 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.criticism.correlation import neighbour_correlation
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.criticism.correlation import (
+    both_axes,
+    frame_fields,
+    monomials,
+    neighbour_correlation,
+)
 from fisheye_svp_ros.criticism.model import Linearised
-from fisheye_svp_ros.criticism.projection import Nuisance, p_value, score
+from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import single_landmarks
 
 _FIELD = 4  # degree of the smooth field over the image
@@ -55,20 +60,20 @@ def mean_fields(linear: Linearised) -> dict[str, Array]:
     near = near / max(near.max(), 1e-9)
     radial, tangential = _polar(x, y)
     fields = {
-        'image': _both_axes(_monomials(x, y, _FIELD)),
+        'image': both_axes(monomials(x, y, _FIELD)),
         'theta': _along(radial, _powers(theta)) + _along(tangential, _powers(theta)),
         'range': [
             direction * (near**i * theta**j)[..., None]
             for direction in (radial, tangential) for i in (1, 2) for j in (1, 2, 3)
         ],
-        'pixel_phase': _phases(scene.uv),
+        'pixel_phase': _phases(linear.linear.optical),
     }
     t = scene.times
     if np.isfinite(t).all() and np.ptp(t) > 0:
         when = (2 * (t - t.min()) / np.ptp(t) - 1)[:, None] * np.ones_like(x)
         fields['time'] = [
             field * (when**i)[..., None]
-            for field in _both_axes(_monomials(x, y, 1)) for i in (1, 2, 3)
+            for field in both_axes(monomials(x, y, 1)) for i in (1, 2, 3)
         ]
     return {
         name: linear.whitened(np.stack(columns, axis=-1)) for name, columns in fields.items()
@@ -80,7 +85,7 @@ def _mean_tests(linear: Linearised, nuisance: Nuisance) -> Iterator[tuple[str, f
     for name, columns in fields.items():
         result = score(nuisance, columns)
         yield name, result.p_value, result.statistic / nuisance.misfit
-    yield 'frame', *_frame_test(linear, nuisance)
+    yield 'frame', *frame_fields(linear, nuisance)
     if nuisance.frame_basis is not None:
         yield 'landmark', *_landmark_test(linear, nuisance)
     coefficient, p = neighbour_correlation(linear, nuisance)
@@ -121,30 +126,13 @@ def _trend(e2: Array, z: Array) -> float:
     return float(stats.chi2.sf(len(e2) * r2, 1))
 
 
-def _groups(e2: Array, labels: Array) -> float:
+def _groups(e2: Array, labels: Index) -> float:
     """Koenker's test against group membership."""
     counts = np.bincount(labels)
     sums = np.bincount(labels, weights=e2 - e2.mean())
     explained = float((sums**2 / np.maximum(counts, 1)).sum())
     statistic = explained / max(float(e2.var()), 1e-300)
     return float(stats.chi2.sf(statistic, int((counts > 0).sum()) - 1))
-
-
-def _frame_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
-    """Smooth second-degree fields of their own in every frame, summed over the frames."""
-    x, y = np.moveaxis(np.nan_to_num(linear.scene.normalised()), -1, 0)
-    field = linear.whitened(np.stack(_both_axes(_monomials(x, y, 2)), axis=-1))
-    free = nuisance.frame_basis
-    if free is not None:
-        field = field - free @ (np.swapaxes(free, -1, -2) @ field)
-    norms = np.sqrt((field**2).sum(axis=1, keepdims=True))
-    u, s, _ = np.linalg.svd(field / np.maximum(norms, 1e-12), full_matrices=False)
-    u = u * (s > 1e-3)[:, None, :]
-    statistic = float((np.einsum('fmr,fm->fr', u, nuisance.residual) ** 2).sum())
-    # The shared parameters take their part out of these directions: count what is left.
-    taken = np.einsum('fmr,fmk->frk', u, nuisance.shared_basis)
-    rank = int(round((s > 1e-3).sum() - float((taken**2).sum())))
-    return p_value(nuisance, statistic, max(rank, 1)), statistic / nuisance.misfit
 
 
 def _landmark_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
@@ -158,16 +146,6 @@ def _landmark_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float
     variance = nuisance.misfit / nuisance.freedom
     z = (statistic / variance - rank) / np.sqrt(2 * rank)
     return float(stats.norm.sf(z)), statistic / nuisance.misfit
-
-
-def _monomials(x: Array, y: Array, degree: int) -> list[Array]:
-    return [x**i * y ** (total - i) for total in range(degree + 1) for i in range(total + 1)]
-
-
-def _both_axes(scalars: list[Array]) -> list[Array]:
-    zero = np.zeros_like(scalars[0])
-    pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
-    return [np.stack(pair, axis=-1) for pair in pairs]
 
 
 def _along(direction: Array, scalars: list[Array]) -> list[Array]:

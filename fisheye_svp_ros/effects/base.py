@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
@@ -133,7 +133,7 @@ class Effect(ABC):
         """Displacement (S, N, D) at this effect's stage."""
         return np.asarray(self.columns(scene) @ values)
 
-    def joined(self, other: Effect) -> Effect:
+    def joined(self, other: Self) -> Effect:
         """Return the form that holds this one and another of the same effect."""
         return other
 

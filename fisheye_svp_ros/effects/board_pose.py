@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -42,7 +42,7 @@ class BoardPoseEffect(Effect):
         forms: list[Effect] = [cls((one,)) for one in others]
         return forms if len(others) == 1 else [cls(tuple(others)), *forms]
 
-    def joined(self, other: Effect) -> Effect:
+    def joined(self, other: Self) -> Effect:
         return replace(self, boards=tuple(dict.fromkeys((*self.boards, *other.boards))))
 
     @property

@@ -22,7 +22,8 @@ class FlatPortEffect(Effect):
     name: ClassVar[str] = 'flat_port'
     stage: ClassVar[str] = 'ray'
     signature: ClassVar[str] = (
-        'residuals along the radius that grow with the angle and with 1 / range, bounded by the thickness'
+        'residuals along the radius that grow with the angle and with 1 / range, '
+        'bounded by the thickness'
     )
     confused_with: ClassVar[str] = 'viewpoint_shift, radial_profile at one single range'
     to_separate: ClassVar[str] = (

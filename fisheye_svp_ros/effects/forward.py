@@ -29,7 +29,7 @@ class LinearViews(NamedTuple):
 
     uv (S, N, 2), px; valid (S, N); d_pose (S, N, 2, 6), px/m and px/rad, by the small change of
     `pose.Pose.retract`; d_target (S, N, 2, 3), px/m; image: the lens's own derivatives;
-    ideal (S, N, 2), px: uv without image and detector effects.
+    ideal, optical (S, N, 2), px: uv before image effects, and before detector effects.
     """
 
     uv: Array
@@ -38,6 +38,7 @@ class LinearViews(NamedTuple):
     d_target: Array
     image: LinearImage
     ideal: Array
+    optical: Array
 
 
 class ForwardModel:
@@ -99,6 +100,8 @@ class ForwardModel:
 
     def effect_columns(self, effect: Effect, scene: Scene, linear: LinearViews) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""
+        if effect.stage == 'detector':
+            scene = replace(scene, uv=linear.optical)
         columns = effect.columns(scene)
         if effect.stage in ('image', 'detector'):
             return columns
@@ -116,7 +119,7 @@ class ForwardModel:
         if self._of('pose'):
             # When a row was exposed depends on where the point is seen: predict that first.
             seen = project(self.lens, arm @ pose.rotation, limited=False).uv
-            move = self._moved(Scene(views, self.lens, pose, seen), 'pose')
+            move = np.asarray(self._moved(Scene(views, self.lens, pose, seen), 'pose'))
             turn = rotation_from_vector(-move[..., 3:])
             arm = (turn @ (arm - move[..., :3])[..., None])[..., 0]
         image = _linear(self.lens, arm @ pose.rotation, limited)
@@ -124,12 +127,12 @@ class ForwardModel:
         d_target = image.d_point @ np.swapaxes(pose.rotation, -1, -2)[..., None, :, :]
         d_turn = np.cross(d_target, arm[..., None, :])
         d_pose = np.concatenate([-d_target, d_turn], axis=-1)
-        uv = image.uv
+        uv = [image.uv]
         for stage in ('image', 'detector'):
-            if self._of(stage):
-                scene = Scene(views, self.lens, pose, uv, image.incidence)
-                uv = uv + self._moved(scene, stage)
-        return LinearViews(uv, image.valid, d_pose, d_target, image, image.uv)
+            scene = Scene(views, self.lens, pose, uv[-1], image.incidence)
+            uv.append(uv[-1] + self._moved(scene, stage))
+        ideal, optical, detected = uv
+        return LinearViews(detected, image.valid, d_pose, d_target, image, ideal, optical)
 
     def _of(self, *stages: str) -> list[Term]:
         return [term for term in self.terms if term[0].stage in stages]

@@ -24,7 +24,9 @@ class LandmarkScaleEffect(Effect):
     signature: ClassVar[str] = (
         'residuals as if all landmarks had moved away from the centre of the target'
     )
-    confused_with: ClassVar[str] = 'focal_length with known poses; with unknown poses a single camera cannot see a uniform scale'
+    confused_with: ClassVar[str] = (
+        'focal_length with known poses; with unknown poses one camera cannot see a uniform scale'
+    )
     to_separate: ClassVar[str] = (
         'measure one long distance on the target; a rig of known baseline; known poses'
     )
@@ -42,4 +44,4 @@ class LandmarkScaleEffect(Effect):
 
     def columns(self, scene: Scene) -> Array:
         arm = scene.views.points - np.array(self.centre)
-        return arm[..., None] if self.axes == 1 else arm[..., None] * np.eye(3)
+        return np.asarray(arm[..., None] * (1.0 if self.axes == 1 else np.eye(3)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -40,8 +40,8 @@ class LandmarkSurveyEffect(Effect):
             raise Untestable(f'no landmark is seen {MIN_VIEWS} times')
         return [cls(tuple(int(i) for i in often), everywhere=True)]
 
-    def joined(self, other: Effect) -> Effect:
-        if not isinstance(other, LandmarkSurveyEffect) or other.everywhere:
+    def joined(self, other: Self) -> Effect:
+        if other.everywhere:
             return other
         return replace(self, landmarks=tuple(dict.fromkeys((*self.landmarks, *other.landmarks))))
 

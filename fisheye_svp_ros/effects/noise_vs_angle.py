@@ -30,4 +30,4 @@ class NoiseVsAngleEffect(NoiseEffect):
         return (Parameter('growth', '1/rad^2', 0.5),)
 
     def noise_scale(self, scene: Scene, values: Array) -> Array:
-        return np.exp(np.nan_to_num(values[0] * scene.theta**2))
+        return np.asarray(np.exp(np.nan_to_num(values[0] * scene.theta**2)))

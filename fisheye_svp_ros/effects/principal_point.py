@@ -21,7 +21,9 @@ class PrincipalPointEffect(Effect):
     signature: ClassVar[str] = (
         'residuals with a constant part over the image that no turn of the camera takes up'
     )
-    confused_with: ClassVar[str] = 'decentering, sensor_tilt; with a narrow field, a turn of the camera'
+    confused_with: ClassVar[str] = (
+        'decentering, sensor_tilt; with a narrow field, a turn of the camera'
+    )
     to_separate: ClassVar[str] = (
         'landmarks over the whole field of view; views turned about the axis'
     )

@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_camer
 
 @dataclass(frozen=True)
 class RigFlexEffect(Effect):
-    """The turn of the second camera in the rig as a polynomial of time, or of its own in each frame."""
+    """The turn of the second camera in the rig: a polynomial of time, or one for each frame."""
 
     degree: int = 1
     frames: tuple[int, ...] = field(default=(), metadata={'key': False})

@@ -19,9 +19,11 @@ class RollingShutterEffect(Effect):
     name: ClassVar[str] = 'rolling_shutter'
     stage: ClassVar[str] = 'pose'
     signature: ClassVar[str] = (
-        'residuals that grow with the distance from the middle row and with the speed of the camera'
+        'residuals that grow with the distance from the middle row and with the camera speed'
     )
-    confused_with: ClassVar[str] = 'aspect and skew where the motion is always the same, stereo_time_offset'
+    confused_with: ClassVar[str] = (
+        'aspect and skew where the motion is always the same, stereo_time_offset'
+    )
     to_separate: ClassVar[str] = (
         'the same scene from a tripod: the residuals vanish when nothing moves'
     )

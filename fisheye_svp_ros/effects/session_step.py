@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
+
+_STEP = (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class SessionStepEffect(Effect):
     signature: ClassVar[str] = (
         'residuals that change at one frame and keep their new pattern'
     )
-    confused_with: ClassVar[str] = 'focal_drift, landmark_survey of landmarks seen in one group only'
+    confused_with: ClassVar[str] = 'focal_drift, landmark_survey of landmarks seen in one group'
     to_separate: ClassVar[str] = (
         'frames taken in turns before and after the suspected event, of the same scene'
     )
@@ -40,16 +42,15 @@ class SessionStepEffect(Effect):
             raise Untestable('fewer than six frames')
         return [cls((float(start),), timed) for start in instants[2:-1]]
 
-    def joined(self, other: Effect) -> Effect:
-        more = getattr(other, 'starts', ())
-        return replace(self, starts=tuple(dict.fromkeys((*self.starts, *more))))
+    def joined(self, other: Self) -> Effect:
+        return replace(self, starts=tuple(dict.fromkeys((*self.starts, *other.starts))))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(
             Parameter(f'step{i + 1}.{name}', unit, large)
             for i in range(len(self.starts))
-            for name, unit, large in (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
+            for name, unit, large in _STEP
         )
 
     def columns(self, scene: Scene) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -18,7 +18,7 @@ BoardAxes = tuple[float, ...]
 
 @dataclass(frozen=True)
 class TargetShapeEffect(Effect):
-    """A displacement along the normal, a polynomial of the place on the board (constant, slope out)."""
+    """A displacement along the normal, a polynomial of the place on the board from degree 2."""
 
     degree: int = 2
     boards: tuple[BoardAxes, ...] = field(default=(), metadata={'key': False})
@@ -26,11 +26,14 @@ class TargetShapeEffect(Effect):
     name: ClassVar[str] = 'target_shape'
     stage: ClassVar[str] = 'target'
     signature: ClassVar[str] = (
-        'residuals that keep to the board: the same place on it is off by the same height in every view'
+        'residuals that keep to the board: the same place is off by the same height in every view'
     )
-    confused_with: ClassVar[str] = 'viewpoint_shift when the board is always met from near and squarely, landmark_survey'
+    confused_with: ClassVar[str] = (
+        'viewpoint_shift when the board is always met from near and squarely, landmark_survey'
+    )
     to_separate: ClassVar[str] = (
-        'turn the board about its normal and tilt it between views; measure its flatness with a ruler'
+        'turn the board about its normal and tilt it between views; '
+        'measure its flatness with a ruler'
     )
 
     @classmethod
@@ -42,7 +45,7 @@ class TargetShapeEffect(Effect):
             forms.extend(cls(2, (one,)) for one in every)
         return forms
 
-    def joined(self, other: Effect) -> Effect:
+    def joined(self, other: Self) -> Effect:
         boards = tuple(dict.fromkeys((*self.boards, *other.boards)))
         return TargetShapeEffect(max(self.degree, other.degree), boards)
 

@@ -24,9 +24,11 @@ class ViewpointShiftEffect(Effect):
     signature: ClassVar[str] = (
         'residuals along the radius that grow with the angle and with 1 / range'
     )
-    confused_with: ClassVar[str] = 'radial_profile at one single range, flat_port, target_shape of a warped board'
+    confused_with: ClassVar[str] = (
+        'radial_profile at one single range, flat_port, target_shape of a warped board'
+    )
     to_separate: ClassVar[str] = (
-        'views of the same angles at clearly different ranges, the nearest ones as near as possible;'
+        'views of the same angles at clearly different ranges, the nearest as near as possible; '
         'a target of known flatness'
     )
 

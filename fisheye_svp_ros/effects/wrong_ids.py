@@ -31,7 +31,7 @@ class WrongIdsEffect(NoiseEffect):
 
     def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         swapped = uv.copy()
-        for view, seen in enumerate(np.isfinite(uv).all(axis=-1)):
+        for view, seen in enumerate(np.asarray(np.isfinite(uv).all(axis=-1))):
             points = rng.permutation(np.flatnonzero(seen))
             pairs = points[: len(points) // 2 * 2].reshape(-1, 2)
             pairs = pairs[rng.random(len(pairs)) < values[0]]
