@@ -201,6 +201,10 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
     except (FisheyeSvpError, ParameterException) as error:
         print(f'{kind.NAME}: {error}', file=sys.stderr)
         return 2
+    except Exception:
+        # A signal ends the context between any two calls; what fails then is no failure.
+        if rclpy.ok():
+            raise
     finally:
         # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
