@@ -331,6 +331,7 @@ def test_reading_a_recording_needs_neither_ros_nor_dds(tmp_path: Path) -> None:
         'from fisheye_svp_ros.cli import main\n'
         f'sys.exit(main(["table", {str(tmp_path / "bag")!r}]))'
     )
-    env = os.environ | {'PYTHONPATH': str(ROOT)}
+    path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
+    env = os.environ | {'PYTHONPATH': path}
     done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True)
     assert done.returncode == 0 and '3 rows' in done.stdout, done.stderr

@@ -23,8 +23,6 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.evaluation.recording import STAMP, is_tabulated, tabulate
-    from fisheye_svp_ros.reporting.columns import write_columns
-    from fisheye_svp_ros.reporting.results import write_json
 
     bag = Bag(args.bag)
     columns = tabulate(bag.records(is_tabulated))
@@ -36,6 +34,9 @@ def run(args: argparse.Namespace) -> None:
                        '`fisheye-svp record` or `ros2 bag record`')
     _print(args.bag, columns)
     if args.output:
+        from fisheye_svp_ros.reporting.columns import write_columns
+        from fisheye_svp_ros.reporting.results import write_json
+
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'table.json', {
             'bag': str(args.bag), 'rows': rows, 'columns': list(columns), 'damage': bag.damage,
