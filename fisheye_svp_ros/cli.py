@@ -21,6 +21,7 @@ COMMANDS = {
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
+    'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
     'table': 'a recording to a table, one row an input stamp',
 }
 _BAD_INPUT = 2

@@ -29,5 +29,9 @@ class OutputError(FisheyeSvpError):
     """A result cannot be written."""
 
 
+class SweepError(FisheyeSvpError):
+    """A sweep cannot go on, for want of somebody who works on it."""
+
+
 class StandaloneError(FisheyeSvpError):
     """Something was asked of the standalone client that it does not cover."""

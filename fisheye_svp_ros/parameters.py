@@ -34,6 +34,8 @@ class Row(NamedTuple):
     def check(self, value: Any) -> Any:
         """Return the value in the type of the default; raise ParameterError if not allowed."""
         if isinstance(self.default, tuple):
+            if isinstance(value, str) or not isinstance(value, Sequence):
+                raise ParameterError(f'{self.name} is {value!r}; a list is needed')
             return tuple(self._check_one(one, self.default[0]) for one in value)
         return self._check_one(value, self.default)
 

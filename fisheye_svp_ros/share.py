@@ -21,7 +21,16 @@ def config_path(name: str) -> Path:
 
 def lens_path(name: str) -> Path:
     """Return the path of a lens: a file as given, or the name of one in config/lenses."""
+    return _given_or_named(name, 'lenses')
+
+
+def sweep_path(name: str) -> Path:
+    """Return the path of a sweep file: a file as given, or the name of one in config/sweeps."""
+    return _given_or_named(name, 'sweeps')
+
+
+def _given_or_named(name: str, folder: str) -> Path:
     given = Path(name)
     if given.suffix in ('.yaml', '.yml') or given.is_file():
         return given
-    return config_path(f'lenses/{name}.yaml')
+    return config_path(f'{folder}/{name}.yaml')

@@ -12,7 +12,7 @@ from fisheye_svp_ros.camera import incidence
 from fisheye_svp_ros.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS, localization_metrics
+from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS, NO_POSE, localization_metrics
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.shapes import camera_shape
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
@@ -44,7 +44,7 @@ class Localizer(SolverNode):
         views, model = self.views(stamp, landmarks, seen), self.model(items)
         solution = localize(model, views)
         if not solution.converged[0]:
-            raise GeometryError('image_points: they do not fix a pose (all near one line?)')
+            raise GeometryError(NO_POSE)
         pose, world = solution.pose.take(0), landmarks.frame
         self._pose.publish(
             messages.pose_with_covariance_message(pose, solution.covariance[0], stamp, world)

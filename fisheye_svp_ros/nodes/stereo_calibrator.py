@@ -11,6 +11,7 @@ from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.evaluation.errors import (
+    NO_RIG,
     STEREO_CALIBRATION_METRICS,
     stereo_calibration_metrics,
 )
@@ -70,7 +71,7 @@ class StereoCalibrator(SolverNode):
         left, right = stereo_views(table_of(window), self.settings.sigma_px)
         solution = calibrate_stereo(model, model, left, right)
         if not solution.converged[0]:
-            raise GeometryError('image_points: they do not fix a rig')
+            raise GeometryError(NO_RIG)
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario = window, scenario
         self._publish(stamp, items, solution)

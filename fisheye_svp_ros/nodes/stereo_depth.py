@@ -10,7 +10,7 @@ from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.clouds import LANDMARKS, structured
 from fisheye_svp_ros.errors import GeometryError, ObservationError
-from fisheye_svp_ros.evaluation.errors import STEREO_DEPTH_METRICS, stereo_depth_metrics
+from fisheye_svp_ros.evaluation.errors import NO_PAIR, STEREO_DEPTH_METRICS, stereo_depth_metrics
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, run
 from fisheye_svp_ros.nodes.solver import (
     Items,
@@ -55,7 +55,7 @@ class StereoDepth(SolverNode):
             left.landmark, right.landmark, assume_unique=True, return_indices=True
         )
         if not len(ids):
-            raise GeometryError('image_points: no landmark is in both images')
+            raise GeometryError(NO_PAIR)
         uv = left.uv[in_left], right.uv[in_right]
         offset = epipolar_offset(model, model, rig, *uv)
         solve = triangulate_optimally if self.settings.optimal else triangulate

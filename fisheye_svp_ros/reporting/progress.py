@@ -5,20 +5,33 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from rich.console import Console
 from rich.progress import Progress
 
 
 @contextmanager
-def progress(description: str, total: int | None = None) -> Iterator[Callable[[], None]]:
-    """Show a bar while the block runs; call what it yields after each of `total` steps.
+def progress(description: str, total: int | None = None) -> Iterator[Callable[..., None]]:
+    """Show a bar while the block runs; call what it yields after one of `total` steps, or more.
 
     Without a total the bar only says that the work goes on.
     """
+    with _bar(description, total) as update:
+        yield lambda count=1: update(advance=count)
+
+
+@contextmanager
+def stages(description: str) -> Iterator[Callable[[str], None]]:
+    """Show that the work goes on while the block runs; call what it yields with its stage."""
+    with _bar(description, None) as update:
+        yield lambda stage: update(description=f'{description}: {stage}')
+
+
+@contextmanager
+def _bar(description: str, total: int | None) -> Iterator[Callable[..., None]]:
     if not sys.stderr.isatty():
-        yield lambda: None
+        yield lambda **_: None
         return
     with Progress(console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(description, total=total)
-        yield lambda: bar.advance(task)
+        yield partial(bar.update, bar.add_task(description, total=total))

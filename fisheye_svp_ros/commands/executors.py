@@ -1,0 +1,88 @@
+"""Who works on a sweep: this process, local processes, or an existing Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import NamedTuple
+
+from fisheye_svp_ros.errors import SweepError
+from fisheye_svp_ros.evaluation.sweep import InProcess
+
+_AHEAD = 3  # tasks under way for each worker: none waits for the next
+_PATIENCE = 10  # s for a scheduler to answer
+
+
+class Workers(NamedTuple):
+    """An executor, and how many tasks to hand to it at once."""
+
+    executor: Executor
+    ahead: int
+
+
+@contextmanager
+def local(count: int) -> Iterator[Workers]:
+    """Yield processes on this machine; 0: this process itself.
+
+    Raises SweepError when one of them dies.
+    """
+    if not count:
+        yield Workers(InProcess(), 1)
+        return
+    # One thread a process; they inherit this when they start.
+    os.environ.setdefault('OMP_NUM_THREADS', '1')
+    executor = ProcessPoolExecutor(
+        count, multiprocessing.get_context('spawn'), initializer=_end_with_parent
+    )
+    try:
+        yield Workers(executor, _AHEAD * count)
+    except BrokenExecutor as cause:
+        raise SweepError('a worker process died (out of memory?); what is done is kept, '
+                         '--resume goes on with fewer --workers') from cause
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def dask(address: str) -> Iterator[Workers]:
+    """Yield the workers of a Dask cluster, which outlives the sweep.
+
+    Raises SweepError where there is none or where it gives up on a task.
+    """
+    try:
+        import distributed
+        from distributed.comm import CommClosedError
+    except ModuleNotFoundError as cause:
+        raise SweepError('dask.distributed is not installed; install the extra `dask` of this '
+                         'package') from cause
+    try:
+        client = distributed.Client(address, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as cause:
+        raise SweepError(f'{address}: no Dask scheduler answers there ({cause})') from cause
+    with client:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise SweepError(f'{address}: the Dask cluster has no worker; start one')
+        try:
+            yield Workers(client.get_executor(pure=False), _AHEAD * threads)
+        except (distributed.KilledWorker, CommClosedError) as cause:
+            raise SweepError(f'the Dask cluster gave up ({cause}); what is done is kept, --resume '
+                             'goes on') from cause
+
+
+def _end_with_parent() -> None:
+    """Make a worker end when this program is killed, and leave Ctrl-C to this program."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,0 +1,135 @@
+"""`fisheye-svp sweep`: a sweep, offline, one row a scenario."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.evaluation.sweep import Plan
+    from fisheye_svp_ros.reporting.columns import Parts
+
+_LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
+_PARTS, _SUMMARY = 'parts', 'sweep.json'
+_MARK = 'sweep.txt'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('file', type=Path, metavar='FILE',
+                        help='ROS parameter file in which sweep.PARAMETER holds a list, or the '
+                        'name of one in config/sweeps')
+    parser.add_argument('-o', '--output', type=Path, default=Path('sweep'), metavar='DIR',
+                        help='folder for sweep.parquet, sweep.csv and sweep.json; default: sweep')
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--workers', type=_count, default=0, metavar='N',
+                       help='processes to work in; default: this one')
+    where.add_argument('--dask', metavar='ADDRESS',
+                       help='work on a Dask cluster: the address of its scheduler')
+    parser.add_argument('--resume', action='store_true',
+                        help='go on with what an interrupted run has left in DIR, if anything')
+    parser.add_argument('--large', action='store_true',
+                        help=f'allow more than {_LARGE} scenarios')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Solve what is not solved yet; join the parts."""
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.sweep_file import read_sweep
+    from fisheye_svp_ros.errors import ParameterError
+    from fisheye_svp_ros.evaluation.sweep import column_types, fingerprint
+    from fisheye_svp_ros.reporting.columns import Parts
+    from fisheye_svp_ros.share import sweep_path
+
+    path = sweep_path(str(args.file))
+    plan = read_sweep(path)
+    if len(plan.sweep) > _LARGE and not args.large:
+        lengths = ' x '.join(f'{len(v)} {name}' for name, v in plan.sweep.lists.items())
+        raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); --large if that '
+                             'is meant')
+    parts = Parts(args.output / _PARTS, column_types(plan))
+    mine = fingerprint(plan)
+    if args.resume and _finished(args.output, mine):
+        say(f'{args.output} holds this sweep already')
+    else:
+        _claim(parts, mine, args.resume)
+        _solve(args, plan, parts)
+        parts.join(args.output / 'sweep')
+        _report(path, args.output, plan, mine)
+    shutil.rmtree(parts.folder, ignore_errors=True)
+
+
+def _finished(folder: Path, mine: str) -> bool:
+    """Say whether a folder holds the whole table of a sweep."""
+    summary = folder / _SUMMARY
+    return summary.exists() and json.loads(summary.read_text()).get('fingerprint') == mine
+
+
+def _claim(parts: Parts, mine: str, resume: bool) -> None:
+    """Make the folder of the parts this sweep's own; refuse that of another sweep."""
+    from fisheye_svp_ros.errors import OutputError
+    from fisheye_svp_ros.files import write_text
+
+    mark = parts.folder / _MARK
+    if not mark.exists():
+        write_text(mark, mine)
+    elif not resume:
+        raise OutputError(f'{parts.folder}: an interrupted sweep is there; --resume goes on with '
+                          'it, or remove that folder')
+    elif mark.read_text(encoding='utf-8') != mine:
+        raise OutputError(f'{parts.folder}: another sweep was interrupted there; choose another '
+                          '-o, or remove that folder')
+
+
+def _solve(args: argparse.Namespace, plan: Plan, parts: Parts) -> None:
+    from fisheye_svp_ros.commands.executors import dask, local
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.evaluation.sweep import solve_sweep, tasks
+    from fisheye_svp_ros.reporting.progress import progress
+
+    done = parts.numbers()
+    remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
+    left = sum(map(len, remaining))
+    if left < len(plan.sweep):
+        say(f'{len(plan.sweep) - left} of {len(plan.sweep)} scenarios are done already')
+    with (
+        dask(args.dask) if args.dask else local(args.workers) as workers,
+        progress('sweeping', left) as advance,
+    ):
+        for numbers, columns in solve_sweep(plan, remaining, *workers):
+            parts.write(numbers.start, columns)
+            advance(len(numbers))
+
+
+def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
+    """Print and write what came out, metric by metric."""
+    from fisheye_svp_ros.evaluation.summary import summarise
+    from fisheye_svp_ros.evaluation.sweep import column_types
+    from fisheye_svp_ros.reporting.columns import read_column
+    from fisheye_svp_ros.reporting.results import write_json
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    table = folder / 'sweep.parquet'
+    metrics = [name for name, kind in column_types(plan).items()
+               if kind is float and '.' in name]
+    found = {name: summarise(read_column(table, name)) for name in metrics}
+    print_table(
+        f'{path}: {len(plan.sweep)} scenarios',
+        ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
+        [(name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
+         for name, s in found.items()],
+    )
+    write_json(folder / _SUMMARY, {
+        'fingerprint': mine, 'file': str(path), 'scenarios': len(plan.sweep),
+        'swept': {name: list(values) for name, values in plan.sweep.lists.items()},
+        'metrics': {name: s._asdict() for name, s in found.items()},
+    })
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f'{text!r} is no number of processes')
+    return int(text)

@@ -1,0 +1,41 @@
+"""Sweep files: ROS parameter files for the nodes of a sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.evaluation.sweep import CAMERA, TABLES, Plan, plan_sweep
+from fisheye_svp_ros.parameters import SWEEP, rows
+from fisheye_svp_ros.standalone.arguments import Arguments, parse
+
+
+def read_sweep(path: Path) -> Plan:
+    """Return the sweep of a parameter file.
+
+    Raises ParameterError, naming the file, for whatever cannot be used.
+    """
+    try:
+        arguments = parse(['--ros-args', '--params-file', str(path)])
+        for pattern, values in arguments.parameters.items():
+            _check_names(pattern, values)
+        return plan_sweep({node: arguments.overrides(f'/{node}') for node in TABLES})
+    except FisheyeSvpError as error:
+        text = ' '.join(str(error).split())
+        raise ParameterError(text if str(path) in text else f'{path}: {text}') from error
+
+
+def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
+    """Refuse what means nothing to any node; the nodes themselves would only warn."""
+    only = Arguments(parameters={pattern: dict(values)})
+    nodes = [node for node in TABLES if only.overrides(f'/{node}')]
+    if values and not nodes:
+        raise ParameterError(f'{pattern} is no node of a sweep; those are {", ".join(TABLES)}')
+    known = {row.name for node in nodes for row in rows(TABLES[node])}
+    for name in values:
+        swept = name.startswith(SWEEP) and CAMERA in nodes  # the camera's own table says more
+        if name not in known and not swept:
+            raise ParameterError(f'{name} is no parameter of {", ".join(nodes)}; known are '
+                                 + ', '.join(sorted(known)))
