@@ -259,4 +259,3 @@ def curve_name(curve: ImageHeight | ViewpointShift) -> str:
     """Return the name under which the curve's class is registered."""
     registry: dict[str, type] = {**IMAGE_HEIGHTS, **VIEWPOINT_SHIFTS}
     return next(name for name, kind in registry.items() if kind is type(curve))
-
