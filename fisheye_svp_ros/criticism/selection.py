@@ -236,4 +236,3 @@ def _step(candidate: Candidate, gains: dict[str, float], accepted: bool) -> Step
 
 def _gone(name: str, why: str) -> Step:
     return Step(name, 0.0, 0, 1.0, 1.0, {}, False, f'removed: {why}')
-

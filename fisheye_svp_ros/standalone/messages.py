@@ -257,7 +257,10 @@ def _number_check(dtype: np.dtype[Any]) -> Convert:
 
 def _nested(typename: str) -> Field:
     cls = message_class(typename)
-    check: Convert = lambda value: _require(isinstance(value, cls), value, f'takes {typename}')  # noqa: E731
+
+    def check(value: object) -> object:
+        return _require(isinstance(value, cls), value, f'takes {typename}')
+
     return Field(cls, check, to_wire=_to_wire if _needs_conversion(typename) else None)
 
 
