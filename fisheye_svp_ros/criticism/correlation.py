@@ -102,7 +102,7 @@ def neighbour_correlation(linear: Linearised, nuisance: Nuisance) -> tuple[float
 def frame_fields(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
     """Test for smooth second-degree fields over the image, each frame with one of its own.
 
-    Returns the p-value of their sum and the share of the residual's squares that they hold.
+    Returns the p-value of their sum and their share of the misfit.
     """
     x, y = np.moveaxis(np.nan_to_num(linear.scene.normalised()), -1, 0)
     field = linear.whitened(np.stack(both_axes(monomials(x, y, 2)), axis=-1))
@@ -116,7 +116,13 @@ def frame_fields(linear: Linearised, nuisance: Nuisance) -> tuple[float, float]:
     # The shared parameters take their part out of these directions: count what is left.
     taken = np.einsum('fmr,fmk->frk', u, nuisance.shared_basis)
     rank = round(float((s > 1e-3).sum() - (taken**2).sum()))
-    return p_value_of(nuisance, statistic, max(rank, 1)), statistic / nuisance.misfit
+    rank = max(rank, 1)
+    return p_value_of(nuisance, statistic, rank), share(nuisance, statistic, rank)
+
+
+def share(nuisance: Nuisance, statistic: float, rank: int) -> float:
+    """Return the part of the misfit that a statistic holds, less what chance gives its rank."""
+    return float(max(statistic / nuisance.misfit - rank / max(nuisance.freedom, 1), 0.0))
 
 
 def monomials(x: Array, y: Array, degree: int) -> list[Array]:

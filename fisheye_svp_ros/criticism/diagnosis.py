@@ -34,6 +34,8 @@ from fisheye_svp_ros.criticism.selection import (
     indistinguishable,
     select,
     settle,
+    significant,
+    withdraw,
 )
 from fisheye_svp_ros.criticism.standard_errors import standard_errors
 from fisheye_svp_ros.criticism.structure import Structure, remaining_structure
@@ -129,7 +131,8 @@ def diagnose(
     selection = settle(data, select(data, base, free, progress), free)
     progress('looking at what is left')
     stated = bool(np.isfinite(observations.sigma).all())
-    state, noise_causes, left = _noise_causes(data, selection, free, stated)
+    selection, left = withdraw(data, selection, free, stated)
+    state, noise_causes, left = _noise_causes(data, selection, free, stated, left)
     after = Linearised(data, state, free)
     nuisance = Nuisance(after)
     test = None if held_out is None else prepare(held_out)
@@ -179,29 +182,23 @@ def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:
 
 
 def _noise_causes(
-    data: Data, selection: Selection, free: Sequence[str], stated: bool
+    data: Data, selection: Selection, free: Sequence[str], stated: bool, left: list[Structure]
 ) -> tuple[State, list[Cause], list[Structure]]:
-    """Look at what is left; if only the scatter depends on the angle, weight by it."""
+    """If of what is left only the scatter depends on the angle, weight by it."""
     state = selection.state
-    linear = Linearised(data, state, free)
-    nuisance = Nuisance(linear)
-    left = _significant(remaining_structure(linear, nuisance, stated))
     if {s.variable for s in left} - {'scatter_vs_theta', 'outliers', 'size', 'scatter_vs_frame'}:
         return state, [], left
-    growth = noise_growth(linear, nuisance)
+    linear = Linearised(data, state, free)
+    growth = noise_growth(linear, Nuisance(linear))
     corrected = growth.p_value * len(CATALOGUE)
     if corrected > SIGNIFICANCE:
         return state, [], left
     state = fit(data, with_noise_growth(state, growth.value), free)
     linear = Linearised(data, state, free)
-    left = _significant(remaining_structure(linear, Nuisance(linear), stated))
+    left = significant(remaining_structure(linear, Nuisance(linear), stated))
     value = {'value': growth.value, 'stderr': growth.stderr, 'unit': '1/rad^2'}
     cause = _plain_cause('noise_vs_angle', {'growth': value}, growth.p_value)
     return state, [cause], left
-
-
-def _significant(found: Sequence[Structure]) -> list[Structure]:
-    return [structure for structure in found if structure.p_value < SIGNIFICANCE]
 
 
 def _prefixes(

@@ -13,6 +13,7 @@ from fisheye_svp_ros.criticism.held_out import held_out_gain
 from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, survey_of
 from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transferred
+from fisheye_svp_ros.criticism.structure import Structure, remaining_structure
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
@@ -21,6 +22,7 @@ from fisheye_svp_ros.effects.session_step import SessionStepEffect
 SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
+WITHDRAWN = 0.3
 MAX_STEPS = 20
 _GAPS = 4
 
@@ -68,7 +70,10 @@ def select(
         screening = screen(linear, Nuisance(linear), correlation)
         if len(evidence) == 0 and not trace:
             first = screening
-        eligible = [c for c in screening.eligible(SIGNIFICANCE) if c.effect.key not in refused]
+        eligible = [
+            c for c in screening.eligible(SIGNIFICANCE)
+            if c.effect.key not in refused and (c.merit > 0 or not _is_survey(c.effect))
+        ]
         if not eligible or len(trace) >= MAX_STEPS:
             break
         chosen = _first(eligible)
@@ -151,6 +156,37 @@ def settle(data: Data, selection: Selection, free: Sequence[str]) -> Selection:
                 selection.evidence.pop(name, None)
                 selection.evidence[better.effect.name] = better
     return replace(selection, state=state)
+
+
+def withdraw(
+    data: Data, selection: Selection, free: Sequence[str], stated: bool
+) -> tuple[Selection, list[Structure]]:
+    """Take back causes that explain little beside what no effect explains; return what is left.
+
+    An effect outside the catalogue lends every effect a little of itself.  What is not clearly
+    stronger than its remainder is no name for it.
+    """
+    while True:
+        linear = Linearised(data, selection.state, free)
+        left = significant(remaining_structure(linear, Nuisance(linear), stated))
+        misfit = float((linear.residual**2).sum())
+        unexplained = max((s.share for s in left if s.of_mean), default=0.0) * misfit
+        weak = [
+            name for name, candidate in selection.evidence.items()
+            if candidate.score.statistic < WITHDRAWN * unexplained
+        ]
+        if not weak:
+            return selection, left
+        name = min(weak, key=lambda n: selection.evidence[n].score.statistic)
+        state = fit(data, without_effect(selection.state, name), free)
+        selection.evidence.pop(name)
+        selection.trace.append(_gone(name, 'explains little beside what stays unexplained'))
+        selection = replace(selection, state=state)
+
+
+def significant(found: Sequence[Structure]) -> list[Structure]:
+    """Return the structures below the significance that all of them share."""
+    return [structure for structure in found if structure.p_value < SIGNIFICANCE]
 
 
 def indistinguishable(

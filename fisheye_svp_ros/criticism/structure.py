@@ -14,6 +14,7 @@ from fisheye_svp_ros.criticism.correlation import (
     frame_fields,
     monomials,
     neighbour_correlation,
+    share,
 )
 from fisheye_svp_ros.criticism.model import Linearised
 from fisheye_svp_ros.criticism.projection import Nuisance, score
@@ -26,12 +27,20 @@ _CURVE = 5  # degree of smooth curves over an angle, a range, the time
 class Structure(NamedTuple):
     """One variable that residuals may depend on: the test's p-value (corrected) and its size.
 
-    share: the part of the residual's sum of squares that goes with it.
+    share: the part of the residual's sum of squares that goes with it, less what chance gives.
     """
 
     variable: str
     p_value: float
     share: float
+
+    @property
+    def of_mean(self) -> bool:
+        """Whether it speaks of a pattern, not of scatter or of neighbours alone."""
+        return self.variable in _PATTERNS
+
+
+_PATTERNS = ('image', 'theta', 'range', 'pixel_phase', 'time', 'frame', 'landmark')
 
 
 def remaining_structure(
@@ -84,7 +93,7 @@ def _mean_tests(linear: Linearised, nuisance: Nuisance) -> Iterator[tuple[str, f
     fields = mean_fields(linear)
     for name, columns in fields.items():
         result = score(nuisance, columns)
-        yield name, result.p_value, result.statistic / nuisance.misfit
+        yield name, result.p_value, share(nuisance, result.statistic, result.rank)
     yield 'frame', *frame_fields(linear, nuisance)
     if nuisance.frame_basis is not None:
         yield 'landmark', *_landmark_test(linear, nuisance)
@@ -145,7 +154,7 @@ def _landmark_test(linear: Linearised, nuisance: Nuisance) -> tuple[float, float
     # Poses take up part of what all landmarks do together; the sum errs to the small side.
     variance = nuisance.misfit / nuisance.freedom
     z = (statistic / variance - rank) / np.sqrt(2 * rank)
-    return float(stats.norm.sf(z)), statistic / nuisance.misfit
+    return float(stats.norm.sf(z)), share(nuisance, statistic, rank)
 
 
 def _along(direction: Array, scalars: list[Array]) -> list[Array]:
