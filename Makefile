@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint test-oldest clean
+.PHONY: demo test lint blind test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -15,6 +15,10 @@ test: $(VENV)/ready lint
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# All blind tests of the diagnosis; takes long.
+blind: $(VENV)/ready
+	$(BIN)/python -m benchmark.blind --trials 200
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:

@@ -1,0 +1,105 @@
+"""Blind tests of the diagnosis: `python -m benchmark.blind --trials 200 --workers 2`.
+
+Hides random effects in random scenes, hands table and lens to `diagnose`, and writes what came of
+it: a file a mode in docs/blind/, and docs/blind.md from all that are there (design, section 8).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from benchmark.blind_effects import HIDDEN
+from benchmark.blind_outside import OUTSIDE
+from benchmark.blind_report import write_report
+from benchmark.blind_trial import MODES, Outcome, Task, attempt
+from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.reporting.progress import progress
+
+SIZES = (1.0, 0.5, 0.2, 0.05)
+OUTSIDE_SIZES = (1.0, 0.5)
+PAIR_SIZE = 0.5
+
+
+def tasks(mode: str, trials: int, seed: int) -> Iterator[Task]:
+    """Yield the trials of a mode (of every size, for one effect), spread over the effects."""
+    names = list(HIDDEN)
+    for number in range(trials):
+        if mode == 'one':
+            yield from (Task(mode, s, (names[number % len(names)],), seed, number) for s in SIZES)
+        elif mode == 'clean':
+            yield Task(mode, 0.0, (), seed, number)
+        elif mode == 'outside':
+            name = list(OUTSIDE)[number % len(OUTSIDE)]
+            size = OUTSIDE_SIZES[number // len(OUTSIDE) % len(OUTSIDE_SIZES)]
+            yield Task(mode, size, (name,), seed, number)
+        else:
+            # Every effect is the first of a pair equally often; the second is any other.
+            rng = np.random.default_rng([seed, number])
+            first = names[number % len(names)]
+            second = str(rng.choice([name for name in names if name != first]))
+            yield Task(mode, PAIR_SIZE, (first, second), seed, number)
+
+
+def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
+    """Run trials in processes of their own, one thread each."""
+    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
+    context = multiprocessing.get_context('spawn')  # the number of threads is read at the start
+    outcomes = []
+    with (
+        progress('blind trials', len(todo)) as advance,
+        ProcessPoolExecutor(workers, mp_context=context) as pool,
+    ):
+        for outcome in pool.map(attempt, todo):
+            outcomes.append(outcome)
+            advance()
+    return outcomes
+
+
+def save(mode: str, outcomes: Sequence[Outcome], asked: argparse.Namespace) -> None:
+    """Write the trials of a mode, one a line, with the command that makes them."""
+    numbers = f'--trials {asked.trials} --seed {asked.seed}'
+    command = f'python -m benchmark.blind --modes {mode} {numbers}'
+    lines = ',\n'.join(json.dumps(outcome.to_dict()) for outcome in outcomes)
+    text = f'{{"command": {json.dumps(command)},\n"trials": [\n{lines}\n]}}\n'
+    write_text(asked.output / f'blind/{mode}.json', text)
+
+
+def load(directory: Path) -> dict[str, tuple[str, list[Outcome]]]:
+    """Return by mode the command and the outcomes that were saved."""
+    saved = {}
+    for mode in MODES:
+        path = directory / f'blind/{mode}.json'
+        if path.is_file():
+            document = json.loads(path.read_text())
+            trials = [Outcome.from_dict(entry) for entry in document['trials']]
+            saved[mode] = document['command'], trials
+    return saved
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the trials that the command line asks for and write the report."""
+    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.blind')
+    parser.add_argument('--trials', type=int, default=200, help='a mode, and a size of one effect')
+    parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
+    parser.add_argument('--seed', type=int, default=0, help='another seed, other trials')
+    parser.add_argument('--modes', nargs='+', choices=MODES, default=MODES, help='what to hide')
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs'), help='directory')
+    asked = parser.parse_args(arguments)
+    (asked.output / 'blind').mkdir(parents=True, exist_ok=True)
+    for mode in asked.modes:
+        save(mode, run(list(tasks(mode, asked.trials, asked.seed)), asked.workers), asked)
+    write_report(load(asked.output), asked.output)
+    sys.stdout.write(f'wrote {asked.output / "blind.md"}\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,279 @@
+"""One blind trial: hide, hand over, diagnose, and compare with what was hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmark.blind_effects import HIDDEN
+from benchmark.blind_hidden import Hidden
+from benchmark.blind_oracle import LinearScene, oracle_finds
+from benchmark.blind_outside import OUTSIDE
+from benchmark.blind_scene import Needs, Scene, draw_scene
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.criticism.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.criticism.projection import Nuisance, score
+from fisheye_svp_ros.effects.base import Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+
+MODES = ('one', 'clean', 'outside', 'two')
+_WEAKEST = 0.02  # an effect of which what is free leaves less than this is drawn again
+_STEPS = 6
+_LARGEST = 1e4  # px
+
+
+class Task(NamedTuple):
+    """What a trial is: its mode, size over the noise, the names to hide, its place in the run."""
+
+    mode: str
+    size: float
+    names: tuple[str, ...]
+    seed: int
+    number: int
+
+
+@dataclass
+class Outcome:
+    """What came of a trial.
+
+    causes: each named effect with its class; hit: whether every hidden effect is among them;
+    extra: named effects whose class holds nothing hidden; oracle: whether it finds each hidden
+    effect; recovered: held-out misfit above noise that the extended model takes away, over what
+    the true one does; errors: of parameters, over their standard errors; p_values: of the first
+    screening; trace: its steps.
+    """
+
+    task: Task
+    scene: str
+    hidden: list[str]
+    verdict: str
+    causes: dict[str, list[str]]
+    remaining: list[str]
+    hit: bool
+    extra: list[str]
+    oracle: list[bool] = field(default_factory=list)
+    recovered: float | None = None
+    errors: dict[str, float] = field(default_factory=dict)
+    p_values: dict[str, float] = field(default_factory=dict)
+    trace: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name; `from_dict` reads them."""
+        return asdict(self) | {'task': self.task._asdict()}
+
+    @classmethod
+    def from_dict(cls, entry: dict[str, Any]) -> Outcome:
+        """Return the outcome that `to_dict` wrote."""
+        task = Task(**entry['task'])
+        return cls(**entry | {'task': task._replace(names=tuple(task.names))})
+
+
+class Case(NamedTuple):
+    """What a trial hides: scene, effects, amounts; image points (S, N, 2), true and as handed."""
+
+    scene: Scene
+    hidden: list[Hidden]
+    amounts: list[float]
+    linear: LinearScene
+    ideal: Array
+    exact: Array
+    given: Array
+
+
+def run_trial(task: Task) -> Outcome:
+    """Run one trial; the same task always gives the same data."""
+    case = draw_case(task)
+    scene = case.scene
+    test = scene.table(case.given, held_out=True) if scene.held_out.any() else None
+    found = diagnose(
+        scene.table(case.given), scene.lens, free_intrinsics=scene.free, held_out=test
+    )
+    classes = {cause.effect: cause.indistinguishable_from for cause in found.causes}
+    named = set(classes).union(*classes.values())
+    outcome = Outcome(
+        task, _described(scene),
+        [
+            f'{name}{f" ({hidden.detail})" if hidden.detail else ""} {amount:.3g}'
+            for name, hidden, amount in zip(task.names, case.hidden, case.amounts, strict=True)
+        ],
+        found.verdict, classes, [structure.variable for structure in found.remaining],
+        hit=named.issuperset(task.names),
+        extra=[e for e, same in classes.items() if not {e, *same} & set(task.names)],
+        trace=[
+            f'{s.effect}: corrected p {s.corrected:.1e}, {s.why}' for s in found.trace
+        ],
+    )
+    if task.mode in ('one', 'two'):
+        outcome.oracle = [
+            oracle_finds(case.linear, name, hidden, amount, case.given)
+            for name, hidden, amount in zip(task.names, case.hidden, case.amounts, strict=True)
+        ]
+    if task.mode == 'one':
+        outcome.errors = _errors(case, task, found)
+        if test is not None:
+            outcome.recovered = _recovered(case, found)
+    if task.mode == 'clean':
+        outcome.p_values = _null_p_values(found)
+    return outcome
+
+
+def attempt(task: Task) -> Outcome:
+    """Run one trial; an error of the diagnosis is an outcome too, and a miss."""
+    try:
+        return run_trial(task)
+    except Exception as error:
+        verdict = f'error: {type(error).__name__}: {error}'
+        return Outcome(task, '', list(task.names), verdict, {}, [], hit=False, extra=[])
+
+
+def draw_case(task: Task) -> Case:
+    """Draw scene and effects, set the amounts, take the pictures."""
+    rng = np.random.default_rng(
+        [task.seed, MODES.index(task.mode), round(1000 * task.size), task.number]
+    )
+    while True:
+        scene = draw_scene(
+            rng, _needs(task), held_out=task.mode == 'one' and task.size >= 1,
+            landmarks=int(rng.choice([26, 54, 80])) if task.mode == 'clean' else 54,
+        )
+        case = _hide(task, scene, rng)
+        if case is not None:
+            return case
+
+
+def _needs(task: Task) -> Needs:
+    needs = Needs()
+    for name in task.names:
+        if name in HIDDEN:
+            needs = needs.joined(HIDDEN[name][1])
+    return needs
+
+
+def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
+    """Return the case, or None where an effect does not show in this scene or shows too much."""
+    world = scene.world()
+    ideal = world.image()
+    linear = LinearScene(scene, ideal)
+    theta = linear.angles(world)
+    hidden, amounts = [], []
+    for name in task.names:
+        draw = HIDDEN[name][0] if name in HIDDEN else OUTSIDE[name][0]
+        one = draw(scene, rng)
+        amount = _amount(one, task.size, scene, linear, theta, rng)
+        if amount is None:
+            return None
+        world = one.world(world, amount) if one.moves else world
+        hidden.append(one)
+        amounts.append(amount)
+    exact = world.image()
+    if not np.isfinite(exact[scene.seen]).all():
+        return None
+    noise = scene.noise * rng.standard_normal(exact.shape)
+    for one, amount in zip(hidden, amounts, strict=True):
+        noise = noise * one.scatter(theta, amount, rng)
+    given = exact + noise
+    for one, amount in zip(hidden, amounts, strict=True):
+        given = one.recorded(given, amount, rng)
+    return Case(scene, hidden, amounts, linear, ideal, exact, given)
+
+
+def _amount(
+    hidden: Hidden, size: float, scene: Scene, linear: LinearScene, theta: Array,
+    rng: np.random.Generator,
+) -> float | None:
+    """Return the amount at which the effect has its size; None where it cannot.
+
+    The size is the RMS, over the noise, of what is left once poses and free intrinsics are
+    fitted; for scatter the RMS of its relative change.
+    """
+    world = scene.world()
+
+    def rms(amount: float) -> float:
+        if not hidden.moves:
+            factor = np.broadcast_to(hidden.scatter(theta, amount, rng), linear.ideal.shape)
+            return float(np.sqrt(np.mean((factor[scene.seen] - 1) ** 2)))
+        moved = hidden.world(world, amount).image() - linear.ideal
+        whole, left = linear.rms(moved), linear.rms(moved, outside=True)
+        known = np.isfinite(whole) and whole < _LARGEST and left > _WEAKEST * whole
+        return left / scene.noise if known else np.nan
+
+    if hidden.recorded(linear.ideal, 1.0, rng) is not linear.ideal:
+        return size * scene.noise
+    if hidden.moves or float(np.ptp(hidden.scatter(theta, 0.1, np.random.default_rng(0)))) > 0:
+        amount = _solved(rms, hidden.start, size)
+        return amount if amount is not None and amount <= hidden.largest else None
+    return None
+
+
+def _solved(rms: Callable[[float], float], start: float, size: float) -> float | None:
+    """Solve rms(amount) = size by secants in logarithms, in which it is nearly straight."""
+    before, after = ((np.log(a), np.log(rms(a))) for a in (start, 2 * start))
+    for _ in range(_STEPS):
+        slope = (after[1] - before[1]) / (after[0] - before[0])
+        if not (np.isfinite(slope) and 0.2 < slope < 5):
+            return None
+        step = (np.log(size) - after[1]) / slope
+        if abs(step) < 1e-3:
+            return float(np.exp(after[0] + step))
+        place = after[0] + step
+        before, after = after, (place, np.log(rms(np.exp(place))))
+    return None
+
+
+def _described(scene: Scene) -> str:
+    return ', '.join([
+        scene.lens.name, 'free' if scene.free else 'fixed',
+        'stereo' if scene.cameras == 2 else 'mono',
+        'boards' if scene.board.any() else 'cloud',
+        f'noise {scene.noise} px{" (stated)" if scene.stated else ""}',
+        f'{2 * int(scene.seen[~scene.held_out[scene.frame]].sum())} numbers',
+    ])
+
+
+def _errors(case: Case, task: Task, found: Diagnosis) -> dict[str, float]:
+    """Return errors over standard errors where the true values are known by the same names."""
+    truth = case.hidden[0].truth(case.amounts[0])
+    mine = [cause for cause in found.causes if cause.effect == task.names[0]]
+    # With other causes beside it the fit is of another model, which is counted elsewhere.
+    if len(found.causes) != 1 or not mine or set(mine[0].parameters) != set(truth):
+        return {}
+    return {
+        name: (entry['value'] - truth[name]) / entry['stderr']
+        for name, entry in mine[0].parameters.items()
+    }
+
+
+def _recovered(case: Case, found: Diagnosis) -> float | None:
+    """Return (before - after) / (before - true model) of the held-out misfit, px^2."""
+    if not (case.hidden[0].moves and case.hidden[0].lasting):
+        return None
+    moves = np.where(case.scene.seen[..., None], case.exact - case.ideal, 0.0)
+    truth = LinearScene(case.scene, case.ideal, held_out=True).pose_rms(case.given - moves)
+    before, after = found.base.heldout_rms_px, found.extended.heldout_rms_px
+    return float((before**2 - after**2) / (before**2 - truth**2))
+
+
+def _null_p_values(found: Diagnosis) -> dict[str, float]:
+    """Return the p-value of the simplest form of each effect in the first screening."""
+    linear = found.before
+    nuisance = Nuisance(linear)
+    values = {}
+    for name, kind in CATALOGUE.items():
+        try:
+            form = min(kind.candidates(linear.scene), key=lambda form: len(form.parameters))
+        except Untestable:
+            continue
+        if isinstance(form, LandmarkSurveyEffect):
+            form = LandmarkSurveyEffect(form.landmarks[:1])
+        result = score(nuisance, linear.effect_columns(form))
+        wrong = [
+            value < 0 for value, parameter in zip(result.estimate, form.parameters, strict=True)
+            if parameter.positive
+        ]
+        if result.rank and not any(wrong):
+            values[name] = round(result.p_value, 5)
+    return values
