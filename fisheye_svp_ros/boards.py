@@ -12,7 +12,7 @@ from fisheye_svp_ros.arrays import Array, Index
 class Board(NamedTuple):
     """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
 
-    size: half the extent along its longer side; flat: all landmarks lie in the plane a, b.
+    size: half the extent along its longer side; flat: four or more landmarks, all in the plane a, b.
     """
 
     id: int
@@ -42,5 +42,6 @@ def _board(label: int, points: Array) -> Board:
     axes[2] = np.cross(axes[0], axes[1])
     along = (distinct - centre) @ axes.T
     size = float(np.abs(along).max(initial=1e-9))
-    flat = bool(np.abs(along[:, 2] - along[:, 2].mean()).max(initial=0.0) < 1e-6 + 1e-3 * size)
+    off = np.abs(along[:, 2] - along[:, 2].mean()).max(initial=0.0)
+    flat = len(distinct) > 3 and bool(off < 1e-6 + 1e-3 * size)
     return Board(label, centre, axes, size, flat)

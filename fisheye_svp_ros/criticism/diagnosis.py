@@ -184,21 +184,26 @@ def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:
 def _noise_causes(
     data: Data, selection: Selection, free: Sequence[str], stated: bool, left: list[Structure]
 ) -> tuple[State, list[Cause], list[Structure]]:
-    """If of what is left only the scatter depends on the angle, weight by it."""
+    """If the scatter depends on the angle, and weighting by it leaves no pattern, name it.
+
+    Uneven scatter by itself makes patterns look significant; a pattern makes scatter look uneven.
+    """
     state = selection.state
-    if {s.variable for s in left} - {'scatter_vs_theta', 'outliers', 'size', 'scatter_vs_frame'}:
+    if 'scatter_vs_theta' not in {s.variable for s in left}:
         return state, [], left
     linear = Linearised(data, state, free)
     growth = noise_growth(linear, Nuisance(linear))
-    corrected = growth.p_value * len(CATALOGUE)
-    if corrected > SIGNIFICANCE:
+    if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
         return state, [], left
-    state = fit(data, with_noise_growth(state, growth.value), free)
-    linear = Linearised(data, state, free)
-    left = significant(remaining_structure(linear, Nuisance(linear), stated))
+    weighted = fit(data, with_noise_growth(state, growth.value), free)
+    linear = Linearised(data, weighted, free)
+    after = significant(remaining_structure(linear, Nuisance(linear), stated))
+    if any(s.of_mean for s in after):
+        return state, [], left
     value = {'value': growth.value, 'stderr': growth.stderr, 'unit': '1/rad^2'}
     cause = _plain_cause('noise_vs_angle', {'growth': value}, growth.p_value)
-    return state, [cause], left
+    # The weights are relative now: what sigma the table states is no longer tested.
+    return weighted, [cause], [s for s in after if s.variable != 'size']
 
 
 def _prefixes(

@@ -83,7 +83,7 @@ def merit(nuisance: Nuisance, result: Score) -> float:
     """Return twice the gain in log likelihood less the charge of the Bayesian criterion."""
     left = max(nuisance.misfit - result.statistic, 1e-12 * nuisance.misfit)
     gain = nuisance.freedom * np.log(nuisance.misfit / left)
-    return float(gain / result.inflation - result.rank * np.log(nuisance.rows))
+    return float(gain - result.rank * np.log(nuisance.rows))
 
 
 def _test(

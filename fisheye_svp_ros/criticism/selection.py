@@ -228,11 +228,15 @@ def indistinguishable(
 def _first(eligible: Sequence[Candidate]) -> Candidate:
     """Return the candidate to try: the best, but freeing every landmark explains nearly anything.
 
-    It comes last, when single landmarks are all that is left to name.
+    It comes last, and only where it describes the data better than a few single landmarks.
     """
-    few = [c for c in eligible if not _is_survey(c.effect)]
-    named = [c for c in few if c.effect.name != 'landmark_survey']
-    return named[0] if named else eligible[0]
+    every = [c for c in eligible if _is_survey(c.effect)]
+    if not every:
+        return eligible[0]
+    single = [c for c in eligible if c.effect.name == 'landmark_survey' and c not in every]
+    if every[0].merit < sum(max(c.merit, 0.0) for c in single):
+        return next(c for c in eligible if c not in every)
+    return next((c for c in eligible if c.effect.name != 'landmark_survey'), every[0])
 
 
 def _worth(
@@ -246,7 +250,7 @@ def _worth(
     hundredth of the misfit.
     """
     explained = candidate.score.statistic
-    fair = gains['frames'] > 0.2 * explained
+    fair = gains['landmarks' if candidate.effect.per_frame else 'frames'] > 0.2 * explained
     if candidate.effect.stage != 'target':
         fair = fair and gains['landmarks'] > 0
     material = explained > 0.01 * float((linear.residual**2).sum())

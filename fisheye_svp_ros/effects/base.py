@@ -138,6 +138,11 @@ class Effect(ABC):
         return other
 
     @property
+    def per_frame(self) -> bool:
+        """Whether parameters belong to single frames, so that other frames say nothing of them."""
+        return False
+
+    @property
     def key(self) -> str:
         """A short name of this form, unique within a data set."""
         parts = [

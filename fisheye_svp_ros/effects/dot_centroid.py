@@ -48,7 +48,7 @@ class DotCentroidEffect(Effect):
         distance = np.linalg.norm(in_camera, axis=-1)
         for board in scene.boards:
             mine = views.used & (views.board == board.id)
-            if not board.flat or board.size < 1e-6 or not mine.any():
+            if not board.flat or not mine.any():
                 continue
             radius = _PROBE * distance[mine]
             angle = 2 * np.pi * np.arange(_RIM) / _RIM

@@ -36,6 +36,10 @@ class RigFlexEffect(Effect):
         return [cls(degree, frames) for degree in (1, 2, 0) if degree < len(frames)]
 
     @property
+    def per_frame(self) -> bool:
+        return not self.degree
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Degree 0 stands for a turn of its own in each frame."""
         labels = [f't{i + 1}' for i in range(self.degree)] or [f'f{f}' for f in self.frames]

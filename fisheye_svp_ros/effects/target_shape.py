@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.boards import Board
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 
 # id, centre (3), axis a (3), axis b (3), size: what places a board in the target frame.
 BoardAxes = tuple[float, ...]
@@ -38,7 +38,9 @@ class TargetShapeEffect(Effect):
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        boards = [board for board in scene.boards if board.size > 1e-6]
+        boards = [board for board in scene.boards if board.flat]
+        if not boards:
+            raise Untestable('no landmarks lie on a flat board that could be bowed')
         every = tuple(_axes(board) for board in boards)
         forms: list[Effect] = [cls(degree, every) for degree in (2, 3, 4)]
         if len(every) > 1:
