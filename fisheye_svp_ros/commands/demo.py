@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> None:
 
 def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:
     """Run the node graph through its scenarios, in lock-step, into a recording."""
+    from fisheye_svp_ros.commands.lock_step import start_in_step, values
     from fisheye_svp_ros.commands.processes import Processes
     from fisheye_svp_ros.evaluation.demonstration import TASKS
 
@@ -63,15 +64,11 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     with Processes(logs) as processes:
         processes.start('recorder', ['record', '-o', str(bag)])
         for task in TASKS:
-            processes.start(task.node, [
-                'run', task.node, *_ros(task.name, wait_for_subscribers=1, patience=_PATIENCE)
-            ])
             cameras.append(f'camera_{task.name}')
-            processes.start(cameras[-1], ['run', 'synthetic_camera', *_ros(
-                task.name, **dict(_scenarios(task.name, lenses, radii)),
-                # The solver and the recorder.
-                wait_for_subscribers=2, lock_step=f'{task.node}/result', repeat='false',
-            )])
+            start_in_step(
+                processes, cameras[-1], [task.node], ['-r', f'__ns:=/{task.name}'],
+                values(**dict(_scenarios(task.name, lenses, radii))),
+            )
         processes.wait(cameras, _PATIENCE)
         processes.stop('recorder')
         for task in TASKS:
@@ -92,13 +89,6 @@ def _scenarios(
         yield 'poses_file', 'calibration'
     if task == 'depth':
         yield 'poses', _list([number for pose in DEPTH_POSES for number in pose])
-
-
-def _ros(namespace: str, **parameters: Any) -> list[str]:
-    words = ['--ros-args', '-r', f'__ns:=/{namespace}']
-    for name, value in parameters.items():
-        words += ['-p', f'{name}:={value}']
-    return words
 
 
 def _list(values: Sequence[Any]) -> str:

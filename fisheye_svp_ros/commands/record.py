@@ -20,12 +20,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--topics', type=_pattern, default=TOPICS, metavar='REGEX',
                         help='full names of the topics; by default all that the nodes publish, '
                         'but for markers and diagnostics')
+    parser.add_argument('--sweep', metavar='FILE',
+                        help='run the node graph through a sweep file, in lock-step, and end with '
+                        'it: a file, or the name of one in config/sweeps')
     parser.add_argument('arguments', nargs=argparse.REMAINDER, metavar='--ros-args ...',
                         help='as for `ros2 run`')
 
 
 def run(args: argparse.Namespace) -> None:
-    """Record until interrupted."""
+    """Record until interrupted, or to the end of a sweep."""
+    if args.sweep:
+        _sweep(args.sweep, args.output)
+    else:
+        _record(args)
+
+
+def _sweep(name: str, bag: Path) -> None:
+    from fisheye_svp_ros.bags import Bag
+    from fisheye_svp_ros.commands.lock_step import record_sweep
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.sweep_file import read_sweep
+    from fisheye_svp_ros.errors import BagError
+    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.share import sweep_path
+
+    path = sweep_path(name)
+    plan = read_sweep(path)
+    if bag.exists():
+        raise BagError(f'{bag}: it exists; a recording needs a new folder')
+    with progress(f'{len(plan.sweep)} scenarios'):
+        record_sweep(path, tuple(plan.solvers), bag, bag.with_name(f'{bag.name}_logs'))
+    count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
+    say(f'{count} sets of {len(plan.sweep)} scenarios are in {bag}')
+
+
+def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.bags import BagWriter
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.run import supply_rclpy

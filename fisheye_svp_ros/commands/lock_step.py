@@ -1,0 +1,50 @@
+"""The node graph in lock-step: a camera whose every set waits for what the solvers say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from fisheye_svp_ros.commands.processes import Processes
+
+_PATIENCE = 3600.0  # s, of a solver for the other topics of a set: nothing is lost in lock-step
+
+
+def values(**parameters: Any) -> list[str]:
+    """Return parameters as ROS arguments."""
+    return [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+
+
+def start_in_step(
+    processes: Processes, camera: str, solvers: Sequence[str], common: Sequence[str],
+    scenarios: Sequence[str] = (),
+) -> None:
+    """Start solver nodes and a synthetic camera, `camera` by name, that ends after its sweep.
+
+    common: ROS arguments of all nodes; scenarios: of the camera.  All wait for a recorder.
+    """
+    for node in solvers:
+        processes.start(node, ['run', node, '--ros-args', *common,
+                               *values(wait_for_subscribers=1, patience=_PATIENCE)])
+    processes.start(camera, [
+        'run', 'synthetic_camera', '--ros-args', *common, *scenarios, *values(
+            wait_for_subscribers=len(solvers) + 1, repeat='false',
+            lock_step=' '.join(f'{node}/result' for node in solvers),
+        )
+    ])
+
+
+def record_sweep(path: Path, solvers: Sequence[str], bag: Path, logs: Path) -> None:
+    """Run the node graph through a sweep file into a new recording.
+
+    Raises StandaloneError where a process does not end well.
+    """
+    with Processes(logs) as processes:
+        processes.start('recorder', ['record', '-o', str(bag)])
+        start_in_step(processes, 'camera', solvers, ['--params-file', str(path)])
+        processes.wait(['camera'], math.inf)
+        processes.stop('recorder')
+        for node in solvers:
+            processes.stop(node)
