@@ -20,11 +20,11 @@ import numpy as np
 from benchmark.blind_effects import HIDDEN
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_report import write_report
-from benchmark.blind_trial import MODES, Outcome, Task, attempt
+from benchmark.blind_trial import MODES, Outcome, Task, run_trial
 from fisheye_svp_ros.files import write_text
 from fisheye_svp_ros.reporting.progress import progress
 
-SIZES = (1.0, 0.5, 0.2, 0.05)
+SIZES = (1.0, 0.5, 0.2, 0.1, 0.05)
 OUTSIDE_SIZES = (1.0, 0.5)
 PAIR_SIZE = 0.5
 
@@ -58,7 +58,7 @@ def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
         progress('blind trials', len(todo)) as advance,
         ProcessPoolExecutor(workers, mp_context=context) as pool,
     ):
-        for outcome in pool.map(attempt, todo):
+        for outcome in pool.map(run_trial, todo):
             outcomes.append(outcome)
             advance()
     return outcomes

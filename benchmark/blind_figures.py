@@ -13,7 +13,7 @@ from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_trial import Outcome
 from fisheye_svp_ros.arrays import Array
 
-NAMELESS = ('unexplained', 'partly_explained')
+OPEN = ('unexplained', 'partly_explained')
 
 
 class Rate(NamedTuple):
@@ -70,8 +70,8 @@ def is_clean(outcome: Outcome) -> bool:
 
 
 def is_open(outcome: Outcome) -> bool:
-    """Whether no name was given and the verdict says that something is left."""
-    return not outcome.causes and outcome.verdict in NAMELESS
+    """Whether the verdict says that something is left."""
+    return outcome.verdict in OPEN
 
 
 def is_right_variable(outcome: Outcome) -> bool:

@@ -156,7 +156,7 @@ def _outside(outcomes: Sequence[Outcome], directory: Path) -> str:
         for name in OUTSIDE for size in sizes(outcomes, 'outside')
     ]
     return '\n'.join(['## Effects outside the catalogue', '', _table(
-        ['hidden', 'no name', 'and said to be unexplained', 'right variable', 'taken as adequate'],
+        ['hidden', 'no name', 'something left', 'right variable', 'taken as adequate'],
         [[
             name, str(rate(mine, lambda o: not o.causes)), str(rate(mine, is_open)),
             str(rate(mine, is_right_variable)), str(rate(mine, is_clean)),

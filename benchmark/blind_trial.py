@@ -85,49 +85,51 @@ class Case(NamedTuple):
 
 
 def run_trial(task: Task) -> Outcome:
-    """Run one trial; the same task always gives the same data."""
+    """Run one trial; the same task always gives the same data.
+
+    An error of the diagnosis is an outcome too, and a miss.
+    """
     case = draw_case(task)
     scene = case.scene
     test = scene.table(case.given, held_out=True) if scene.held_out.any() else None
-    found = diagnose(
-        scene.table(case.given), scene.lens, free_intrinsics=scene.free, held_out=test
-    )
+    hidden = [
+        f'{name}{f" ({one.detail})" if one.detail else ""} {amount:.3g}'
+        for name, one, amount in zip(task.names, case.hidden, case.amounts, strict=True)
+    ]
+    oracle = [
+        oracle_finds(case.linear, name, one, amount, case.given)
+        for name, one, amount in zip(task.names, case.hidden, case.amounts, strict=True)
+        if name in HIDDEN
+    ]
+    try:
+        found = diagnose(
+            scene.table(case.given), scene.lens, free_intrinsics=scene.free, held_out=test
+        )
+    except Exception as error:
+        verdict = f'error: {type(error).__name__}: {error}'
+        return Outcome(task, _described(scene), hidden, verdict, {}, [], False, [], oracle)
+    outcome = _judged(task, case, found, hidden)
+    outcome.oracle = oracle
+    if task.mode == 'one':
+        outcome.errors = _errors(case, task, found)
+        outcome.recovered = None if test is None else _recovered(case, found)
+    if task.mode == 'clean':
+        outcome.p_values = _null_p_values(found)
+    return outcome
+
+
+def _judged(task: Task, case: Case, found: Diagnosis, hidden: list[str]) -> Outcome:
     classes = {cause.effect: cause.indistinguishable_from for cause in found.causes}
     named = set(classes).union(*classes.values())
-    outcome = Outcome(
-        task, _described(scene),
-        [
-            f'{name}{f" ({hidden.detail})" if hidden.detail else ""} {amount:.3g}'
-            for name, hidden, amount in zip(task.names, case.hidden, case.amounts, strict=True)
-        ],
-        found.verdict, classes, [structure.variable for structure in found.remaining],
+    return Outcome(
+        task, _described(case.scene), hidden, found.verdict, classes,
+        [structure.variable for structure in found.remaining],
         hit=named.issuperset(task.names),
         extra=[e for e, same in classes.items() if not {e, *same} & set(task.names)],
         trace=[
             f'{s.effect}: corrected p {s.corrected:.1e}, {s.why}' for s in found.trace
         ],
     )
-    if task.mode in ('one', 'two'):
-        outcome.oracle = [
-            oracle_finds(case.linear, name, hidden, amount, case.given)
-            for name, hidden, amount in zip(task.names, case.hidden, case.amounts, strict=True)
-        ]
-    if task.mode == 'one':
-        outcome.errors = _errors(case, task, found)
-        if test is not None:
-            outcome.recovered = _recovered(case, found)
-    if task.mode == 'clean':
-        outcome.p_values = _null_p_values(found)
-    return outcome
-
-
-def attempt(task: Task) -> Outcome:
-    """Run one trial; an error of the diagnosis is an outcome too, and a miss."""
-    try:
-        return run_trial(task)
-    except Exception as error:
-        verdict = f'error: {type(error).__name__}: {error}'
-        return Outcome(task, '', list(task.names), verdict, {}, [], hit=False, extra=[])
 
 
 def draw_case(task: Task) -> Case:
@@ -263,6 +265,8 @@ def _null_p_values(found: Diagnosis) -> dict[str, float]:
     nuisance = Nuisance(linear)
     values = {}
     for name, kind in CATALOGUE.items():
+        if kind.stage == 'noise':
+            continue
         try:
             form = min(kind.candidates(linear.scene), key=lambda form: len(form.parameters))
         except Untestable:
