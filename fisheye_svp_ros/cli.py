@@ -18,6 +18,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 COMMANDS = {
     'calibrate': 'a lens from measured observations: poses unknown, no start values',
     'demo': 'the whole node graph as processes, recorded, summarised and plotted',
+    'diagnose': 'what a simulation gets wrong about measured observations, and why',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',

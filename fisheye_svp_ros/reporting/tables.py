@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 
 from rich import box
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
 
 _WIDE = 200  # columns where no terminal says how many it has
@@ -23,6 +24,15 @@ def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]
     out = console()
     out.print(title)
     out.print(table)
+
+
+def print_paragraphs(title: str, texts: Iterable[str]) -> None:
+    """Print a title and numbered paragraphs below it."""
+    out = console()
+    out.print(title)
+    for number, text in enumerate(texts, start=1):
+        out.print(Padding(f'{number}. {text}', (0, 2)))
+    out.print()
 
 
 def console() -> Console:

@@ -1,0 +1,129 @@
+"""`fisheye-svp diagnose`: what a lens's simulation gets wrong about measured observations."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.criticism.diagnosis import Diagnosis
+    from fisheye_svp_ros.criticism.known_truth import Compared
+    from fisheye_svp_ros.criticism.points import PointResiduals
+    from fisheye_svp_ros.lens import Lens
+    from fisheye_svp_ros.observations import Observations
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('observations', metavar='OBS',
+                        help='observations: a CSV file, a folder of ORPC files, a recording')
+    parser.add_argument('--lens', required=True, metavar='LENS',
+                        help='the simulation: a lens file, or the name of one that comes with '
+                        'the package')
+    parser.add_argument('--poses', metavar='POSES.csv',
+                        help='true poses; unknown and fitted by default')
+    parser.add_argument('--free', choices=['intrinsics'],
+                        help='fit the intrinsics too; always so for a lens from `calibrate`')
+    parser.add_argument('--held-out', metavar='TEST',
+                        help='other observations of the same camera and target to measure the '
+                        'gain on; by default frames of OBS in turn')
+    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+                        help='folder for report.html and its pictures, diagnosis.json, '
+                        'extended_lens.yaml, residuals.csv')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Diagnose, say what is wrong, write report and extended lens."""
+    from fisheye_svp_ros.criticism.diagnosis import diagnose
+    from fisheye_svp_ros.criticism.inputs import poses_by_frame
+    from fisheye_svp_ros.criticism.known_truth import known_errors
+    from fisheye_svp_ros.criticism.model import intrinsic_names
+    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.readers import read_poses
+    from fisheye_svp_ros.reporting.progress import stages
+    from fisheye_svp_ros.share import lens_path
+
+    lens = load_lens(lens_path(args.lens))
+    free = args.free == 'intrinsics' or lens.calibration is not None
+    observations = _read(args.observations, lens)
+    held_out = _read(args.held_out, lens) if args.held_out else None
+    poses = None
+    if args.poses:
+        poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
+    with stages('diagnosing') as progress:
+        diagnosis = diagnose(
+            observations, lens, free_intrinsics=free, poses=poses, held_out=held_out,
+            progress=progress,
+        )
+        progress('errors where the truth is known')
+        names = intrinsic_names(lens) if free else ()
+        known = known_errors(diagnosis.before, diagnosis.after, names)
+        if args.output:
+            progress('report')
+            _write(args, diagnosis, known, free)
+    _print(diagnosis, known, args.output)
+
+
+def _read(path: str, lens: Lens) -> Observations:
+    from fisheye_svp_ros.commands.notes import note_left_out
+    from fisheye_svp_ros.criticism.inputs import posable
+    from fisheye_svp_ros.readers import read_observations
+
+    observations, left_out = posable(read_observations(path), lens)
+    note_left_out(left_out)
+    return observations
+
+
+def _print(
+    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None
+) -> None:
+    from fisheye_svp_ros.reporting import diagnosis_text as text
+    from fisheye_svp_ros.reporting.tables import print_paragraphs, print_table
+
+    print_paragraphs(
+        text.VERDICTS[diagnosis.verdict], text.verdict_sentences(diagnosis, known)
+    )
+    if diagnosis.causes:
+        print_table(
+            f'{diagnosis.observations} points in {diagnosis.frames} frames, held-out rms '
+            f'{diagnosis.base.heldout_rms_px:.4f} px without any cause',
+            text.CAUSE_HEADER, text.cause_rows(diagnosis),
+        )
+    if folder:
+        print(f'{folder}: report.html, diagnosis.json, {text.EXTENDED}, residuals.csv')
+
+
+def _write(
+    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool
+) -> None:
+    from fisheye_svp_ros.criticism.points import point_residuals
+    from fisheye_svp_ros.lens import save_lens
+    from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report
+    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
+    from fisheye_svp_ros.reporting.results import write_json
+
+    folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
+    truth = {name: compared._asdict() for name, compared in known.items()}
+    write_json(folder / 'diagnosis.json', {**diagnosis.to_dict(), 'known_truth': truth})
+    save_lens(diagnosis.lens, folder / EXTENDED)
+    _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations.cameras)
+    write_report(diagnosis, points, known, Inputs(
+        args.observations, args.lens, args.poses, args.held_out, folder, free
+    ))
+
+
+def _write_residuals(path: Path, points: PointResiduals, cameras: Sequence[str]) -> None:
+    import numpy as np
+
+    from fisheye_svp_ros.readers.table import write_table
+
+    named = {'camera': np.array(cameras)[points.camera]} if len(cameras) > 1 else {}
+    write_table(path, {
+        'frame': points.frame, **named, 'landmark': points.landmark,
+        'u': points.uv[:, 0], 'v': points.uv[:, 1],
+        'du_before': points.before[:, 0], 'dv_before': points.before[:, 1],
+        'du_after': points.after[:, 0], 'dv_after': points.after[:, 1],
+        'theta': points.theta, 'range': points.range, 'outlier': points.outlier.astype(int),
+    })

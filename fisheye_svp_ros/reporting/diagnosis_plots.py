@@ -1,0 +1,276 @@
+"""Pictures of residuals before and after the model was extended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from scipy import stats
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.criticism.diagnosis import Diagnosis
+from fisheye_svp_ros.criticism.points import PointResiduals
+from fisheye_svp_ros.files import replacing
+from fisheye_svp_ros.lens import Lens
+
+BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
+_STYLE: Any = {
+    'font.size': 9.5, 'axes.titlesize': 10.5, 'axes.edgecolor': NOISE, 'axes.labelcolor': INK,
+    'xtick.color': INK, 'ytick.color': INK, 'text.color': INK, 'axes.spines.top': False,
+    'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': '#e2e8f0',
+    'legend.frameon': False,
+}
+_SIDES = (('before', BEFORE), ('after', AFTER))
+_BINS = 16
+_ARROWS = 2500
+_CELLS = 18  # of the mean field, along the image
+
+
+Picture = tuple[str, Callable[..., Figure], tuple[Any, ...]]
+
+
+class Shown(NamedTuple):
+    """What the pictures are of: observations without gross errors, the lens, noise (px)."""
+
+    points: PointResiduals
+    lens: Lens
+    noise: float
+
+    @classmethod
+    def of(cls, diagnosis: Diagnosis, points: PointResiduals) -> Shown:
+        """Leave out gross errors: they have a table of their own."""
+        both = np.concatenate([points.before, points.after], axis=1)
+        kept = ~points.outlier & np.isfinite(both).all(axis=1)
+        shown = PointResiduals._make(array[kept] for array in points)
+        return cls(shown, diagnosis.after.state.lens, diagnosis.noise_px)
+
+
+def save(path: Path, draw: Callable[..., Figure], *arguments: object) -> None:
+    """Draw a figure in the style of the report and write it as PNG, whole or not at all."""
+    with matplotlib.rc_context(_STYLE), replacing(path) as temporary:
+        draw(*arguments).savefig(temporary, dpi=120)
+
+
+def draw_field(shown: Shown) -> Figure:
+    """Residual vectors over the image: of single points, and means over cells of the image."""
+    points, cell = shown.points, shown.lens.width / _CELLS
+    figure = Figure((11, 1.2 + 10 * shown.lens.height / shown.lens.width), layout='constrained')
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    step = max(1, len(points.uv) // _ARROWS)
+    fields = [
+        ((points.uv[::step], residual[::step]), _cell_means(points.uv, residual, cell))
+        for residual in (points.before, points.after)
+    ]
+    for kind, row in enumerate(axes):
+        typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
+        for axis, field, (side, colour) in zip(row, fields, _SIDES, strict=True):
+            _image_frame(axis, shown.lens)
+            _arrows(axis, *field[kind], typical, cell, colour)
+            if not kind:
+                rms = _rms(getattr(points, side))
+                axis.set_title(f'{side}: {rms:.3f} px rms', color=colour)
+    axes[0, 0].set_ylabel('single points\nv / px')
+    axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
+    for axis in axes[1]:
+        axis.set_xlabel('u / px')
+    return figure
+
+
+def draw_against(shown: Shown, x: Array, label: str, log: bool = False) -> Figure:
+    """Radial and tangential residuals against a variable (K,), with binned means."""
+    rows = [('radial / px', 0), ('tangential / px', 1)]
+    polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
+    return _grid(shown, [
+        (name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows
+    ], label, log)
+
+
+def draw_phase(shown: Shown) -> Figure:
+    """Residuals of u and v against the place of u and v within its pixel."""
+    phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
+    return _grid(shown, [
+        (f'{name} residual / px', phase[:, i],
+         {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES})
+        for i, name in enumerate('uv')
+    ], 'distance of u (above) and v (below) from the middle of its pixel / px', False)
+
+
+def draw_landmarks(shown: Shown) -> Figure:
+    """Rms of each landmark's residuals."""
+    return _by_group(shown, shown.points.landmark, None, 'landmark')
+
+
+def draw_frames(shown: Shown) -> Figure:
+    """Rms of each frame's residuals, over time where it is known."""
+    t = shown.points.t
+    if not np.isfinite(t).all():
+        return _by_group(shown, shown.points.frame, None, 'frame')
+    return _by_group(shown, shown.points.frame, t - t.min(), 'time / s')
+
+
+def draw_histogram(shown: Shown) -> Figure:
+    """Residuals of both coordinates over the noise, beside the normal distribution."""
+    figure = Figure((11, 3.4), layout='constrained')
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    bins = np.linspace(-6, 6, 73)
+    middle = (bins[:-1] + bins[1:]) / 2
+    for axis, (side, colour) in zip(axes, _SIDES, strict=True):
+        z = getattr(shown.points, side).ravel() / shown.noise
+        count = z.size * np.diff(bins)[0]
+        axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='residuals of u and v')
+        axis.plot(middle, count * stats.norm.pdf(middle), color=INK, lw=1.4, label='noise alone')
+        axis.set(yscale='log', ylim=(0.5, None), xlabel='residual over the noise', title=side)
+        axis.legend(loc='upper right')
+    axes[0].set_ylabel('image coordinates')
+    return figure
+
+
+def _grid(
+    shown: Shown, rows: list[tuple[str, Array, dict[str, Array]]], label: str, log: bool
+) -> Figure:
+    figure = Figure((11, 5.0), layout='constrained')
+    axes = figure.subplots(2, 2, sharex=True, sharey='row')
+    for row, (name, x, values) in zip(axes, rows, strict=True):
+        highest = 2.2 * shown.noise
+        for axis, (side, colour) in zip(row, _SIDES, strict=True):
+            highest = max(highest, _binned(axis, x, values[side], shown.noise, colour))
+            if log:
+                axis.set_xscale('log')
+                axis.xaxis.set_major_formatter('{x:g}')
+        row[0].set_ylim(-1.2 * highest, 1.2 * highest)
+        row[0].set_ylabel(name)
+    for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
+        axis.set_title(side, color=colour)
+    for axis in axes[1]:
+        axis.set_xlabel(label)
+    _legend(figure, axes[0, 1])
+    return figure
+
+
+def _binned(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
+    """Draw points, and of bins of equal count the means, their errors and the scatter.
+
+    Returns the largest mean with its error, px.
+    """
+    axis.plot(x, y, '.', ms=1.5, color=colour, alpha=0.15, zorder=1)
+    order = np.argsort(x, kind='stable')
+    parts = np.array_split(order, max(min(_BINS, len(x) // 8), 1))
+    centre, mean, rms, error, count = np.array([
+        (x[p].mean(), y[p].mean(), y[p].std(), y[p].std() / np.sqrt(p.size), p.size)
+        for p in parts
+    ]).T
+    band = 2 * noise / np.sqrt(count)
+    axis.fill_between(centre, -band, band, color=NOISE, alpha=0.6, lw=0, zorder=2,
+                      label='where noise alone keeps 95 % of the means')
+    axis.errorbar(centre, mean, error, fmt='o-', ms=4, lw=1.3, color=colour, zorder=3,
+                  mec='white', mew=0.5, label='mean of a bin and its standard error')
+    for sign in (-1, 1):
+        axis.plot(centre, mean + sign * rms, ':', lw=1.2, color=colour, zorder=3,
+                  label='scatter within a bin' if sign > 0 else None)
+    return float((np.abs(mean) + error).max())
+
+
+def _legend(figure: Figure, axis: Axes) -> None:
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside upper right', ncols=len(labels), fontsize=8)
+
+
+def _by_group(shown: Shown, group: Index, x: Array | None, label: str) -> Figure:
+    figure = Figure((11, 3.0), layout='constrained')
+    axis = figure.subplots()
+    names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
+    place = names if x is None else np.bincount(label_of, weights=x) / count
+    order = np.argsort(place, kind='stable')
+    expected = np.sqrt(2) * shown.noise
+    low, high = (np.sqrt(stats.chi2.ppf(p, 2 * count) / count) * shown.noise
+                 for p in (0.025, 0.975))
+    axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
+                      step='mid', label='where noise alone keeps 95 %')
+    axis.axhline(expected, color=NOISE, lw=1)
+    for side, colour in _SIDES:
+        squares = (getattr(shown.points, side) ** 2).sum(axis=1)
+        rms = np.sqrt(np.bincount(label_of, weights=squares) / count)
+        style = 'o' if len(names) > 60 else 'o-'
+        axis.plot(place[order], rms[order], style, ms=3.5, lw=1, color=colour, label=side)
+    axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
+    _legend(figure, axis)
+    return figure
+
+
+def _image_frame(axis: Axes, lens: Lens) -> None:
+    """Draw the border of the image and circles of equal incidence angle."""
+    axis.set_aspect('equal')
+    axis.grid(visible=False)
+    axis.add_patch(Rectangle((-0.5, -0.5), lens.width, lens.height, fill=False, ec=NOISE))
+    turn = np.linspace(0, 2 * np.pi, 181)
+    for degrees in range(30, int(np.degrees(lens.max_incidence)) + 1, 30):
+        height, _ = lens.image_height.value_and_slope(np.radians(np.array([degrees])))
+        u, v = lens.cx + lens.fx * height * np.cos(turn), lens.cy + lens.fy * height * np.sin(turn)
+        inside = (u > 0) & (u < lens.width) & (v > 0) & (v < lens.height)
+        axis.plot(np.where(inside, u, np.nan), v, ':', color=NOISE, lw=0.8)
+        if inside.any():
+            at = int(np.argmax(np.where(inside, np.sin(turn - 0.6), -2)))
+            axis.annotate(f'{degrees}°', (u[at], v[at]), color=NOISE, fontsize=8)
+    axis.set(xlim=(-1, lens.width), ylim=(lens.height, -1))
+
+
+def _arrows(
+    axis: Axes, uv: Array, residual: Array, typical: float, cell: float, colour: str
+) -> None:
+    """Draw residuals, the typical one (px) as long as a cell, and the key to their scale."""
+    key = axis.quiver(
+        *uv.T, *residual.T, angles='xy', scale_units='xy', scale=typical / cell, color=colour,
+        alpha=0.45 if len(uv) > 600 else 0.9, width=0.0018,
+    )
+    length = round_number(typical)
+    axis.quiverkey(key, 0.85, 1.03, length, f'{length:g} px', labelpos='E', color=INK)
+
+
+def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
+    """Return places and means of the cells that hold three points or more."""
+    _, label, count = np.unique(
+        np.floor(uv / cell), axis=0, return_inverse=True, return_counts=True
+    )
+    means = [
+        np.bincount(label.reshape(-1), weights=column) / count
+        for column in (*uv.T, *residual.T)
+    ]
+    table = np.stack(means, axis=-1)[count >= 3]
+    return table[:, :2], table[:, 2:]
+
+
+def _polar(shown: Shown, residual: Array) -> Array:
+    """Return residuals (K, 2) along the radius and across it."""
+    arm = shown.points.uv - np.array([shown.lens.cx, shown.lens.cy])
+    radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-9)
+    across = np.stack([-radial[:, 1], radial[:, 0]], axis=-1)
+    return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)
+
+
+def _rms(residual: Array) -> float:
+    return float(np.sqrt((residual**2).sum(axis=1).mean()))
+
+
+def round_number(value: float) -> float:
+    """Return 1, 2 or 5 times a power of ten, near a value."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
+    return float(max((m * power for m in (1, 2, 5) if m * power <= value), default=power))
+
+
+def residual_pictures(shown: Shown) -> Iterator[Picture]:
+    """Yield name, function and arguments of every picture of residuals."""
+    points = shown.points
+    spread = points.range.max() > 4 * points.range.min()
+    yield 'field', draw_field, (shown,)
+    yield 'theta', draw_against, (shown, np.degrees(points.theta), 'incidence angle / deg')
+    yield 'range', draw_against, (shown, points.range, 'distance of the landmark / m', spread)
+    yield 'landmark', draw_landmarks, (shown,)
+    yield 'frame', draw_frames, (shown,)
+    yield 'phase', draw_phase, (shown,)
+    yield 'histogram', draw_histogram, (shown,)

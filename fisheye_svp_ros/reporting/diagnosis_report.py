@@ -1,0 +1,178 @@
+"""The report of a diagnosis: one self-contained HTML page, and its pictures beside it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+import numpy as np
+
+from fisheye_svp_ros.criticism.diagnosis import Diagnosis
+from fisheye_svp_ros.criticism.known_truth import Compared
+from fisheye_svp_ros.criticism.points import PointResiduals
+from fisheye_svp_ros.criticism.selection import SIGNIFICANCE, Step
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.reporting import diagnosis_text as text
+from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures, save
+from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
+from fisheye_svp_ros.reporting.target_map import board_maps
+
+_CAPTIONS = {
+    'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
+             'incidence angle. Above: single points. Below: means over cells of the image; what '
+             'is alike in all frames shows there.',
+    'theta': 'Residuals against the incidence angle, along the radius from the principal point '
+             '(above) and across it (below).',
+    'range': 'Residuals against the distance of the landmark. A lens without a single viewpoint '
+             'shows here: its radial residuals change with the distance.',
+    'landmark': 'Residuals of each landmark. One that stands out is not where it is said to be.',
+    'frame': 'Residuals of each frame. A step or a drift is a change of the camera.',
+    'phase': 'Residuals against the place within a pixel. Waves come from the detector of image '
+             'points.',
+    'histogram': 'Residuals over the noise; beyond 6 at the ends. Wide flanks are gross errors or '
+                 'noise that differs from place to place.',
+}
+_PICTURE_OF = {
+    'image': 'field', 'theta': 'theta', 'range': 'range', 'landmark': 'landmark',
+    'frame': 'frame', 'time': 'frame', 'pixel_phase': 'phase', 'neighbour_correlation': 'field',
+    'outliers': 'histogram', 'scatter_vs_theta': 'theta', 'scatter_vs_frame': 'frame',
+    'size': 'histogram',
+}
+_BAR = 220  # px of a share of 1
+_ROWS = 24
+
+
+class Inputs(NamedTuple):
+    """What was diagnosed, as the user named it; folder: where the report goes."""
+
+    observations: str
+    lens: str
+    poses: str | None
+    held_out: str | None
+    folder: Path
+    free_intrinsics: bool
+
+
+def write_report(
+    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Compared], inputs: Inputs
+) -> list[Path]:
+    """Write report.html and its pictures into a folder; return the files.
+
+    Raises OutputError where one cannot be written.
+    """
+    pictures = list(_draw(diagnosis, points, inputs.folder))
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'), autoescape=True,
+        undefined=jinja2.StrictUndefined, trim_blocks=True,
+    )
+    page = environment.get_template('diagnosis.html').render(
+        d=diagnosis, inputs=inputs, percent=text.percent, significance=SIGNIFICANCE,
+        headline=text.VERDICTS[diagnosis.verdict],
+        sentences=text.verdict_sentences(diagnosis, known),
+        pictures={'target': None, 'evidence': None, **{p.stem: _data_uri(p) for p in pictures}},
+        shown=_CAPTIONS.items(),
+        **_causes(diagnosis), **_evidence(diagnosis), **_rest(diagnosis, points),
+        known=list(text.known_rows(known)), free=_free(inputs),
+    )
+    report = inputs.folder / 'report.html'
+    write_text(report, page)
+    return [report, *pictures]
+
+
+def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:
+    for name, draw, arguments in residual_pictures(Shown.of(diagnosis, points)):
+        save(folder / f'{name}.png', draw, *arguments)
+        yield folder / f'{name}.png'
+    if diagnosis.trace:
+        save(folder / 'evidence.png', draw_evidence, diagnosis)
+        yield folder / 'evidence.png'
+    on_target = [c.effect for c in diagnosis.causes if CATALOGUE[c.effect].stage == 'target']
+    if on_target:
+        maps = [('the target in the extended model', m) for m in board_maps(diagnosis.after)]
+        if 'target_shape' in on_target and len(on_target) > 1:
+            alone = board_maps(diagnosis.after, ('target_shape',))
+            maps += [('target_shape alone', m) for m in alone]
+        save(folder / 'target.png', draw_target, maps)
+        yield folder / 'target.png'
+
+
+def _data_uri(path: Path) -> str:
+    return 'data:image/png;base64,' + base64.b64encode(path.read_bytes()).decode('ascii')
+
+
+def _free(inputs: Inputs) -> str:
+    free = {'poses': not inputs.poses, 'intrinsics': inputs.free_intrinsics}
+    return text.listed([name for name, fitted in free.items() if fitted]) or 'nothing'
+
+
+def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
+    causes = []
+    for cause, row in zip(diagnosis.causes, text.cause_rows(diagnosis), strict=True):
+        fields = dict(zip(('effect', 'size', 'p', 'rms', 'gain', 'same'), row, strict=True))
+        shown = list(cause.parameters.items())[:_ROWS]
+        causes.append({
+            **fields, 'what': text.what(cause.effect),
+            'to_separate': cause.to_separate if cause.indistinguishable_from else '',
+            'parameters': [
+                (name, text.quantity(entry), f'{entry["value"]:.6g} {entry["unit"]}')
+                for name, entry in shown
+            ],
+            'count': len(cause.parameters),
+        })
+    stages = {CATALOGUE[cause.effect].stage for cause in diagnosis.causes}
+    return {'causes': causes, 'on_target': 'target' in stages}
+
+
+def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
+    misfit = float((diagnosis.before.residual**2).sum())
+    return {
+        'steps': [_step(step, misfit) for step in diagnosis.trace],
+        'tested': len(CATALOGUE) - len(diagnosis.untestable),
+    }
+
+
+def _step(step: Step, misfit: float) -> dict[str, Any]:
+    gains = (step.held_out.get(name) for name in ('frames', 'landmarks', 'range_bands'))
+    tried = step.statistic > 0
+    return {
+        'effect': step.effect, 'accepted': step.accepted, 'why': step.why,
+        'rank': step.rank if tried else '',
+        'explains': f'{100 * step.statistic / misfit:.1f}' if tried else '',
+        'p': text.probability(step.corrected).removeprefix('p ').removeprefix('= ')
+        if tried else '',
+        'held_out': ['' if g is None else f'{100 * g / misfit:.1f}' for g in gains],
+    }
+
+
+def _rest(diagnosis: Diagnosis, points: PointResiduals) -> dict[str, Any]:
+    strongest = sorted(diagnosis.remaining, key=lambda structure: -structure.share)
+    far = np.flatnonzero(points.outlier)
+    distance = np.linalg.norm(points.after, axis=1)
+    far = far[np.argsort(-np.nan_to_num(distance[far], nan=np.inf))]
+    return {
+        'remaining': [
+            {
+                'words': text.remaining_text(s.variable),
+                'link': _PICTURE_OF.get(s.variable),
+                'p': text.probability(s.p_value).removeprefix('p ').removeprefix('= '),
+                'share': text.percent(s.share) if s.variable in text.VARIABLES else '',
+                'width': round(_BAR * min(s.share, 1.0)),
+            }
+            for s in {s.variable: s for s in strongest}.values()
+        ],
+        'looked_at': text.listed(list(text.VARIABLES.values()), 'or'),
+        'untestable': [
+            (effect, why, CATALOGUE[effect].signature)
+            for effect, why in diagnosis.untestable.items()
+        ],
+        'outlier_count': len(far),
+        'outliers': [
+            (points.frame[i], points.landmark[i], f'{points.uv[i, 0]:.2f}',
+             f'{points.uv[i, 1]:.2f}', f'{distance[i]:.2f}')
+            for i in far[:_ROWS]
+        ],
+    }

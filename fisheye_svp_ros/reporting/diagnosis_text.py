@@ -1,0 +1,221 @@
+"""A diagnosis in words and human units: for the terminal, the report and /diagnostics."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.criticism.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.criticism.known_truth import Compared
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.reporting.tables import with_error
+from fisheye_svp_ros.reporting.target_map import board_maps
+
+EXTENDED = 'extended_lens.yaml'
+VERDICTS = {
+    'adequate': 'Adequate: the simulation describes these data',
+    'explained': 'Explained: what is wrong has a name',
+    'partly_explained': 'Partly explained: something remains without a name',
+    'unexplained': 'Unexplained: something is wrong that no effect accounts for',
+}
+VARIABLES = {
+    'image': 'the place in the image',
+    'theta': 'the incidence angle',
+    'range': 'the distance of the landmark',
+    'landmark': 'the landmark',
+    'frame': 'the frame',
+    'time': 'the time',
+    'pixel_phase': 'the place within a pixel',
+}
+_OTHERWISE = {
+    'neighbour_correlation': 'neighbours in the image err alike',
+    'outliers': 'a few points lie far off',
+    'scatter_vs_theta': 'the scatter changes with the incidence angle',
+    'scatter_vs_frame': 'the scatter differs from frame to frame',
+    'size': 'the residuals are not of the size that sigma says',
+}
+_HUMAN = {
+    'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
+    '1': (1e2, '%'), '1/rad^2': (1.0, '/rad²'),
+}
+_MEASURES = {
+    'position_error_m': ('position error', 1e3, 'mm'),
+    'axis_error_rad': ('error of the viewing axis', 180 / math.pi, 'deg'),
+    'depth_error_m': ('stereo error', 1e3, 'mm'),
+}
+_NAMED = 3  # causes that one sentence can bear
+_UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
+_FEW = 4  # parameters that are read one by one
+
+
+def what(effect: str) -> str:
+    """Return what an effect is, as the end of a sentence."""
+    text = inspect.getdoc(inspect.getmodule(CATALOGUE[effect])) or effect
+    return text[0].lower() + text[1:].rstrip('.')
+
+
+def quantity(entry: Mapping[str, Any]) -> str:
+    """Return a parameter's value and standard error in the unit that people read."""
+    factor, unit = _HUMAN.get(entry['unit'], (1.0, entry['unit']))
+    value, error = with_error(factor * entry['value'], factor * entry['stderr'])
+    return f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}'
+
+
+def size(diagnosis: Diagnosis, cause: Cause) -> str:
+    """Return how large a cause is: its parameters, or what many of them amount to."""
+    if cause.effect == 'target_shape':
+        maps = board_maps(diagnosis.after, (cause.effect,))
+        return '; '.join(
+            (f'board {m.board}: ' if len(maps) > 1 else '')
+            + f'{1e3 * m.peak_to_valley:.2f} mm from the lowest to the highest place'
+            for m in maps if m.peak_to_valley > 0
+        )
+    if cause.effect == 'landmark_survey':
+        return _landmarks(diagnosis, cause)
+    named = [
+        f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
+        if abs(entry['value']) > _UNDETERMINED * entry['stderr']
+    ]
+    if len(named) <= _FEW:
+        return ', '.join(named)
+    return ', '.join(named[:_FEW]) + f' and {len(named) - _FEW} more'
+
+
+def _landmarks(diagnosis: Diagnosis, cause: Cause) -> str:
+    names = list(dict.fromkeys(name.partition('.')[0] for name in cause.parameters))
+    if len(names) <= _FEW:
+        values = np.array([entry['value'] for entry in cause.parameters.values()]).reshape(-1, 3)
+        far = 1e3 * np.linalg.norm(values, axis=1)
+        return ', '.join(f'landmark {n} by {d:.2f} mm' for n, d in zip(names, far, strict=True))
+    maps = board_maps(diagnosis.after, (cause.effect,))
+    squares = np.concatenate([m.height**2 + (m.slide**2).sum(axis=1) for m in maps])
+    return f'{len(names)} landmarks by {1e3 * np.sqrt(squares.mean()):.2f} mm rms'
+
+
+def probability(p_value: float) -> str:
+    """Return a p-value; the smallest ones rest on more normal tails than any data have."""
+    return f'p = {p_value:.1g}' if p_value > 1e-12 else 'p < 1e-12'
+
+
+def percent(share: float) -> str:
+    """Return a share in percent."""
+    return f'{100 * share:.0f} %'
+
+
+def remains(diagnosis: Diagnosis, most: int = 3) -> str:
+    """Return what the residuals still show, the variables they depend on most first."""
+    order = sorted(diagnosis.remaining, key=lambda structure: -structure.share)
+    names = list(dict.fromkeys(structure.variable for structure in order))
+    depends = [VARIABLES.get(name, name) for name in names if name not in _OTHERWISE]
+    clauses = [f'they depend on {listed(depends[:most])}'] if depends else []
+    return '; '.join([*clauses, *(_OTHERWISE[name] for name in names if name in _OTHERWISE)])
+
+
+def remaining_text(variable: str) -> str:
+    """Return one variable of what remains as a clause."""
+    depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
+    return _OTHERWISE.get(variable, depends)
+
+
+def verdict_sentences(
+    diagnosis: Diagnosis, known: Mapping[str, Compared] | None = None
+) -> tuple[str, str, str]:
+    """Return what is wrong, what correcting it gains, and what to do next.
+
+    known: errors where the truth is known, of `criticism.known_truth`.
+    """
+    return _wrong(diagnosis), _gained(diagnosis, known or {}), _next(diagnosis)
+
+
+def _wrong(d: Diagnosis) -> str:
+    noise = f'noise of {d.noise_px:.3g} px a coordinate'
+    if d.verdict == 'adequate':
+        return (f'Nothing is wrong that these data can show: in {d.observations} points of '
+                f'{d.frames} frames the simulation leaves {noise} and no pattern.')
+    if not d.causes:
+        return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms that are not all '
+                f'noise, and no effect of the catalogue accounts for them: {remains(d, 7)}.')
+    causes = '; because '.join(
+        f'{what(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
+        for c in d.causes[:_NAMED]
+    )
+    more = len(d.causes) - _NAMED
+    rest = f'; and for {more} more reason{"s" * (more > 1)} in the table' if more > 0 else ''
+    return f'Beyond {noise} the simulation is wrong because {causes}{rest}.'
+
+
+def _name(cause: Cause) -> str:
+    others = listed(cause.indistinguishable_from, 'or')
+    return f'{cause.effect}, or as well {others}' if others else cause.effect
+
+
+def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
+    before, after = d.base.heldout_rms_px, d.extended.heldout_rms_px
+    moving = [c for c in d.causes if CATALOGUE[c.effect].stage != 'noise']
+    if not d.causes:
+        why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
+        return f'The lens as it is predicts held-out data to {before:.3g} px rms; {why}.'
+    if not moving:
+        return (f'Held-out data are predicted to {after:.3g} px rms as before: the cause is in '
+                'the table of image points, not in the lens.')
+    text = (f'Corrected, held-out data are predicted to {after:.3g} px rms instead of '
+            f'{before:.3g}, which takes away {percent(d.gain.value)} (95 % interval '
+            f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
+    for label, base, extended, _ in known_rows(known):
+        text += f'; the {label} goes from {base} to {extended}'
+    return text + '.'
+
+
+def _next(d: Diagnosis) -> str:
+    if d.verdict == 'adequate':
+        blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
+        return f'Keep the lens as it is{blind}.'
+    stages = {CATALOGUE[c.effect].stage for c in d.causes}
+    steps = []
+    if stages - {'noise'}:
+        steps.append(f'solve with {EXTENDED}')
+    if 'target' in stages:
+        steps.append('measure the target again (the correction holds for this target alone)')
+    steps += [
+        f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
+        for c in d.causes if c.indistinguishable_from
+    ]
+    steps += [_remedy(c) for c in d.causes if CATALOGUE[c.effect].stage == 'noise']
+    if d.remaining:
+        steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
+    text = '; '.join(steps)
+    return text[0].upper() + text[1:] + '.'
+
+
+def _remedy(cause: Cause) -> str:
+    return cause.to_separate.replace(';', ',')
+
+
+def known_rows(known: Mapping[str, Compared]) -> Iterable[tuple[str, str, str, str]]:
+    """Yield name, mean error before and after, and by how much it is less."""
+    for name, compared in known.items():
+        label, factor, unit = _MEASURES[name]
+        yield (label, f'{factor * compared.base:.3g} {unit}',
+               f'{factor * compared.extended:.3g} {unit}',
+               f'{percent(compared.gain)} ({percent(compared.low)} to {percent(compared.high)})')
+
+
+def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
+    """Yield the table of causes: effect, size, p-value, held-out rms, gain, its class."""
+    for c in diagnosis.causes:
+        rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
+        same = ', '.join(c.indistinguishable_from) or '-'
+        p_value = probability(c.p_value).removeprefix('p ').removeprefix('= ')
+        yield c.effect, size(diagnosis, c), p_value, rms, percent(c.gain), same
+
+
+CAUSE_HEADER = ('cause', 'size', 'p', 'held-out rms px', 'gain', 'may as well be')
+
+
+def listed(names: Sequence[str], word: str = 'and') -> str:
+    """Return names as one enumerates them."""
+    return f' {word} '.join(filter(None, (', '.join(names[:-1]), *names[-1:])))

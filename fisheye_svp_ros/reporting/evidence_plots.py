@@ -1,0 +1,86 @@
+"""Pictures of the evidence for each cause, and of the target as the extended model has it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from fisheye_svp_ros.criticism.diagnosis import Diagnosis
+from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, round_number
+from fisheye_svp_ros.reporting.target_map import BoardMap
+
+_REFUSED = '#cbd5e1'
+
+
+def draw_evidence(diagnosis: Diagnosis) -> Figure:
+    """What each step of the search explains, and how well held-out data are predicted after it."""
+    steps = [step for step in diagnosis.trace if step.statistic > 0]
+    count = max(len(steps), len(diagnosis.causes) + 1)
+    figure = Figure((11, 1.4 + 0.32 * count), layout='constrained')
+    left, right = figure.subplots(1, 2)
+    misfit = float((diagnosis.before.residual**2).sum())
+    left.barh(
+        [step.effect for step in steps], [100 * step.statistic / misfit for step in steps],
+        color=[AFTER if step.accepted else _REFUSED for step in steps],
+    )
+    left.set(xlabel='explains % of the misfit there was at the start', title='steps of the search')
+    left.plot([], [], 's', color=AFTER, label='accepted')
+    left.plot([], [], 's', color=_REFUSED, label='refused')
+    left.legend(loc='lower right', fontsize=8)
+    _held_out(right, diagnosis)
+    for axis in (left, right):
+        axis.invert_yaxis()
+        axis.grid(visible=False, axis='y')
+    return figure
+
+
+def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
+    causes = [c for c in diagnosis.causes if math.isfinite(c.heldout_rms_px)]
+    names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes)]
+    rms = [diagnosis.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes)]
+    axis.barh(names, rms, color=[BEFORE, *[AFTER] * len(causes)], height=0.6)
+    for place, value in enumerate(rms):
+        axis.annotate(f' {value:.3f}', (value, place), va='center', fontsize=8.5)
+    axis.axvline(math.sqrt(2) * diagnosis.noise_px, color=INK, ls=':', label='noise')
+    axis.set(xlabel='rms residual of held-out data / px', title='prediction of held-out data')
+    axis.margins(x=0.12)
+    axis.legend(loc='lower right', fontsize=8)
+
+
+def draw_target(maps: list[tuple[str, BoardMap]]) -> Figure:
+    """Height maps of boards with their titles, and the landmarks' slides along them."""
+    rows = math.ceil(len(maps) / 2)
+    figure = Figure((5.5 * min(len(maps), 2), 4.8 * rows), layout='constrained')
+    axes = np.ravel(figure.subplots(rows, min(len(maps), 2), squeeze=False))
+    for axis in axes[len(maps):]:
+        axis.remove()
+    for axis, (title, board) in zip(axes, maps, strict=False):
+        _height_map(figure, axis, board)
+        axis.set_title(f'board {board.board}, {title}:\n'
+                       f'{1e3 * board.peak_to_valley:.2f} mm from lowest to highest')
+    return figure
+
+
+def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
+    x, y = 1e3 * board.place.T
+    height = 1e3 * board.height
+    limit = max(float(np.quantile(np.abs(height), 0.99)), 1e-6)
+    levels = np.linspace(-limit, limit, 21)
+    drawn = axis.tricontourf(x, y, height, levels, cmap='RdBu_r', extend='both')
+    axis.plot(x, y, '.', color=INK, ms=2)
+    figure.colorbar(drawn, ax=axis, label='height / mm', shrink=0.9, format='%.2f')
+    longest = 1e3 * float(np.linalg.norm(board.slide, axis=1).max())
+    if longest > 0.02 * limit:
+        typical = 1e3 * float(np.quantile(np.linalg.norm(board.slide, axis=1), 0.9))
+        scale = typical / (0.06 * float(np.ptp(x)))
+        key = axis.quiver(x, y, *(1e3 * board.slide.T), angles='xy', scale_units='xy',
+                          scale=scale, width=0.003, color=INK)
+        length = round_number(typical)
+        axis.quiverkey(key, 0.8, -0.09, length, f'{length:g} mm along the board', labelpos='E',
+                       fontproperties={'size': 8})
+    axis.set_aspect('equal')
+    axis.grid(visible=False)
+    axis.set(xlabel='x on the board / mm', ylabel='y / mm')
