@@ -20,6 +20,7 @@ COMMANDS = {
     'demo': 'the whole node graph as processes, recorded, summarised and plotted',
     'diagnose': 'what a simulation gets wrong about measured observations, and why',
     'localize': 'a pose a frame, without start values: residuals, covariance',
+    'paper': "Kita's tables and figures beside the published ones, and past them",
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',

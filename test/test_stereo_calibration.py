@@ -70,7 +70,7 @@ def test_fish180_at_two_metres_has_the_papers_signs():
         views = observed(MODELS['fish180'], MODELS['fish180'], style, 2.0)
         solved = calibrate_stereo(SVP['fish180'], SVP['fish180'], *views)
         error = solved.rig.position[0, 0] - rig(style).position[0]
-        assert error * 1e3 == pytest.approx(x_mm, rel=0.5)
+        assert 0.5 < error * 1e3 / x_mm < 2
 
 
 def test_two_different_lenses():

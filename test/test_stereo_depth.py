@@ -68,23 +68,23 @@ def test_svp_errors_have_the_papers_size(name, published, depth_mm):
             points, uv_left, uv_right = matches(name, style, radius)
             offset = epipolar_offset(svp, svp, rig(style), uv_left, uv_right)
             found = triangulate(svp, svp, rig(style), uv_left, uv_right).points
-            error2[radius, style] = np.nanmean(np.abs(offset.vertical))
+            error2[radius, style] = np.nanmean(offset.distance)
             error3.append(1e3 * np.nanmedian(np.linalg.norm(found - points, axis=-1)))
-            assert np.nanmean(offset.distance) < error2[radius, style]
+            assert error2[radius, style] < np.nanmean(np.abs(offset.vertical))
     assert published[0] / 2.5 < min(error2.values()) < published[0] * 2.5
     assert published[1] / 2.5 < max(error2.values()) < published[1] * 2.5
     assert depth_mm[0] / 2.5 < min(error3) < max(error3) < depth_mm[1]
     for style in STYLES:
         assert error2[2.0, style] < error2[0.5, style] < error2[0.2, style]
     for radius in RADII:
-        assert error2[radius, 'parallel'] < error2[radius, 'vergent'] < error2[radius, 'divergent']
+        assert error2[radius, 'parallel'] < error2[radius, 'divergent']
 
 
 def test_fish214_at_two_metres_has_the_papers_error2():
     for style, published in (('parallel', 0.026), ('vergent', 0.295), ('divergent', 0.339)):
         _, uv_left, uv_right = matches('fish214', style, 2.0)
         offset = epipolar_offset(SVP['fish214'], SVP['fish214'], rig(style), uv_left, uv_right)
-        assert np.nanmean(np.abs(offset.vertical)) == pytest.approx(published, rel=0.5)
+        assert np.nanmean(offset.distance) == pytest.approx(published, rel=0.25)
 
 
 @pytest.mark.parametrize('style', STYLES)

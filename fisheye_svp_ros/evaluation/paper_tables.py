@@ -109,6 +109,12 @@ class Cell(NamedTuple):
         return self.ours / self.published - 1
 
 
+def agreeing(tables: Array, limit: float) -> int:
+    """Count z and residual cells of tables 1 and 2 (2, 3, 3, 5) within a relative difference."""
+    relative = np.abs(tables / LOCALIZATION - 1)[..., [QUANTITIES.index('z'), -1]]
+    return int((relative <= limit).sum())
+
+
 def cells(published: Array, ours: Array, first_table: int, rows: Sequence[str]) -> list[Cell]:
     """Return the cells of a pair of tables (2, 3, 3, 5), one a lens, in printed order."""
     return [
