@@ -83,7 +83,7 @@ def select(
         if not good:
             refused.add(chosen.effect.key)
             continue
-        state = fit(data, with_effect(state, chosen.effect, chosen.score.estimate), free)
+        state = extended(data, state, chosen, free)
         evidence.setdefault(chosen.effect.name, chosen)
     return Selection(state, trace, first.untestable, correlation, evidence)
 
@@ -125,6 +125,15 @@ def with_effect(state: State, effect: Effect, values: Array | None = None) -> St
     return replace(state, terms=(*state.terms, (effect, start)))
 
 
+def extended(data: Data, state: State, chosen: Candidate, free: Sequence[str]) -> State:
+    """Return the fit with one more effect, from the linear estimate or, out of reach, from none."""
+    for values in (chosen.score.estimate, np.zeros_like(chosen.score.estimate)):
+        found = fit(data, with_effect(state, chosen.effect, values), free)
+        if np.isfinite(Linearised(data, found, free).residual).all():
+            break
+    return found
+
+
 def without_effect(state: State, name: str) -> State:
     """Return the state without one effect."""
     return replace(state, terms=tuple(term for term in state.terms if term[0].name != name))
@@ -151,7 +160,7 @@ def settle(data: Data, selection: Selection, free: Sequence[str]) -> Selection:
         elif eligible[0].effect.name != name and not _in_model(state, eligible[0].effect.name):
             better = eligible[0]
             if better.merit > own[0].merit + 6:
-                state = fit(data, with_effect(rest, better.effect, better.score.estimate), free)
+                state = extended(data, rest, better, free)
                 trace.append(_gone(name, f'{better.effect.name} explains more'))
                 selection.evidence.pop(name, None)
                 selection.evidence[better.effect.name] = better
