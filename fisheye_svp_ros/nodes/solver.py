@@ -46,8 +46,8 @@ class SolverNode(BaseNode):
         self._metrics = {
             name: self.announce(Float64, f'~/metrics/{name}', wait=True) for name in self.METRICS
         }
-        points = [f'{camera}image_points' for camera in self.CAMERAS]
-        poses = [f'{camera}true_pose' for camera in self.CAMERAS]
+        points = [f'{camera}image_points' for camera in self.cameras]
+        poses = [f'{camera}true_pose' for camera in self.cameras]
         self._join = StampJoin(points, [*poses, 'landmarks', 'scenario'])
         self._standing: LandmarkSet | None = None
         self._in_series = False
@@ -61,6 +61,11 @@ class SolverNode(BaseNode):
         for topic in points:
             self._collect(PointCloud2, topic, messages.read_image_points)
         self.create_timer(0.1, self._work)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The namespaces of the cameras, each with its slash."""
+        return self.CAMERAS
 
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
@@ -134,7 +139,7 @@ class SolverNode(BaseNode):
             self._give_up(items)
 
     def _attempt(self, stamp: int, items: Items) -> None:
-        topic = f'{self.CAMERAS[0]}image_points'
+        topic = f'{self.cameras[0]}image_points'
         landmarks: LandmarkSet | None = items.get('landmarks', self._standing)
         if 'landmarks' in items:
             # Landmarks come set by set: from now on those of another set never stand in.
@@ -148,7 +153,7 @@ class SolverNode(BaseNode):
             self.publish_result(stamp, {}, str(error), warn=True)
 
     def _give_up(self, items: Items) -> None:
-        for topic in (f'{camera}image_points' for camera in self.CAMERAS):
+        for topic in (f'{camera}image_points' for camera in self.cameras):
             if topic in items:
                 self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
 
