@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,7 @@ pytest.importorskip('pyarrow')
 
 from fisheye_svp_ros.bags import Bag
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands import record
 from fisheye_svp_ros.evaluation.recording import NAMESPACE, STAMP, is_tabulated, tabulate
 from fisheye_svp_ros.reporting.columns import read_columns
 
@@ -77,3 +79,10 @@ def test_a_bad_sweep_starts_nothing(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert main(['record', '--sweep', str(path), '-o', str(tmp_path / 'bag')]) == 2
     assert 'no such parameter to sweep' in capsys.readouterr().err
     assert sorted(p.name for p in tmp_path.iterdir()) == ['file.yaml']
+
+
+def test_a_recorder_takes_ros_arguments() -> None:
+    parser = argparse.ArgumentParser()
+    record.add_arguments(parser)
+    assert parser.parse_args(['-o', 'bag', '--ros-args', '-r', 'a:=b']).ros_args == ['-r', 'a:=b']
+    assert parser.parse_args(['-o', 'bag']).ros_args == []

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--sweep', metavar='FILE',
                         help='run the node graph through a sweep file, in lock-step, and end with '
                         'it: a file, or the name of one in config/sweeps')
-    parser.add_argument('arguments', nargs=argparse.REMAINDER, metavar='--ros-args ...',
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='as for `ros2 run`')
 
 
@@ -64,7 +64,7 @@ def _record(args: argparse.Namespace) -> None:
 
     from fisheye_svp_ros.nodes.recorder import Recorder
 
-    rclpy.init(args=args.arguments)
+    rclpy.init(args=['--ros-args', *args.ros_args])
     try:
         with BagWriter(args.output) as bag:
             recorder = Recorder(bag, args.topics)
