@@ -255,7 +255,7 @@ class _Fit:
     def pack(self, state: State) -> Arrays:
         lens = [state.lens.parameters[name] for name in self._free]
         values = [v for effect, v in state.terms if is_shared(effect)]
-        survey = [v for effect, v in state.terms if not is_shared(effect)]
+        survey = [v for effect, v in self._own_terms(state)]
         parts = (*state.pose, *state.rig, np.concatenate([np.array(lens), *values]))
         return tuple(array[None] for array in (*parts, np.concatenate([np.zeros(0), *survey])))
 
@@ -263,13 +263,20 @@ class _Fit:
         rotation, position, rig_rotation, rig_position, shared, own = (a[0] for a in packed)
         count = len(self._free)
         lens = self._template.lens.with_parameters(self._free, list(shared[:count]))
-        terms, rest = [], {True: shared[count:], False: own}
-        for effect, values in self._template.terms:
-            mine = is_shared(effect)
-            terms.append((effect, rest[mine][: len(values)]))
-            rest[mine] = rest[mine][len(values) :]
+        solved: dict[str, Array] = {}
+        both = [term for term in self._template.terms if is_shared(term[0])]
+        for parts, values in ((both, shared[count:]), (self._own_terms(self._template), own)):
+            for effect, known in parts:
+                solved[effect.name] = values[: len(known)]
+                values = values[len(known) :]
+        terms = [(effect, solved[effect.name]) for effect, _ in self._template.terms]
         rig = Pose(rig_rotation, rig_position)
         return State(Pose(rotation, position), rig, lens, tuple(terms))
+
+    def _own_terms(self, state: State) -> list[Term]:
+        """Return the terms outside the shared parameters: the survey first, then noise."""
+        own = [term for term in state.terms if not is_shared(term[0])]
+        return sorted(own, key=lambda term: isinstance(term[0], NoiseEffect))
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):
@@ -318,10 +325,13 @@ class _SurveyFit(_Fit):
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         block, change = step
         frames = 6 * self._data.frames
-        own = np.zeros((1, len(state[5][0]) // 3, 3))
-        own[:, self._slots[self._slots >= 0]] = block[:, self._slots >= 0]
+        own = np.zeros_like(state[5])
+        free = self._slots >= 0
+        # The survey's values stand first; what follows belongs to noise effects and stays.
+        places = 3 * self._slots[free][:, None] + np.arange(3)
+        own[:, places] = block[:, free]
         frame = change[:, :frames].reshape(1, -1, 6)
-        return self._moved(state, frame, change[:, frames:], own.reshape(1, -1))
+        return self._moved(state, frame, change[:, frames:], own)
 
 
 def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arrays]:

@@ -126,7 +126,7 @@ def with_effect(state: State, effect: Effect, values: Array | None = None) -> St
 
 
 def extended(data: Data, state: State, chosen: Candidate, free: Sequence[str]) -> State:
-    """Return the fit with one more effect, from the linear estimate or, out of reach, from none."""
+    """Return the fit with one more effect, from its linear estimate or, out of reach, from 0."""
     for values in (chosen.score.estimate, np.zeros_like(chosen.score.estimate)):
         found = fit(data, with_effect(state, chosen.effect, values), free)
         if np.isfinite(Linearised(data, found, free).residual).all():
