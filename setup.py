@@ -45,7 +45,7 @@ setup(
         'pyarrow>=14',
     ],
     extras_require={
-        'standalone': ['cyclonedds>=0.10.5'],
+        'standalone': ['cyclonedds>=11.0.1'],
         'dask': ['distributed>=2023.7'],
         'test': ['pytest>=7.4', 'mpmath>=1.3', 'hypothesis>=6.80'],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],

@@ -12,7 +12,7 @@ from fisheye_svp_ros.arrays import Array, Index
 class Board(NamedTuple):
     """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
 
-    size: half the extent along its longer side; flat: four or more landmarks, all in the plane a, b.
+    size: half the extent along its longer side; flat: four or more landmarks, all in one plane.
     """
 
     id: int

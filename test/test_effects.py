@@ -90,7 +90,7 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
 def test_unknown_and_incomplete_effects_are_refused():
     with pytest.raises(LensError, match="effect 'bent' is unknown"):
         load_effects({'bent': {}}, 'lens.yaml')
-    with pytest.raises(LensError, match='lens.yaml: effect skew is incomplete'):
+    with pytest.raises(LensError, match=r'lens\.yaml: effect skew is incomplete'):
         load_effects({'skew': {'parameters': {}}}, 'lens.yaml')
     with pytest.raises(LensError, match='skew has bend, which does not belong'):
         load_effects({'skew': {'parameters': {'shear': 0.1, 'bend': 1.0}}}, 'lens.yaml')
