@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,13 +40,19 @@ class _Height:
 
     base: ImageHeight
     change: Callable[[Array], Array]
+    limit: float = np.pi
+    coefficients: tuple[float, ...] = ()
+    coefficient_names: ClassVar[tuple[str, ...]] = ()
 
     def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
         height, slope = self.base.value_and_slope(theta)
         return height + self.change(theta), slope
 
     def angle(self, height: Array) -> Array:
-        return invert_height(self, height)  # type: ignore[arg-type]
+        return invert_height(self, height)
+
+    def columns(self, theta: Array) -> Array:
+        return np.empty((*np.shape(theta), 0))
 
 
 def radial_profile(scene: Scene, rng: Rng) -> Hidden:
@@ -57,8 +64,7 @@ def radial_profile(scene: Scene, rng: Rng) -> Hidden:
     other = kinds[int(rng.integers(len(kinds)))]
     bend = rng.uniform(1.0, 2.2)
     # Another projection than the one assumed, or a curve with a bend of its own.
-    bent = not scene.free or scene.lens.name == 'kannala_brandt'
-    bent = bent and bool(rng.integers(2))
+    bent = bool(rng.integers(2))
 
     def change(theta: Array) -> Array:
         if bent:

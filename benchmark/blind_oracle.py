@@ -58,7 +58,8 @@ class LinearScene:
     def angles(world: World) -> Array:
         """Incidence angles (S, N), rad, as far as scatter is concerned."""
         places = world.in_camera(world.points, world.times[:, None])
-        return np.arctan2(np.linalg.norm(places[..., :2], axis=-1), places[..., 2])
+        off_axis = np.linalg.norm(places[..., :2], axis=-1)
+        return np.asarray(np.arctan2(off_axis, places[..., 2]))
 
 
 def oracle_finds(

@@ -232,9 +232,9 @@ def _draw_lens(rng: np.random.Generator, needs: Needs) -> tuple[Lens, bool]:
     if curve.limit < edge + 0.2:
         return _draw_lens(rng, needs)
     size = int(2 * f * curve.value_and_slope(np.array(edge))[0]) + 20
-    centre = size / 2 + rng.uniform(-8, 8, 2)
+    cx, cy = size / 2 + rng.uniform(-8, 8, 2)
     shift = Gennery(0.0, *(rng.normal(size=2) * (0.008, 0.003))) if rng.integers(2) else None
-    return Lens(name, size, size, f, f, *centre, curve, edge, shift), True
+    return Lens(name, size, size, f, f, cx, cy, curve, edge, shift), True
 
 
 def _draw_trajectory(rng: np.random.Generator) -> Trajectory:

@@ -30,7 +30,7 @@ NAMED, ADEQUATE = 0.93, 0.93
 FIXED = tuple(
     Task('one', 0.5, (name,), 2024, 0) for name in (
         'viewpoint_shift', 'radial_profile', 'sensor_tilt', 'focal_drift', 'board_pose',
-        'rolling_shutter', 'detector_bias', 'wrong_ids',
+        'rolling_shutter', 'wrong_ids',
     )
 )
 
@@ -143,9 +143,9 @@ def test_fresh_trials(one_thread):
     seed = random.SystemRandom().randrange(2**32)
     print(f'seed {seed}')
     picked = random.Random(seed)
-    names = picked.sample(list(HIDDEN), 14)
+    names = picked.sample(list(HIDDEN), 12)
     one = [Task('one', 0.5, (name,), seed, number) for number, name in enumerate(names)]
-    clean = [Task('clean', 0.0, (), seed, number) for number in range(10)]
+    clean = [Task('clean', 0.0, (), seed, number) for number in range(8)]
     outcomes = run([*one, *clean], workers=2)
     named = sum(outcome.hit for outcome in outcomes[: len(one)])
     adequate = sum(outcome.verdict == 'adequate' for outcome in outcomes[len(one) :])
