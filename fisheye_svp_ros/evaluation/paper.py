@@ -66,6 +66,36 @@ class Measured(NamedTuple):
         return {name: float(value[0]) for name, value in found.items()}
 
 
+class Evaluation(NamedTuple):
+    """All of the paper's numbers for one lens and one solver.
+
+    localization, calibration (3 radii, 3 spreads or styles, 5): tables 1 and 3, or 2 and 4;
+    localized: one a spread; measured: one a panel of figure 9 or 10, in the order of PANELS.
+    """
+
+    lens: Lens
+    localization: Array
+    calibration: Array
+    localized: tuple[Localized, ...]
+    measured: tuple[Measured, ...]
+
+    def panels(self, metric: str) -> Array:
+        """Return a stereo depth metric of the nine panels, (9,)."""
+        return np.array([measured.metrics[metric] for measured in self.measured])
+
+
+def evaluate(lens: Lens, solver: Lens | None = None) -> Evaluation:
+    """Evaluate a lens with a solver that believes another one, by default the SVP lens."""
+    localized = localize_spreads(lens, solver)
+    return Evaluation(
+        lens,
+        np.stack([spread.rows for spread in localized], axis=1),
+        calibrate_rigs(lens, solver)[0],
+        localized,
+        tuple(measure(lens, radius, style, solver) for radius, style in PANELS),
+    )
+
+
 def localize_environments(
     lens: Lens, points: Array, solver: Lens | None = None, start: Pose | None = None
 ) -> Localized:
@@ -82,15 +112,14 @@ def localize_environments(
     return Localized(_rows(metrics), solved, views)
 
 
-def localization_table(lens: Lens, solver: Lens | None = None) -> Array:
-    """Return table 1 or 2: rows (3 radii, 3 spreads, 5)."""
-    by_spread = [
+def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[Localized, ...]:
+    """Localize at the three radii, one result a spread: Whole, Inner, Outer."""
+    return tuple(
         localize_environments(
             lens, np.stack([environment(spread, radius).points for radius in RADII]), solver
-        ).rows
+        )
         for spread in SPREADS
-    ]
-    return np.stack(by_spread, axis=1)
+    )
 
 
 def calibrate_rigs(
