@@ -21,6 +21,7 @@ COMMANDS = {
     'diagnose': 'what a simulation gets wrong about measured observations, and why',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'paper': "Kita's tables and figures beside the published ones, and past them",
+    'plot': 'pictures of a recording, a table or a sweep',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',

@@ -128,7 +128,8 @@ def _cells(row: Shown) -> tuple[str, ...]:
 
 def _draw(folder: Path, bag: Path, rows: Sequence[Shown]) -> None:
     from fisheye_svp_ros.bags import Bag
-    from fisheye_svp_ros.evaluation.demonstration import has_residuals, residual_fields
+    from fisheye_svp_ros.evaluation.demonstration import residual_fields
+    from fisheye_svp_ros.evaluation.residuals import has_residuals
     from fisheye_svp_ros.lens import load_lens
     from fisheye_svp_ros.reporting.plots import draw_comparison, draw_residual_fields
     from fisheye_svp_ros.share import lens_path

@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.clouds import RESIDUALS, Points, unpack
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.evaluation.paper import RIGHT_CAMERA_Z
 from fisheye_svp_ros.evaluation.paper_tables import (
@@ -21,6 +19,7 @@ from fisheye_svp_ros.evaluation.paper_tables import (
     STYLE_NAMES,
 )
 from fisheye_svp_ros.evaluation.recording import NAMESPACE, Columns
+from fisheye_svp_ros.evaluation.residuals import ResidualField, residual_field, residual_sets
 from fisheye_svp_ros.landmarks import RADII, SPREADS
 
 # Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
@@ -28,7 +27,6 @@ DEPTH_POSES = [
     [0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES
 ]
 _MM, _DEGREE = 1e-3, np.radians(1.0)
-_RESIDUALS_TOPIC = '/localization/localizer/residuals'
 
 
 class Task(NamedTuple):
@@ -49,15 +47,6 @@ TASKS = (
          'mean_residual_px'),
     Task('depth', 'style', STYLE_NAMES, 'stereo_depth', 'error3_m', 'error2_px'),
 )
-
-
-class ResidualField(NamedTuple):
-    """Residuals of one localization: uv and residual (N, 2), px."""
-
-    lens: str
-    radius: float
-    uv: Array
-    residual: Array
 
 
 class Shown(NamedTuple):
@@ -106,29 +95,11 @@ def shown(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> li
 
 def residual_fields(records: Iterable[Any], spread: str = 'whole') -> list[ResidualField]:
     """Return the residuals of every localization with landmarks of a spread (figure 6)."""
-    tags: dict[int, dict[str, str]] = {}
-    clouds: dict[int, Points] = {}
-    for record in records:
-        stamp = record.message.header.stamp
-        when = int(stamp.sec) * 10**9 + int(stamp.nanosec)
-        if record.topic == _RESIDUALS_TOPIC:
-            clouds[when] = unpack(record.message, RESIDUALS, record.topic)
-        else:
-            tags[when] = {pair.key: pair.value for pair in record.message.status[0].values}
     return [
-        ResidualField(
-            tags[when]['lens'], float(tags[when]['radius']),
-            np.stack([cloud['u'], cloud['v']], axis=-1),
-            np.stack([cloud['du'], cloud['dv']], axis=-1),
-        )
-        for when, cloud in sorted(clouds.items())
-        if when in tags and tags[when]['environment'] == spread
+        residual_field(one) for one in residual_sets(records)
+        if one.tags.get('environment') == spread
     ]
 
-
-def has_residuals(topic: str, typename: str) -> bool:
-    """Say whether `residual_fields` wants a topic."""
-    return topic in (_RESIDUALS_TOPIC, '/localization/scenario')
 
 
 def _is_shown(task: Task, row: dict[str, Any]) -> bool:

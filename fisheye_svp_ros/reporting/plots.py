@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator
 
-from fisheye_svp_ros.evaluation.demonstration import ResidualField, Shown
+from fisheye_svp_ros.evaluation.demonstration import Shown
+from fisheye_svp_ros.evaluation.residuals import ResidualField
 from fisheye_svp_ros.files import replacing
 from fisheye_svp_ros.lens import Lens
 

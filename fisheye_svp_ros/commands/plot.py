@@ -1,0 +1,102 @@
+"""`fisheye-svp plot`: a recording, a table or a sweep to pictures."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.evaluation.residuals import ResidualSet
+
+_FIELDS = 4  # residual fields a lens
+_TABLES = ('.csv', '.parquet')
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('source', type=Path, metavar='SOURCE',
+                        help='a rosbag2 recording, a table (.csv or .parquet), or the folder of a '
+                        'sweep')
+    parser.add_argument('-o', '--output', type=Path, default=Path('plots'), metavar='DIR',
+                        help='folder for the pictures (PNG); default: plots')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Draw what the source is good for."""
+    from fisheye_svp_ros.errors import OutputError
+    from fisheye_svp_ros.reporting.progress import progress
+
+    with progress('drawing'):
+        files = _of_table(args) if _table_in(args.source) else _of_bag(args)
+    if not files:
+        raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '
+                          'differ are needed, or residuals')
+    for path in files:
+        print(path)
+
+
+def _table_in(source: Path) -> Path | None:
+    if source.suffix in _TABLES:
+        return source
+    table = source / 'sweep.parquet'
+    return table if table.exists() else None
+
+
+def _of_table(args: argparse.Namespace) -> list[Path]:
+    from fisheye_svp_ros.reporting.columns import read_columns
+    from fisheye_svp_ros.reporting.sweep_plots import draw_table
+
+    path = _table_in(args.source)
+    assert path is not None
+    return draw_table(read_columns(path), args.output)
+
+
+def _of_bag(args: argparse.Namespace) -> list[Path]:
+    from fisheye_svp_ros.bags import Bag
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
+    from fisheye_svp_ros.evaluation.residuals import has_residuals, residual_sets
+    from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
+
+    bag = Bag(args.source)
+    files = draw_table(_main_namespace(tabulate(bag.records(is_tabulated))), args.output)
+    found = residual_sets(bag.records(has_residuals))
+    if bag.damage:
+        say(f'{args.source}: {bag.damage}')
+    if found:
+        files.append(args.output / 'residuals.png')
+        draw_residuals([one.points for one in found], files[-1])
+        files += _fields(found, args.output / 'residual_fields.png')
+    return files
+
+
+def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
+    """Draw the residuals over the image, once a lens and range, where a scenario names these."""
+    from fisheye_svp_ros.evaluation.residuals import residual_field
+    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.reporting.plots import draw_residual_fields
+    from fisheye_svp_ros.share import lens_path
+
+    named: dict[Any, ResidualSet] = {}
+    for one in found:
+        key = one.tags.get('lens'), one.tags.get('radius')
+        same_lens = sum(lens == key[0] for lens, _ in named)
+        if None not in key and len(one.points) and same_lens < _FIELDS:
+            named.setdefault(key, one)
+    if not named:
+        return []
+    fields = [residual_field(one) for one in named.values()]
+    lenses = {field.lens: load_lens(lens_path(field.lens)) for field in fields}
+    draw_residual_fields(fields, lenses, path)
+    return [path]
+
+
+def _main_namespace(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
+    """Return the rows of the namespace with most of them: others have other metrics."""
+    from fisheye_svp_ros.evaluation.recording import NAMESPACE
+
+    names = columns[NAMESPACE]
+    most = max(set(names), key=names.count, default=None)
+    kept = [i for i, name in enumerate(names) if name == most]
+    return {name: [cells[i] for i in kept] for name, cells in columns.items()}
