@@ -26,6 +26,7 @@ COMMANDS = {
     'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
     'table': 'a recording to a table, one row an input stamp',
+    'watch': 'the results of running nodes, live, in the terminal',
 }
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it

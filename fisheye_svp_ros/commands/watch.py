@@ -1,0 +1,54 @@
+"""`fisheye-svp watch`: the results of running nodes, live."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fisheye_svp_ros.nodes.watcher import Watcher
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
+                        help='as for `ros2 run`')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Follow every result topic until interrupted."""
+    from fisheye_svp_ros.commands.run import supply_rclpy
+
+    supply_rclpy()
+    import rclpy
+    from rich.live import Live
+
+    from fisheye_svp_ros.nodes.watcher import Watcher
+    from fisheye_svp_ros.reporting.tables import console
+
+    rclpy.init(args=['--ros-args', *args.ros_args])
+    try:
+        watcher = Watcher()
+        with Live(console=console(), refresh_per_second=4) as live:
+            watcher.spin(lambda: live.update(_table(watcher)))
+        watcher.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+
+
+def _table(watcher: Watcher) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD)
+    for name in ('node', 'metric', 'latest', 'mean', 'largest'):
+        table.add_column(name, justify='left' if name in ('node', 'metric') else 'right')
+    for node, results in sorted(watcher.results.items()):
+        lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
+        table.add_row(node, f'{results.sets} sets{lost}')
+        for name, metric in results.metrics.items():
+            values = metric.latest, metric.total / metric.count, metric.largest
+            table.add_row('', name, *(f'{value:.6g}' for value in values))
+    return table

@@ -1,0 +1,88 @@
+"""Follows the results of all solver nodes; behind `fisheye-svp watch`."""
+
+from __future__ import annotations
+
+import math
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+
+from fisheye_svp_ros import messages
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.nodes.base import RELIABLE
+
+_TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
+_LOOK_EVERY = 0.5  # s, for nodes that are new
+
+
+@dataclass
+class Followed:
+    """What one metric of a node has been: its latest value, mean and largest magnitude."""
+
+    latest: float = math.nan
+    total: float = 0.0
+    largest: float = 0.0
+    count: int = 0
+
+    def add(self, value: float) -> None:
+        """Take a value in."""
+        self.latest, self.count = value, self.count + 1
+        self.total, self.largest = self.total + value, max(self.largest, abs(value))
+
+
+@dataclass
+class Results:
+    """What a node has told: sets it was given, sets it could not solve, its metrics."""
+
+    sets: int = 0
+    lost: int = 0
+    note: str = ''
+    metrics: dict[str, Followed] = field(default_factory=dict)
+
+
+class Watcher(Node):  # type: ignore[misc]
+    """Subscribes to every `~/result` that appears."""
+
+    def __init__(self) -> None:
+        super().__init__('watcher')
+        self.results: dict[str, Results] = {}
+        self.create_timer(_LOOK_EVERY, self._look)
+
+    def spin(self, show: Callable[[], None]) -> None:
+        """Follow until SIGINT or SIGTERM; `show` is called after whatever came."""
+        executor, ended = SingleThreadedExecutor(), []
+        executor.add_node(self)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: ended.append(True))
+        while not ended:
+            executor.spin_once(timeout_sec=_LOOK_EVERY)
+            show()
+
+    def _look(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            node = topic.removesuffix('/result')
+            if node != topic and node not in self.results and types == [_TYPE]:
+                self.results[node] = Results()
+                self.create_subscription(DiagnosticArray, topic, self._hear(node), RELIABLE)
+
+    def _hear(self, node: str) -> Callable[[DiagnosticArray], None]:
+        results = self.results[node]
+
+        def hear(message: DiagnosticArray) -> None:
+            try:
+                values = messages.read_key_values(message, f'{node}/result')
+                numbers = {name: float(value) for name, value in values.items()}
+            except (ObservationError, ValueError):
+                return
+            results.sets += 1
+            if not numbers:
+                results.lost, results.note = results.lost + 1, message.status[0].message
+            for name, value in numbers.items():
+                if math.isfinite(value):
+                    results.metrics.setdefault(name, Followed()).add(value)
+
+        return hear
