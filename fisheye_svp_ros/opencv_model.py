@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.curves import KannalaBrandt
+from fisheye_svp_ros.curves import Equidistant, KannalaBrandt
 from fisheye_svp_ros.lens import Lens
 
 _SAMPLES = 512
@@ -21,6 +21,8 @@ def kannala_brandt_equivalent(lens: Lens) -> Lens:
     curve = lens.image_height
     if isinstance(curve, KannalaBrandt):
         return lens.svp()
+    if isinstance(curve, Equidistant):
+        return replace(lens.svp(), image_height=KannalaBrandt())
     theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)
     scaled = theta / lens.max_incidence
     powers = np.arange(1, 10, 2)

@@ -13,8 +13,8 @@ class Settings:
     """Parameters that every node has."""
 
     wait_for_subscribers: int = parameter(
-        0, 'Hold back what this node has to tell until so many subscriptions are there, '
-        'so that a recorder misses nothing', span=(0, 1000)
+        0, 'Hold back what this node has to tell until so many listen to its image points (a '
+        'camera) or results (a solver), so that nobody misses the first', span=(0, 1000)
     )
 
 

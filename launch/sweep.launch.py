@@ -24,7 +24,7 @@ def nodes(context):
              arguments=['record', '-o', LaunchConfiguration('bag').perform(context)]),
         *(
             Node(package=PACKAGE, executable=name, output='screen', parameters=[
-                str(path), {'wait_for_subscribers': 1, 'patience': PATIENCE}])
+                str(path), {'wait_for_subscribers': 2, 'patience': PATIENCE}])
             for name in solvers
         ),
         Node(package=PACKAGE, executable='synthetic_camera', output='screen', parameters=[

@@ -53,7 +53,7 @@ def wrong_type(row: Row) -> Any:
 
 def outside(row: Row) -> list[Any]:
     if row.choices:
-        return ['nonsense', '']
+        return [word for word in ('nonsense', '') if word not in row.choices]
     if row.low is None or row.high is None:
         return []
     kind = type(row.default)

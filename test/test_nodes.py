@@ -17,8 +17,10 @@ from std_msgs.msg import Float64  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros import messages
+from fisheye_svp_ros.camera import incidence
 from fisheye_svp_ros.clouds import LANDMARKS, RESIDUALS, unpack
 from fisheye_svp_ros.landmarks import Landmarks, environment
+from fisheye_svp_ros.lens import load_lens
 from fisheye_svp_ros.nodes.base import Finished
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
@@ -27,6 +29,7 @@ from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.rig import paper_pose
 from fisheye_svp_ros.scenario import Scenario, simulate_scenario
+from fisheye_svp_ros.share import lens_path
 
 
 @pytest.fixture
@@ -182,7 +185,9 @@ def test_the_localizer_with_the_true_lens_makes_no_error(
     assert metrics['rms_px'] < 1e-7 and metrics['axis_error_rad'] < 1e-8
     points = unpack(residuals[0], RESIDUALS, 'residuals')
     assert points['range'] == pytest.approx(np.full(33, 0.5))
-    assert points['theta'].max() == pytest.approx(np.radians(85.3), abs=0.02)
+    seen = paper_pose().into_body(environment('whole', 0.5).points)
+    theta = incidence(load_lens(lens_path(lens)), seen).theta
+    assert points['theta'] == pytest.approx(theta, abs=1e-8)
 
 
 def test_the_localizer_publishes_everything_of_a_set_under_its_stamp(

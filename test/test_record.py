@@ -282,7 +282,7 @@ def test_measured_camera_and_localizer_agree_with_the_command(
                  '-o', str(tmp_path)]) == 0
     recorder = command('record', '-o', str(tmp_path / 'bag'))
     localizer = command('run', 'localizer', '--ros-args', '-p', f'lens:={lens}',
-                        '-p', 'wait_for_subscribers:=1')
+                        '-p', 'wait_for_subscribers:=2')
     camera = command(
         'run', 'measured_camera', '--ros-args', '-p', f'observations:={DATA / "test.csv"}',
         '-p', 'wait_for_subscribers:=2', '-p', 'repeat:=false',

@@ -23,11 +23,12 @@ def start_in_step(
 ) -> None:
     """Start solver nodes and a synthetic camera, `camera` by name, that ends after its sweep.
 
-    common: ROS arguments of all nodes; scenarios: of the camera.  All wait for a recorder.
+    common: ROS arguments of all nodes; scenarios: of the camera.  All wait for a recorder, and
+    solvers for the camera, which listens to what they answer.
     """
     for node in solvers:
         processes.start(node, ['run', node, '--ros-args', *common,
-                               *values(wait_for_subscribers=1, patience=_PATIENCE)])
+                               *values(wait_for_subscribers=2, patience=_PATIENCE)])
     processes.start(camera, [
         'run', 'synthetic_camera', '--ros-args', *common, *scenarios, *values(
             wait_for_subscribers=len(solvers) + 1, repeat='false',

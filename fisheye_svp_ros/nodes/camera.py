@@ -22,7 +22,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.settings import CameraSettings
 
 WORLD = 'world'
-_LONG = 5.0  # s without an answer that are worth a word
+_LONG = 15.0  # s without an answer after which a set is published again
 
 
 class CameraTopics:
@@ -62,12 +62,17 @@ class CameraNode(BaseNode):
         self._steps: Iterator[Any] = iter(())
         self._answering: set[str] = set()
         self._unanswered: set[str] = set()
+        self._step: Any = None
         self._stamp = 0
         self._sent = 0.0
 
     @abstractmethod
-    def publish_set(self, step: Any) -> int:
-        """Publish one set and return its stamp, ns."""
+    def publish_set(self, step: Any, stamp: int) -> None:
+        """Publish one set."""
+
+    def stamp_of(self, step: Any) -> int:
+        """Return the stamp of a set, ns: the present time, never the same twice."""
+        return int(max(self.get_clock().now().nanoseconds, self._stamp + 1))
 
     def play(self, steps: Iterator[Any]) -> None:
         """Start stepping through other sets."""
@@ -94,10 +99,6 @@ class CameraNode(BaseNode):
         """Publish landmarks; stamp 0: they hold for every set."""
         self._landmarks.publish(messages.landmarks_message(landmarks, stamp, WORLD))
 
-    def new_stamp(self) -> int:
-        """Return the time, ns, never the same twice."""
-        return int(max(self.get_clock().now().nanoseconds, self._stamp + 1))
-
     def _hear_answers_on(self, topic: str) -> None:
         def use(stamp: int, _: Any) -> None:
             if stamp == self._stamp and topic in self._unanswered:
@@ -109,21 +110,27 @@ class CameraNode(BaseNode):
         self.listen(DiagnosticArray, topic, messages.read_key_values, use)
 
     def _tick(self) -> None:
-        if self._unanswered:
-            if time.monotonic() - self._sent > _LONG:
-                waiting = ' '.join(sorted(self._unanswered))
-                self.get_logger().warning(f'no answer on {waiting}', throttle_duration_sec=_LONG)
-        elif self.has_listeners():
-            self._advance()
+        if not self._unanswered:
+            if self.has_listeners():
+                self._advance()
+        elif time.monotonic() - self._sent > _LONG:
+            # Who answers may not have known of this node yet when it did.
+            waiting = ' '.join(sorted(self._unanswered))
+            self.get_logger().warning(f'no answer on {waiting}; publishing the set once more')
+            self._send()
 
     def _advance(self) -> None:
-        step = next(self._steps, None)
-        if step is None:
+        self._step = next(self._steps, None)
+        if self._step is None:
             self._timer.cancel()
             raise Finished('all sets are published')
+        self._stamp = self.stamp_of(self._step)
+        self._send()
+
+    def _send(self) -> None:
         self._unanswered = set(self.settings.lock_step.split())
         self._sent = time.monotonic()
-        self._stamp = self.publish_set(step)
+        self.publish_set(self._step, self._stamp)
 
 
 def rows_by_frame(observations: Observations) -> dict[tuple[int, str], Index]:

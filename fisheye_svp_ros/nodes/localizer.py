@@ -31,10 +31,10 @@ class Localizer(SolverNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self._pose = self.announce(PoseWithCovarianceStamped, '~/pose', wait=True)
-        self._position_error = self.announce(Vector3Stamped, '~/position_error', wait=True)
-        self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error', wait=True)
-        self._residuals = self.announce(PointCloud2, '~/residuals', wait=True)
+        self._pose = self.announce(PoseWithCovarianceStamped, '~/pose')
+        self._position_error = self.announce(Vector3Stamped, '~/position_error')
+        self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
+        self._residuals = self.announce(PointCloud2, '~/residuals')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self.start()
 

@@ -89,10 +89,14 @@ class MeasuredCamera(CameraNode):
         frames = recording.observations.frames.tolist()
         self.play(itertools.cycle(frames) if self.settings.repeat else iter(frames))
 
-    def publish_set(self, step: int) -> int:
+    def stamp_of(self, step: int) -> int:
+        """Return the time of a frame where the data has one."""
+        stamps = self._recording.stamps
+        return stamps[step] if stamps else super().stamp_of(step)
+
+    def publish_set(self, step: int, stamp: int) -> None:
         """Publish a frame."""
         recording, settings = self._recording, self.settings
-        stamp = recording.stamps[step] if recording.stamps else self.new_stamp()
         place = {'frame': step, 'source': settings.observations}
         self.tag(stamp, {**place, **({'lens': settings.lens} if settings.lens else {})})
         for name in recording.observations.cameras:
@@ -100,7 +104,6 @@ class MeasuredCamera(CameraNode):
             if rows is not None:
                 seen = recording.observations.take(rows)
                 self.camera(name).publish(stamp, seen, recording.poses.get(step), recording.lens)
-        return stamp
 
 
 def frame_stamps(table: Observations) -> dict[int, int]:

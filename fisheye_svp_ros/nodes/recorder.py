@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import signal
+import time
 from importlib import import_module
 
 from rclpy.executors import SingleThreadedExecutor
@@ -12,6 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from fisheye_svp_ros.bags import BagWriter
 
+_COUNTED = ('/image_points', '/result')
 _LATCHED = ('landmarks', 'camera_info', 'rig')
 _LOOK_EVERY = 0.2  # s, for topics that are new
 _QUIET = 0.5  # s without a message after which nothing is on its way any more
@@ -35,16 +37,17 @@ class Recorder(Node):  # type: ignore[misc]
             signal.signal(number, lambda *_: ended.append(True))
         while not ended:
             executor.spin_once(timeout_sec=_LOOK_EVERY)
-        before = -1
-        while self._bag.count > before:
-            before = self._bag.count
+        last, count = time.monotonic(), self._bag.count
+        while time.monotonic() - last < _QUIET:
             executor.spin_once(timeout_sec=_QUIET)
+            if self._bag.count > count:
+                last, count = time.monotonic(), self._bag.count
 
     def _look(self) -> None:
-        # A camera that waits for its listeners counts those of image_points: when it sees this
-        # node there, this node must be on all other topics already.
+        # A node that waits for its listeners counts those of image_points or ~/result: when it
+        # sees this node there, this node must be on its other topics already.
         found = self.get_topic_names_and_types()
-        for topic, types in sorted(found, key=lambda entry: 'image_points' in entry[0]):
+        for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED)):
             if topic not in self.topics and self._wanted.fullmatch(topic) and len(types) == 1:
                 self._subscribe(topic, types[0])
 

@@ -42,9 +42,8 @@ class SolverNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self._result = self.announce(DiagnosticArray, '~/result', wait=True)
         self._metrics = {
-            name: self.announce(Float64, f'~/metrics/{name}', wait=True) for name in self.METRICS
+            name: self.announce(Float64, f'~/metrics/{name}') for name in self.METRICS
         }
         points = [f'{camera}image_points' for camera in self.cameras]
         poses = [f'{camera}true_pose' for camera in self.cameras]
@@ -61,6 +60,12 @@ class SolverNode(BaseNode):
         for topic in points:
             self._collect(PointCloud2, topic, messages.read_image_points)
         self.create_timer(0.1, self._work)
+
+    def start(self) -> None:
+        """Take the parameters into use, as every node does; call it after all `announce`."""
+        # Last, because a recorder that sees this topic counts on having seen the others.
+        self._result = self.announce(DiagnosticArray, '~/result', wait=True)
+        super().start()
 
     @property
     def cameras(self) -> tuple[str, ...]:

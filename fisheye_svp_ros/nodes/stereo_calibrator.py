@@ -32,8 +32,8 @@ class StereoCalibrator(SolverNode):
     def __init__(self) -> None:
         super().__init__()
         self._rig = self.announce(TransformStamped, '~/rig', LATCHED)
-        self._position_error = self.announce(Vector3Stamped, '~/position_error', wait=True)
-        self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error', wait=True)
+        self._position_error = self.announce(Vector3Stamped, '~/position_error')
+        self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._window: list[Seen] = []
         self.start()

@@ -39,7 +39,7 @@ class StereoDepth(SolverNode):
 
     def __init__(self) -> None:
         super().__init__()
-        self._points = self.announce(PointCloud2, '~/points', wait=True)
+        self._points = self.announce(PointCloud2, '~/points')
         self._latest: Pose | None = None
         self.listen(TransformStamped, 'rig', messages.read_transform, self._hear, LATCHED_INPUT)
         self.start()

@@ -71,9 +71,8 @@ class SyntheticCamera(CameraNode):
                 self.camera(name)
         self.play(steps(settings, self._sweep))
 
-    def publish_set(self, step: Step) -> int:
-        """Publish a set under the present time."""
-        stamp = self.new_stamp()
+    def publish_set(self, step: Step, stamp: int) -> None:
+        """Publish a set."""
         simulation = step.simulation
         place = {'scenario': step.number, 'scenarios': len(self._sweep),
                  'set': step.frame, 'sets': len(simulation.poses[0].position)}
@@ -84,7 +83,6 @@ class SyntheticCamera(CameraNode):
             self.camera(name).publish(stamp, seen, poses.take(step.frame), step.svp_lens)
         if self._markers.get_subscription_count():
             self._markers.publish(messages.markers_message(_shapes(step), stamp, WORLD))
-        return stamp
 
 
 def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
