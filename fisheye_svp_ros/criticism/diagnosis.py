@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.criticism.correlation import Correlation
 from fisheye_svp_ros.criticism.gain import Gain, HeldOut, gain_between
 from fisheye_svp_ros.criticism.gain import held_out as held_out_misfit
 from fisheye_svp_ros.criticism.model import (
@@ -16,8 +18,10 @@ from fisheye_svp_ros.criticism.model import (
     State,
     fit,
     intrinsic_names,
+    is_shared,
     prepare,
     start,
+    survey_of,
 )
 from fisheye_svp_ros.criticism.noise import (
     Gross,
@@ -39,6 +43,7 @@ from fisheye_svp_ros.criticism.selection import (
 )
 from fisheye_svp_ros.criticism.standard_errors import standard_errors
 from fisheye_svp_ros.criticism.structure import Structure, remaining_structure
+from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.observations import Observations
@@ -140,7 +145,7 @@ def diagnose(
     progress('measuring the gain on held-out data')
     prefixes = _prefixes(data, base, state, selection, free)
     measured = [held_out_misfit(data, prefix, free, test) for prefix in prefixes]
-    causes = _mean_causes(data, state, selection, free, measured, noise) + noise_causes
+    causes = _mean_causes(data, prefixes, selection, free, measured, noise) + noise_causes
     table_causes, left = _table_causes(observations, gross, noise, left)
     extended = _figures(data, state, free, measured[-1])
     return Diagnosis(
@@ -172,7 +177,11 @@ def noise_px(linear: Linearised, nuisance: Nuisance) -> float:
 def extended_lens(lens: Lens, state: State) -> Lens:
     """Return the lens that was fitted, with its effects, for every command and node."""
     effects = {effect.name: effect.to_dict(values) for effect, values in state.terms}
-    return replace(state.lens, effects=effects, calibration=lens.calibration)
+    # A fitted height curve may turn a little earlier than the one the lens came with.
+    limit = min(lens.max_incidence, state.lens.image_height.limit * (1 - 1e-6))
+    return replace(
+        state.lens, effects=effects, calibration=lens.calibration, max_incidence=limit
+    )
 
 
 def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:
@@ -219,15 +228,12 @@ def _prefixes(
 
 
 def _mean_causes(
-    data: Data, state: State, selection: Selection, free: Sequence[str],
+    data: Data, prefixes: Sequence[State], selection: Selection, free: Sequence[str],
     measured: Sequence[HeldOut], noise: float,
 ) -> list[Cause]:
-    linear = Linearised(data, state, free)
-    errors = standard_errors(linear, Nuisance(linear), selection.correlation)
+    state = prefixes[-1]
     causes: list[Cause] = []
-    for (effect, values), stderr in zip(state.terms, errors, strict=True):
-        if effect.stage == 'noise':
-            continue
+    for effect, values, stderr in _estimates(data, prefixes, free, selection.correlation):
         evidence, same = indistinguishable(
             data, state, effect.name, free, selection.correlation
         )
@@ -243,6 +249,29 @@ def _mean_causes(
             same, effect.to_separate,
         ))
     return causes
+
+
+def _estimates(
+    data: Data, prefixes: Sequence[State], free: Sequence[str], correlation: Correlation
+) -> Iterator[tuple[Effect, Array, Array]]:
+    """Yield each effect with its values and standard errors.
+
+    Where all landmarks are free, other effects on the target come from the fit without that.
+    """
+    bounded = [state for state in prefixes if survey_of(state.terms) is None]
+    sources = {id(state): state for state in (prefixes[-1], bounded[-1])}
+    known: dict[tuple[int, str], tuple[Array, Array]] = {}
+    for key, state in sources.items():
+        linear = Linearised(data, state, free)
+        errors = standard_errors(linear, Nuisance(linear), correlation)
+        for (effect, values), stderr in zip(state.terms, errors, strict=True):
+            known[key, effect.name] = values, stderr
+    for effect, _ in prefixes[-1].terms:
+        last = known[id(prefixes[-1]), effect.name]
+        if effect.stage == 'target' and is_shared(effect):
+            last = known.get((id(bounded[-1]), effect.name), last)
+        if effect.stage != 'noise':
+            yield effect, *last
 
 
 def _table_causes(

@@ -215,6 +215,15 @@ def is_shared(effect: Effect) -> bool:
     return effect.stage != 'noise' and not everywhere
 
 
+def on_target(linear: Linearised) -> Mask:
+    """Which shared columns (K,) belong to effects on the target."""
+    effects = [effect for effect, _ in linear.state.terms if is_shared(effect)]
+    mine = [effect.stage == 'target' for effect in effects for _ in effect.parameters]
+    mask = np.zeros(linear.shared_columns.shape[-1], dtype=bool)
+    mask[len(mask) - len(mine) :] = mine
+    return mask
+
+
 def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
     """Return the factor (S, N) by which noise effects lower the weight of observations."""
     scale: Array | float = 1.0
@@ -317,7 +326,9 @@ class _SurveyFit(_Fit):
         group = landmark_groups(linear.rows.landmark, linear.rows.used)
         slot = gather(linear.rows.survey[..., None].astype(float), group)[:, :1].astype(int)
         block = np.where(slot >= 0, gather(place, group), 0.0)
-        others = np.concatenate([dense_frames(linear.frame_columns), linear.shared_columns], -1)
+        # Other effects on the target are contained in free landmarks: they stay as they were.
+        shared = linear.shared_columns * ~on_target(linear)
+        others = np.concatenate([dense_frames(linear.frame_columns), shared], axis=-1)
         self._slots = slot[:, 0, 0]
         residual = gather(linear.residual[..., None], group)[..., 0]
         return _equations(residual, block, gather(others, group))
