@@ -50,7 +50,7 @@ def tasks(mode: str, trials: int, seed: int) -> Iterator[Task]:
 
 
 def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
-    """Run trials in processes of their own, one thread each."""
+    """Run trials in processes of their own, one thread each; Ctrl-C keeps those that are done."""
     os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
     context = multiprocessing.get_context('spawn')  # the number of threads is read at the start
     outcomes = []
@@ -58,19 +58,24 @@ def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
         progress('blind trials', len(todo)) as advance,
         ProcessPoolExecutor(workers, mp_context=context) as pool,
     ):
-        for outcome in pool.map(run_trial, todo):
-            outcomes.append(outcome)
-            advance()
+        try:
+            for outcome in pool.map(run_trial, todo):
+                outcomes.append(outcome)
+                advance()
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
     return outcomes
 
 
-def save(mode: str, outcomes: Sequence[Outcome], asked: argparse.Namespace) -> None:
+def save(mode: str, outcomes: Sequence[Outcome], seed: int, directory: Path) -> None:
     """Write the trials of a mode, one a line, with the command that makes them."""
-    numbers = f'--trials {asked.trials} --seed {asked.seed}'
-    command = f'python -m benchmark.blind --modes {mode} {numbers}'
-    lines = ',\n'.join(json.dumps(outcome.to_dict()) for outcome in outcomes)
+    # Of a run that was cut short, the sizes of the last trial may be incomplete.
+    trials = len(outcomes) // len(list(tasks(mode, 1, seed)))
+    whole = [outcome for outcome in outcomes if outcome.task.number < trials]
+    command = f'python -m benchmark.blind --modes {mode} --trials {trials} --seed {seed}'
+    lines = ',\n'.join(json.dumps(outcome.to_dict()) for outcome in whole)
     text = f'{{"command": {json.dumps(command)},\n"trials": [\n{lines}\n]}}\n'
-    write_text(asked.output / f'blind/{mode}.json', text)
+    write_text(directory / f'blind/{mode}.json', text)
 
 
 def load(directory: Path) -> dict[str, tuple[str, list[Outcome]]]:
@@ -96,7 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     asked = parser.parse_args(arguments)
     (asked.output / 'blind').mkdir(parents=True, exist_ok=True)
     for mode in asked.modes:
-        save(mode, run(list(tasks(mode, asked.trials, asked.seed)), asked.workers), asked)
+        outcomes = run(list(tasks(mode, asked.trials, asked.seed)), asked.workers)
+        save(mode, outcomes, asked.seed, asked.output)
     write_report(load(asked.output), asked.output)
     sys.stdout.write(f'wrote {asked.output / "blind.md"}\n')
 
