@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 
 @dataclass(frozen=True)
 class LandmarkScaleEffect(Effect):
-    """A relative change of scale, of the whole target or along each of its axes."""
+    """A relative change of scale: 1 of the whole target, 2 of x over y, 3 of z as well."""
 
     axes: int = 1
     centre: tuple[float, ...] = field(default=(0.0, 0.0, 0.0), metadata={'key': False})
@@ -33,15 +33,19 @@ class LandmarkScaleEffect(Effect):
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        centre = scene.views.points[scene.views.used].mean(axis=0)
-        where = tuple(float(x) for x in np.round(centre, 9))
-        return [cls(1, where), cls(3, where)]
+        points = scene.views.points[scene.views.used]
+        where = tuple(float(x) for x in np.round(points.mean(axis=0), 9))
+        flat = np.ptp(points[:, 2]) < 1e-9
+        return [cls(1, where), cls(2 if flat else 3, where)]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        names = ('relative',) if self.axes == 1 else ('relative_x', 'relative_y', 'relative_z')
+        names = ('relative',) if self.axes == 1 else ('x_over_y', 'z_over_xy')[: self.axes - 1]
         return tuple(Parameter(name, '1', 0.01) for name in names)
 
     def columns(self, scene: Scene) -> Array:
         arm = scene.views.points - np.array(self.centre)
-        return np.asarray(arm[..., None] * (1.0 if self.axes == 1 else np.eye(3)))
+        if self.axes == 1:
+            return np.asarray(arm[..., None])
+        contrasts = np.array([[0.5, -0.5, 0.0], [0.0, 0.0, 1.0]])[: self.axes - 1]
+        return np.asarray(arm[..., None] * contrasts.T)
