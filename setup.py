@@ -36,7 +36,6 @@ setup(
         'setuptools',
         'numpy>=1.26',
         'scipy>=1.11',
-        'opencv-python-headless>=4.6',
         'PyYAML>=6.0',
         'matplotlib>=3.6',
         'rich>=13.0',
@@ -47,7 +46,7 @@ setup(
     extras_require={
         'standalone': ['cyclonedds>=11.0.1'],
         'dask': ['distributed>=2023.7'],
-        'test': ['pytest>=7.4', 'mpmath>=1.3', 'hypothesis>=6.80'],
+        'test': ['pytest>=7.4', 'mpmath>=1.3', 'opencv-python-headless>=4.6'],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],
     },
     zip_safe=True,
