@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,10 +24,6 @@ class FocalLengthEffect(Effect):
     to_separate: ClassVar[str] = (
         'landmarks over the whole field of view; a calibration of this very camera'
     )
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
+from fisheye_svp_ros.effects.base import NoiseEffect, Parameter, Scene
 
 
 @dataclass(frozen=True)
@@ -20,10 +19,6 @@ class NoiseVsAngleEffect(NoiseEffect):
     signature: ClassVar[str] = 'residuals without a pattern whose scatter grows towards the edge'
     confused_with: ClassVar[str] = 'any unmodelled pattern near the edge of the field'
     to_separate: ClassVar[str] = 'repeat the same view without moving anything: the scatter stays'
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

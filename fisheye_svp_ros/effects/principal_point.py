@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -27,10 +26,6 @@ class PrincipalPointEffect(Effect):
     to_separate: ClassVar[str] = (
         'landmarks over the whole field of view; views turned about the axis'
     )
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
+from fisheye_svp_ros.effects.base import NoiseEffect, Parameter
 
 
 @dataclass(frozen=True)
@@ -20,10 +19,6 @@ class QuantisationEffect(NoiseEffect):
     signature: ClassVar[str] = 'every image point is a multiple of one step'
     confused_with: ClassVar[str] = 'detector_bias'
     to_separate: ClassVar[str] = 'store the image points with more digits, or refine to sub-pixel'
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

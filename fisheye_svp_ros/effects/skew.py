@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,10 +24,6 @@ class SkewEffect(Effect):
     to_separate: ClassVar[str] = (
         'views turned about the axis by 45 and 90 degrees'
     )
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Parameter, Scene
+from fisheye_svp_ros.effects.base import NoiseEffect, Parameter
 
 
 @dataclass(frozen=True)
@@ -20,10 +19,6 @@ class WrongIdsEffect(NoiseEffect):
     signature: ClassVar[str] = 'a few huge residuals that end where another landmark is predicted'
     confused_with: ClassVar[str] = 'landmark_survey where one landmark is always mistaken'
     to_separate: ClassVar[str] = 'look at the named image points; match the ids again'
-
-    @classmethod
-    def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls()]
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
