@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,23 +15,18 @@ from scipy import stats
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.criticism.diagnosis import Diagnosis
 from fisheye_svp_ros.criticism.points import PointResiduals
-from fisheye_svp_ros.files import replacing
 from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.reporting.plots import picture
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
-_STYLE: Any = {
-    'font.size': 9.5, 'axes.titlesize': 10.5, 'axes.edgecolor': NOISE, 'axes.labelcolor': INK,
-    'xtick.color': INK, 'ytick.color': INK, 'text.color': INK, 'axes.spines.top': False,
-    'axes.spines.right': False, 'axes.grid': True, 'axes.axisbelow': True, 'grid.color': '#e2e8f0',
-    'legend.frameon': False,
-}
 _SIDES = (('before', BEFORE), ('after', AFTER))
+_WIDTH = 9.2  # in
 _BINS = 16
 _ARROWS = 2500
 _CELLS = 18  # of the mean field, along the image
 
 
-Picture = tuple[str, Callable[..., Figure], tuple[Any, ...]]
+Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 
 
 class Shown(NamedTuple):
@@ -51,106 +45,101 @@ class Shown(NamedTuple):
         return cls(shown, diagnosis.after.state.lens, diagnosis.noise_px)
 
 
-def save(path: Path, draw: Callable[..., Figure], *arguments: object) -> None:
-    """Draw a figure in the style of the report and write it as PNG, whole or not at all."""
-    with matplotlib.rc_context(_STYLE), replacing(path) as temporary:
-        draw(*arguments).savefig(temporary, dpi=120)
-
-
-def draw_field(shown: Shown) -> Figure:
+def draw_field(path: Path, shown: Shown) -> None:
     """Residual vectors over the image: of single points, and means over cells of the image."""
     points, cell = shown.points, shown.lens.width / _CELLS
-    figure = Figure((11, 1.2 + 10 * shown.lens.height / shown.lens.width), layout='constrained')
-    axes = figure.subplots(2, 2, sharex=True, sharey=True)
     step = max(1, len(points.uv) // _ARROWS)
     fields = [
         ((points.uv[::step], residual[::step]), _cell_means(points.uv, residual, cell))
         for residual in (points.before, points.after)
     ]
-    for kind, row in enumerate(axes):
-        typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
-        for axis, field, (side, colour) in zip(row, fields, _SIDES, strict=True):
-            _image_frame(axis, shown.lens)
-            _arrows(axis, *field[kind], typical, cell, colour)
-            if not kind:
-                rms = _rms(getattr(points, side))
-                axis.set_title(f'{side}: {rms:.3f} px rms', color=colour)
-    axes[0, 0].set_ylabel('single points\nv / px')
-    axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
-    for axis in axes[1]:
-        axis.set_xlabel('u / px')
-    return figure
+    height = 1.1 + (_WIDTH - 1) * shown.lens.height / shown.lens.width
+    with picture(path, _WIDTH, height) as figure:
+        axes = figure.subplots(2, 2, sharex=True, sharey=True)
+        for kind, row in enumerate(axes):
+            typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
+            for axis, field, (_, colour) in zip(row, fields, _SIDES, strict=True):
+                _image_frame(axis, shown.lens)
+                _arrows(axis, *field[kind], typical, cell, colour)
+        for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
+            axis.set_title(f'{side}: {_rms(getattr(points, side)):.3f} px rms', color=colour)
+        axes[0, 0].set_ylabel('single points\nv / px')
+        axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
+        for axis in axes[1]:
+            axis.set_xlabel('u / px')
 
 
-def draw_against(shown: Shown, x: Array, label: str, log: bool = False) -> Figure:
+def draw_against(
+    path: Path, shown: Shown, x: Array, label: str, log: bool = False
+) -> None:
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
-    return _grid(shown, [
+    _grid(path, shown, [
         (name, x, {side: values[:, i] for side, values in polar.items()}) for name, i in rows
     ], label, log)
 
 
-def draw_phase(shown: Shown) -> Figure:
+def draw_phase(path: Path, shown: Shown) -> None:
     """Residuals of u and v against the place of u and v within its pixel."""
     phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
-    return _grid(shown, [
+    _grid(path, shown, [
         (f'{name} residual / px', phase[:, i],
          {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES})
         for i, name in enumerate('uv')
     ], 'distance of u (above) and v (below) from the middle of its pixel / px', False)
 
 
-def draw_landmarks(shown: Shown) -> Figure:
+def draw_landmarks(path: Path, shown: Shown) -> None:
     """Rms of each landmark's residuals."""
-    return _by_group(shown, shown.points.landmark, None, 'landmark')
+    _by_group(path, shown, shown.points.landmark, None, 'landmark')
 
 
-def draw_frames(shown: Shown) -> Figure:
+def draw_frames(path: Path, shown: Shown) -> None:
     """Rms of each frame's residuals, over time where it is known."""
     t = shown.points.t
-    if not np.isfinite(t).all():
-        return _by_group(shown, shown.points.frame, None, 'frame')
-    return _by_group(shown, shown.points.frame, t - t.min(), 'time / s')
+    if np.isfinite(t).all():
+        _by_group(path, shown, shown.points.frame, t - t.min(), 'time / s')
+    else:
+        _by_group(path, shown, shown.points.frame, None, 'frame')
 
 
-def draw_histogram(shown: Shown) -> Figure:
+def draw_histogram(path: Path, shown: Shown) -> None:
     """Residuals of both coordinates over the noise, beside the normal distribution."""
-    figure = Figure((11, 3.4), layout='constrained')
-    axes = figure.subplots(1, 2, sharex=True, sharey=True)
     bins = np.linspace(-6, 6, 73)
     middle = (bins[:-1] + bins[1:]) / 2
-    for axis, (side, colour) in zip(axes, _SIDES, strict=True):
-        z = getattr(shown.points, side).ravel() / shown.noise
-        count = z.size * np.diff(bins)[0]
-        axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='residuals of u and v')
-        axis.plot(middle, count * stats.norm.pdf(middle), color=INK, lw=1.4, label='noise alone')
-        axis.set(yscale='log', ylim=(0.5, None), xlabel='residual over the noise', title=side)
-        axis.legend(loc='upper right')
-    axes[0].set_ylabel('image coordinates')
-    return figure
+    with picture(path, _WIDTH, 3.0) as figure:
+        axes = figure.subplots(1, 2, sharex=True, sharey=True)
+        for axis, (side, colour) in zip(axes, _SIDES, strict=True):
+            z = getattr(shown.points, side).ravel() / shown.noise
+            expected = z.size * np.diff(bins)[0] * stats.norm.pdf(middle)
+            axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='u and v')
+            axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
+            axis.set(yscale='log', ylim=(0.5, None), xlabel='residual over the noise')
+            axis.set_title(side, color=colour)
+            axis.legend(loc='upper right')
+        axes[0].set_ylabel('image coordinates')
 
 
 def _grid(
-    shown: Shown, rows: list[tuple[str, Array, dict[str, Array]]], label: str, log: bool
-) -> Figure:
-    figure = Figure((11, 5.0), layout='constrained')
-    axes = figure.subplots(2, 2, sharex=True, sharey='row')
-    for row, (name, x, values) in zip(axes, rows, strict=True):
-        highest = 2.2 * shown.noise
-        for axis, (side, colour) in zip(row, _SIDES, strict=True):
-            highest = max(highest, _binned(axis, x, values[side], shown.noise, colour))
+    path: Path, shown: Shown, rows: list[tuple[str, Array, dict[str, Array]]], label: str,
+    log: bool,
+) -> None:
+    with picture(path, _WIDTH, 4.4) as figure:
+        axes = figure.subplots(2, 2, sharex=True, sharey='row')
+        for row, (name, x, values) in zip(axes, rows, strict=True):
+            highest = 2.2 * shown.noise
+            for axis, (side, colour) in zip(row, _SIDES, strict=True):
+                highest = max(highest, _binned(axis, x, values[side], shown.noise, colour))
+            row[0].set(ylabel=name, ylim=(-1.2 * highest, 1.2 * highest))
+        for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
+            axis.set_title(side, color=colour)
+        for axis in axes[1]:
+            axis.set_xlabel(label)
             if log:
                 axis.set_xscale('log')
                 axis.xaxis.set_major_formatter('{x:g}')
-        row[0].set_ylim(-1.2 * highest, 1.2 * highest)
-        row[0].set_ylabel(name)
-    for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
-        axis.set_title(side, color=colour)
-    for axis in axes[1]:
-        axis.set_xlabel(label)
-    _legend(figure, axes[0, 1])
-    return figure
+        _legend(figure, axes[0, 1])
 
 
 def _binned(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
@@ -181,26 +170,24 @@ def _legend(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc='outside upper right', ncols=len(labels), fontsize=8)
 
 
-def _by_group(shown: Shown, group: Index, x: Array | None, label: str) -> Figure:
-    figure = Figure((11, 3.0), layout='constrained')
-    axis = figure.subplots()
+def _by_group(path: Path, shown: Shown, group: Index, x: Array | None, label: str) -> None:
     names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
     place = names if x is None else np.bincount(label_of, weights=x) / count
     order = np.argsort(place, kind='stable')
-    expected = np.sqrt(2) * shown.noise
-    low, high = (np.sqrt(stats.chi2.ppf(p, 2 * count) / count) * shown.noise
-                 for p in (0.025, 0.975))
-    axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
-                      step='mid', label='where noise alone keeps 95 %')
-    axis.axhline(expected, color=NOISE, lw=1)
-    for side, colour in _SIDES:
-        squares = (getattr(shown.points, side) ** 2).sum(axis=1)
-        rms = np.sqrt(np.bincount(label_of, weights=squares) / count)
-        style = 'o' if len(names) > 60 else 'o-'
-        axis.plot(place[order], rms[order], style, ms=3.5, lw=1, color=colour, label=side)
-    axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
-    _legend(figure, axis)
-    return figure
+    low, high = (
+        np.sqrt(stats.chi2.ppf(p, 2 * count) / count) * shown.noise for p in (0.025, 0.975)
+    )
+    with picture(path, _WIDTH, 2.8) as figure:
+        axis = figure.subplots()
+        axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
+                          step='mid', label='where noise alone keeps 95 %')
+        for side, colour in _SIDES:
+            squares = (getattr(shown.points, side) ** 2).sum(axis=1)
+            rms = np.sqrt(np.bincount(label_of, weights=squares) / count)
+            axis.plot(place[order], rms[order], 'o' if len(names) > 60 else 'o-', ms=3.5, lw=1,
+                      color=colour, label=side)
+        axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
+        _legend(figure, axis)
 
 
 def _image_frame(axis: Axes, lens: Lens) -> None:

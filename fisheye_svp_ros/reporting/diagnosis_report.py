@@ -17,9 +17,9 @@ from fisheye_svp_ros.criticism.selection import SIGNIFICANCE, Step
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.files import write_text
 from fisheye_svp_ros.reporting import diagnosis_text as text
-from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures, save
+from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
-from fisheye_svp_ros.reporting.target_map import board_maps
+from fisheye_svp_ros.reporting.target_map import BoardMap, board_maps
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
@@ -42,6 +42,7 @@ _PICTURE_OF = {
     'outliers': 'histogram', 'scatter_vs_theta': 'theta', 'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
+_DISPLACING = {'target_shape', 'landmark_survey'}
 _BAR = 220  # px of a share of 1
 _ROWS = 24
 
@@ -85,19 +86,27 @@ def write_report(
 
 def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:
     for name, draw, arguments in residual_pictures(Shown.of(diagnosis, points)):
-        save(folder / f'{name}.png', draw, *arguments)
+        draw(folder / f'{name}.png', *arguments)
         yield folder / f'{name}.png'
     if diagnosis.trace:
-        save(folder / 'evidence.png', draw_evidence, diagnosis)
+        draw_evidence(folder / 'evidence.png', diagnosis)
         yield folder / 'evidence.png'
-    on_target = [c.effect for c in diagnosis.causes if CATALOGUE[c.effect].stage == 'target']
-    if on_target:
-        maps = [('the target in the extended model', m) for m in board_maps(diagnosis.after)]
-        if 'target_shape' in on_target and len(on_target) > 1:
-            alone = board_maps(diagnosis.after, ('target_shape',))
-            maps += [('target_shape alone', m) for m in alone]
-        save(folder / 'target.png', draw_target, maps)
+    maps = list(_target_maps(diagnosis))
+    if maps:
+        draw_target(folder / 'target.png', maps)
         yield folder / 'target.png'
+
+
+def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
+    """Yield maps of the boards where landmarks are displaced other than all together."""
+    effects = {cause.effect for cause in diagnosis.causes}
+    shown: list[tuple[str, tuple[str, ...]]] = []
+    if effects & _DISPLACING:
+        shown.append(('the target in the extended model', ()))
+    if effects >= _DISPLACING:
+        shown.append(('target_shape alone', ('target_shape',)))
+    for title, names in shown:
+        yield from ((title, m) for m in board_maps(diagnosis.after, names) if m.spread_out)
 
 
 def _data_uri(path: Path) -> str:

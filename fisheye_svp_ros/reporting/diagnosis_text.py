@@ -49,6 +49,7 @@ _MEASURES = {
 }
 _NAMED = 3  # causes that one sentence can bear
 _UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
+_NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
 _FEW = 4  # parameters that are read one by one
 
 
@@ -78,7 +79,7 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
         return _landmarks(diagnosis, cause)
     named = [
         f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
-        if abs(entry['value']) > _UNDETERMINED * entry['stderr']
+        if abs(entry['value']) > max(_NOTHING, _UNDETERMINED * entry['stderr'])
     ]
     if len(named) <= _FEW:
         return ', '.join(named)

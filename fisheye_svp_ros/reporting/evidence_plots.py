@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,31 +11,31 @@ from matplotlib.figure import Figure
 
 from fisheye_svp_ros.criticism.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, round_number
+from fisheye_svp_ros.reporting.plots import picture
 from fisheye_svp_ros.reporting.target_map import BoardMap
 
 _REFUSED = '#cbd5e1'
 
 
-def draw_evidence(diagnosis: Diagnosis) -> Figure:
+def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     """What each step of the search explains, and how well held-out data are predicted after it."""
     steps = [step for step in diagnosis.trace if step.statistic > 0]
     count = max(len(steps), len(diagnosis.causes) + 1)
-    figure = Figure((11, 1.4 + 0.32 * count), layout='constrained')
-    left, right = figure.subplots(1, 2)
     misfit = float((diagnosis.before.residual**2).sum())
-    left.barh(
-        [step.effect for step in steps], [100 * step.statistic / misfit for step in steps],
-        color=[AFTER if step.accepted else _REFUSED for step in steps],
-    )
-    left.set(xlabel='explains % of the misfit there was at the start', title='steps of the search')
-    left.plot([], [], 's', color=AFTER, label='accepted')
-    left.plot([], [], 's', color=_REFUSED, label='refused')
-    left.legend(loc='lower right', fontsize=8)
-    _held_out(right, diagnosis)
-    for axis in (left, right):
-        axis.invert_yaxis()
-        axis.grid(visible=False, axis='y')
-    return figure
+    with picture(path, 9.2, 1.4 + 0.3 * count) as figure:
+        left, right = figure.subplots(1, 2)
+        left.barh(
+            [step.effect for step in steps], [100 * step.statistic / misfit for step in steps],
+            color=[AFTER if step.accepted else _REFUSED for step in steps],
+        )
+        left.set(xlabel='explains % of the misfit at the start', title='steps of the search')
+        left.plot([], [], 's', color=AFTER, label='accepted')
+        left.plot([], [], 's', color=_REFUSED, label='refused')
+        left.legend(loc='lower right', fontsize=8)
+        _held_out(right, diagnosis)
+        for axis in (left, right):
+            axis.invert_yaxis()
+            axis.grid(visible=False, axis='y')
 
 
 def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
@@ -50,18 +51,18 @@ def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
     axis.legend(loc='lower right', fontsize=8)
 
 
-def draw_target(maps: list[tuple[str, BoardMap]]) -> Figure:
+def draw_target(path: Path, maps: list[tuple[str, BoardMap]]) -> None:
     """Height maps of boards with their titles, and the landmarks' slides along them."""
-    rows = math.ceil(len(maps) / 2)
-    figure = Figure((5.5 * min(len(maps), 2), 4.8 * rows), layout='constrained')
-    axes = np.ravel(figure.subplots(rows, min(len(maps), 2), squeeze=False))
-    for axis in axes[len(maps):]:
-        axis.remove()
-    for axis, (title, board) in zip(axes, maps, strict=False):
-        _height_map(figure, axis, board)
-        axis.set_title(f'board {board.board}, {title}:\n'
-                       f'{1e3 * board.peak_to_valley:.2f} mm from lowest to highest')
-    return figure
+    columns = min(len(maps), 2)
+    rows = math.ceil(len(maps) / columns)
+    with picture(path, 4.8 * columns, 4.3 * rows) as figure:
+        axes = np.ravel(figure.subplots(rows, columns, squeeze=False))
+        for axis in axes[len(maps):]:
+            axis.remove()
+        for axis, (title, board) in zip(axes, maps, strict=False):
+            _height_map(figure, axis, board)
+            axis.set_title(f'board {board.board}, {title}:\n'
+                           f'{1e3 * board.peak_to_valley:.2f} mm from lowest to highest')
 
 
 def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
@@ -79,8 +80,8 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
         key = axis.quiver(x, y, *(1e3 * board.slide.T), angles='xy', scale_units='xy',
                           scale=scale, width=0.003, color=INK)
         length = round_number(typical)
-        axis.quiverkey(key, 0.8, -0.09, length, f'{length:g} mm along the board', labelpos='E',
+        axis.quiverkey(key, 0.3, -0.15, length, f'{length:g} mm along the board', labelpos='E',
                        fontproperties={'size': 8})
     axis.set_aspect('equal')
     axis.grid(visible=False)
-    axis.set(xlabel='x on the board / mm', ylabel='y / mm')
+    axis.set(xlabel='x on the board / mm\n', ylabel='y / mm')

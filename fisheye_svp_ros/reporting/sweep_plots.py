@@ -20,6 +20,7 @@ from fisheye_svp_ros.evaluation.dependence import (
     swept_parameters,
 )
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.runs_plot import draw_runs
 
 _COLOURS = 'viridis'
 _HUES, _LINES = 8, ('-', '--', ':', '-.')  # colours and lines that can be told apart
@@ -67,7 +68,7 @@ def draw_table(table: Table, folder: Path) -> list[Path]:
         files.append(folder / 'residuals_and_noise.png')
         _draw_spreads(table, _hue(table, [name for name in swept if name != 'noise_px']),
                       files[-1])
-    return files
+    return files + draw_runs(table, folder / 'runs.png')
 
 
 def _hue(table: Table, names: Sequence[str]) -> str | None:

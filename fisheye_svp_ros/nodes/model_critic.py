@@ -1,0 +1,232 @@
+"""Says what the simulation of a lens gets wrong about the image points that come."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
+
+from fisheye_svp_ros import messages
+from fisheye_svp_ros.criticism.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.criticism.inputs import posable
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.lens import Lens, save_lens
+from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.seen import Seen, scenario_of, seen_in, table_of
+from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.observations import STEREO, Observations
+from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.scenario import true_lens
+from fisheye_svp_ros.settings import SolverSettings
+
+T = TypeVar('T')
+
+_UNITS = {'1': '', 'm': '_m', 'm^2': '_m2', 'rad': '_rad', 's': '_s', 'px': '_px',
+          '1/rad^2': '_per_rad2'}
+_MOST = 24  # parameters of a cause that are worth a topic each
+
+
+@dataclass(frozen=True)
+class ModelCriticSettings(SolverSettings):
+    """Parameters of the model critic."""
+
+    sigma_px: float = parameter(
+        0.0, 'Standard deviation of an image point; 0: unknown, to be estimated', 'px', (0.0, 1e3)
+    )
+    stereo: bool = parameter(
+        False, 'Judge the cameras left and right of a rig together; only at the start'
+    )
+    free_intrinsics: bool = parameter(
+        False, 'Fit the intrinsics too; always so for a lens that was calibrated'
+    )
+    min_frames: int = parameter(20, 'Frames before the first diagnosis', span=(5, 100_000))
+    every_frames: int = parameter(20, 'Further frames before the next one', span=(1, 100_000))
+    max_frames: int = parameter(100, 'Judge at most so many of the last frames', span=(5, 100_000))
+    output: str = parameter(
+        'extended_lens.yaml', 'File that the service write_extended_lens writes'
+    )
+
+
+class _Running(NamedTuple):
+    """A diagnosis under way, and the stamp of its last frame."""
+
+    future: Future[Diagnosis]
+    stamp: int
+
+
+class ModelCritic(SolverNode):
+    """Collects frames, diagnoses them beside the executor, publishes the verdict."""
+
+    NAME = 'model_critic'
+    SETTINGS = ModelCriticSettings
+    METRICS = (
+        'frames', 'points', 'noise_px', 'base_rms_px', 'base_heldout_rms_px', 'extended_rms_px',
+        'extended_heldout_rms_px', 'gain', 'gain_low', 'gain_high',
+    )
+    BY_SCENARIO = True
+    settings: ModelCriticSettings
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._scenario: frozenset[tuple[str, str]] = frozenset()
+        self._simulation: Lens
+        self._frames: dict[int, Seen] = {}
+        self._new = 0
+        self._judged = False
+        self._running: _Running | None = None
+        self._verdict: Diagnosis | None = None
+        self.create_service(Trigger, '~/write_extended_lens', self._write_extended_lens)
+        self.create_timer(0.2, self._tick)
+        self.start()
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The namespaces of the cameras, each with its slash."""
+        return tuple(f'{name}/' for name in STEREO) if self.settings.stereo else ('',)
+
+    def prepare(self, settings: Any) -> Any:
+        """Refuse settings that cannot be used."""
+        if settings.stereo != self.settings.stereo:
+            raise ParameterError('stereo can be set at the start only; start the node anew')
+        if settings.min_frames > settings.max_frames:
+            raise ParameterError('min_frames is above max_frames; no diagnosis would ever start')
+        return super().prepare(settings)
+
+    def configure(self, settings: Any) -> None:
+        """Judge what has come so far anew, with other settings."""
+        super().configure(settings)
+        self._judged = False
+
+    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+        """Take in one more frame; start over where the scenario is another one."""
+        seen = seen_in(stamp, landmarks, items, self.cameras)
+        lens, scenario = true_lens(*self._lens(items)), scenario_of(items)
+        if scenario != self._scenario:
+            self._scenario, self._frames, self._judged = scenario, {}, False
+            self._running = self._verdict = None
+        self._simulation = lens.svp() if self.settings.svp else lens
+        self._new += stamp not in self._frames
+        self._frames[stamp] = seen
+        for old in sorted(self._frames)[: -self.settings.max_frames]:
+            del self._frames[old]
+
+    def _tick(self) -> None:
+        if self._running is not None:
+            if self._running.future.done():
+                done, self._running = self._running, None
+                self._finish(done)
+            return
+        wanted = self.settings.every_frames if self._judged else 0
+        if len(self._frames) >= self.settings.min_frames and self._new >= wanted:
+            self._new, self._judged = 0, True
+            table, lens = self._table(), self._simulation
+            free = self.settings.free_intrinsics or lens.calibration is not None
+            work = in_background(lambda: judge(table, lens, free))
+            self._running = _Running(work, max(self._frames))
+
+    def _table(self) -> Observations:
+        table = table_of([self._frames[stamp] for stamp in sorted(self._frames)], self.cameras)
+        sigma = self.settings.sigma_px
+        return replace(table, sigma=np.full(len(table), sigma)) if sigma else table
+
+    def _finish(self, done: _Running) -> None:
+        try:
+            found = done.future.result()
+        except FisheyeSvpError as error:
+            self.drop(f'{self.cameras[0]}image_points', error)
+            self.publish_result(done.stamp, {}, str(error), warn=True)
+            return
+        self._verdict = found
+        numbers = figures(found)
+        for name, value in numbers.items():
+            if name not in self._metrics:
+                self._metrics[name] = self.announce(Float64, f'~/metrics/{name}', LATCHED)
+            self._metrics[name].publish(messages.number_message(value))
+        self.get_logger().info(' '.join(verdict_sentences(found)))
+        self._result.publish(self._verdict_message(found, done.stamp, numbers))
+        self._publish_diagnostics()
+
+    def _verdict_message(
+        self, found: Diagnosis, stamp: int, numbers: Mapping[str, float]
+    ) -> Any:
+        words = {'verdict': found.verdict, 'causes': ' '.join(c.effect for c in found.causes)}
+        return messages.key_values_message(
+            f'{self.get_fully_qualified_name()}: verdict', {**words, **numbers}, stamp,
+            ' '.join(verdict_sentences(found)), warn=found.verdict != 'adequate',
+        )
+
+    def _publish_diagnostics(self) -> None:
+        super()._publish_diagnostics()
+        if self._verdict is not None:
+            now = self.get_clock().now().nanoseconds
+            numbers = figures(self._verdict)
+            self._diagnostics.publish(self._verdict_message(self._verdict, now, numbers))
+
+    def _write_extended_lens(self, request: Any, response: Any) -> Any:
+        response.success = False
+        if self._verdict is None:
+            response.message = (
+                f'no diagnosis yet: {len(self._frames)} of {self.settings.min_frames} frames'
+            )
+            return response
+        path = Path(self.settings.output).absolute()
+        try:
+            save_lens(self._verdict.lens, path)
+        except FisheyeSvpError as error:
+            response.message = str(error)
+            return response
+        response.success, response.message = True, str(path)
+        return response
+
+
+def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
+    """Diagnose the frames that can be posed; raise FisheyeSvpError where none can."""
+    usable, _ = posable(table, lens)
+    return diagnose(usable, lens, free_intrinsics=free_intrinsics)
+
+
+def figures(found: Diagnosis) -> dict[str, float]:
+    """Return METRICS, and the parameters of the causes with their standard errors."""
+    numbers = {
+        'frames': found.frames, 'points': found.observations, 'noise_px': found.noise_px,
+        'base_rms_px': found.base.rms_px, 'base_heldout_rms_px': found.base.heldout_rms_px,
+        'extended_rms_px': found.extended.rms_px,
+        'extended_heldout_rms_px': found.extended.heldout_rms_px,
+        'gain': found.gain.value, 'gain_low': found.gain.low, 'gain_high': found.gain.high,
+    }
+    for cause in found.causes:
+        if len(cause.parameters) > _MOST:
+            continue
+        for name, entry in cause.parameters.items():
+            unit = _UNITS[entry['unit']]
+            key = f'{cause.effect}_{name}'.replace('.', '_')
+            numbers |= {f'{key}{unit}': entry['value'], f'{key}_stderr{unit}': entry['stderr']}
+    return {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
+
+
+def in_background(work: Callable[[], T]) -> Future[T]:
+    """Start work on a thread that does not keep the process from ending."""
+    future: Future[T] = Future()
+
+    def complete() -> None:
+        try:
+            future.set_result(work())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=complete, daemon=True).start()
+    return future
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the node."""
+    return run(ModelCritic, args)
