@@ -15,7 +15,7 @@ from fisheye_svp_ros.errors import SweepError
 from fisheye_svp_ros.evaluation.sweep import InProcess
 
 _AHEAD = 3  # tasks under way for each worker: none waits for the next
-_PATIENCE = 10  # s for a scheduler to answer
+_PATIENCE = 10  # s for a scheduler to answer, and for its first worker
 
 
 class Workers(NamedTuple):
@@ -65,11 +65,13 @@ def dask(address: str) -> Iterator[Workers]:
     except (OSError, ValueError) as cause:
         raise SweepError(f'{address}: no Dask scheduler answers there ({cause})') from cause
     with client:
-        threads = sum(client.nthreads().values())
-        if not threads:
-            raise SweepError(f'{address}: the Dask cluster has no worker; start one')
         try:
-            yield Workers(client.get_executor(pure=False), _AHEAD * threads)
+            client.wait_for_workers(1, timeout=_PATIENCE)
+        except TimeoutError as cause:
+            raise SweepError(f'{address}: the Dask cluster has no worker; start one') from cause
+        ahead = _AHEAD * sum(client.nthreads().values())
+        try:
+            yield Workers(client.get_executor(pure=False), ahead)
         except (distributed.KilledWorker, CommClosedError) as cause:
             raise SweepError(f'the Dask cluster gave up ({cause}); what is done is kept, --resume '
                              'goes on') from cause
