@@ -14,6 +14,9 @@ pytest.importorskip('launch_ros')
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from graph import Graph
 
+from fisheye_svp_ros.bags import Bag
+from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
+
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 
 try:
@@ -26,6 +29,13 @@ FILES = {
     'stereo.launch.py': ['/stereo_calibrator', '/stereo_depth'],
     'whole.launch.py': ['/mono/localizer', '/stereo/stereo_calibrator', '/stereo/stereo_depth'],
 }
+SWEEP = """
+synthetic_camera:
+  ros__parameters:
+    sweep.radius: [2.0, 0.5]
+    sweep.environment: [whole, inner]
+localizer: {ros__parameters: {svp: true}}
+"""
 
 
 @pytest.fixture
@@ -37,7 +47,23 @@ def graph(ros_domain: int) -> Iterator[Graph]:
 
 
 def test_every_launch_file_is_tested() -> None:
-    assert {path.name for path in (SHARE / 'launch').glob('*.launch.py')} == set(FILES)
+    files = {path.name for path in (SHARE / 'launch').glob('*.launch.py')}
+    assert files == {*FILES, 'sweep.launch.py'}
+
+
+def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path) -> None:
+    sweep, bag = tmp_path / 'sweep.yaml', tmp_path / 'bag'
+    sweep.write_text(SWEEP)
+    launch = NodeProcess(
+        ['ros2', 'launch', 'fisheye_svp_ros', 'sweep.launch.py', f'sweep:={sweep}', f'bag:={bag}'],
+        dict(os.environ),
+    )
+    launch.finish()
+    text = '\n'.join(launch.lines)
+    assert 'Traceback' not in text and 'has died' not in text, text
+    columns = tabulate(Bag(bag).records(is_tabulated))
+    assert columns['scenario'] == [0, 1, 2, 3] and columns['radius'] == [2.0, 2.0, 0.5, 0.5]
+    assert all(error < 0.01 for error in columns['localizer.position_error_m'])
 
 
 @pytest.mark.parametrize('name', FILES)

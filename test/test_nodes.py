@@ -21,6 +21,7 @@ from fisheye_svp_ros.camera import incidence
 from fisheye_svp_ros.clouds import LANDMARKS, RESIDUALS, unpack
 from fisheye_svp_ros.landmarks import Landmarks, environment
 from fisheye_svp_ros.lens import load_lens
+from fisheye_svp_ros.nodes import camera
 from fisheye_svp_ros.nodes.base import Finished
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
@@ -155,6 +156,23 @@ def test_in_lock_step_every_scenario_is_answered_once_and_in_order(
     counts = {'whole': 33.0, 'inner': 15.0, 'outer': 18.0}
     for tag, result in zip(tags, results, strict=True):
         assert float(values(result)['points']) == counts[tag['environment']]
+
+
+def test_a_set_without_an_answer_comes_again(
+    graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(camera, '_LONG', 0.3)
+    g = graph('lock_step:=somebody/result', 'rate:=50.0', 'noise_px:=1.0')
+    scenarios = g.hear(DiagnosticArray, 'scenario')
+    points = g.hear(PointCloud2, 'image_points')
+    g.start(SyntheticCamera)
+    g.until(lambda: len(points) >= 3)
+    assert len(set(stamps(points))) == 1 and set(stamps(scenarios)) == set(stamps(points))
+    first, *others = (messages.read_image_points(message).uv for message in points)
+    assert all(np.array_equal(first, other) for other in others)
+    answer = g.tell(DiagnosticArray, 'somebody/result')
+    answer.publish(messages.key_values_message('n', {}, stamps(points)[0]))
+    g.until(lambda: len(set(stamps(points))) == 2)
 
 
 def test_a_change_of_parameters_starts_over(graph: Callable[..., Graph]) -> None:
