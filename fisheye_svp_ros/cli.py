@@ -63,6 +63,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except FisheyeSvpError as error:
         print(f'fisheye-svp: {error}', file=sys.stderr)
         return _BAD_INPUT
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith('fisheye_svp_ros'):
+            raise
+        print(f'fisheye-svp: the Python package {error.name} is not installed, and this needs it',
+              file=sys.stderr)
+        return _BAD_INPUT
     except KeyboardInterrupt:
         return _INTERRUPTED
     except BrokenPipeError:

@@ -340,3 +340,14 @@ def test_the_order_of_work_does_not_matter() -> None:
     for numbers in (range(30, 40), range(30)):
         again = sweep_rows(plan, numbers)['localizer.position_error_m']
         assert again == pytest.approx(rows[numbers.start:numbers.stop], abs=1e-12)
+
+
+def test_a_missing_package_is_one_line(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    monkeypatch.delitem(sys.modules, 'fisheye_svp_ros.reporting.columns', raising=False)
+    assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 2
+    err = capsys.readouterr().err
+    assert 'the Python package pyarrow is not installed' in err and err.count('\n') == 1
