@@ -24,38 +24,47 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _search(folder: Path) -> None:
-    from concurrent.futures import ProcessPoolExecutor
+    import os
     from functools import partial
 
     import yaml
 
+    from fisheye_svp_ros.commands.executors import local
     from fisheye_svp_ros.evaluation.paper_family import (
         best_of,
         family_document,
         layout_document,
         lens_document,
+        whole_directions,
     )
+    from fisheye_svp_ros.evaluation.paper_poses import calibration_range
     from fisheye_svp_ros.evaluation.paper_search import STARTS, recover
     from fisheye_svp_ros.evaluation.paper_tables import LENSES
     from fisheye_svp_ros.files import write_text
-    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.lens import lens_from_dict, load_lens
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.share import lens_path
 
     fish180, fish214 = (load_lens(lens_path(name)) for name in LENSES)
     found = []
-    with progress('fitting tables 1 and 2', STARTS) as step, ProcessPoolExecutor() as pool:
-        for one in pool.map(partial(recover, (fish180, fish214)), range(STARTS)):
-            found.append(one)
-            step()
-    best = best_of(found)
-    documents = {
-        'lenses/fish180.yaml': lens_document(fish180, best, STARTS),
-        'lenses/fish214.yaml': lens_document(fish214, best, STARTS),
-        'environments/kita.yaml': layout_document(best, STARTS),
-        'paper_search.yaml': family_document(found),
-    }
-    for name, document in documents.items():
+    with local(os.cpu_count() or 1) as workers:
+        with progress('fitting tables 1 and 2', STARTS) as step:
+            for one in workers.executor.map(partial(recover, (fish180, fish214)), range(STARTS)):
+                found.append(one)
+                step()
+        best = best_of(found)
+        documents = [lens_document(lens, best, STARTS) for lens in (fish180, fish214)]
+        recovered = [lens_from_dict(document) for document in documents]
+        with progress('calibrating rigs from many sets of poses'):
+            ranges = workers.executor.map(
+                calibration_range, recovered, [whole_directions(best)] * 2)
+            family = family_document(found, dict(zip(LENSES, ranges, strict=True)))
+    for name, document in (
+        ('lenses/fish180.yaml', documents[0]),
+        ('lenses/fish214.yaml', documents[1]),
+        ('environments/kita.yaml', layout_document(best, STARTS)),
+        ('paper_search.yaml', family),
+    ):
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=95)
         write_text(folder / name, text)
         print(f'  {folder / name}')

@@ -7,6 +7,7 @@ paper prints them, in the paper's frames (x right, y up, camera gazing along -z)
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
 from typing import NamedTuple
 
@@ -84,6 +85,16 @@ class Evaluation(NamedTuple):
         return np.array([measured.metrics[metric] for measured in self.measured])
 
 
+def landmarks_at(spread: str, radius: float) -> Array:
+    """Return the landmarks (N, 3) of an environment, m."""
+    return radius * _directions(spread)
+
+
+@cache
+def _directions(spread: str) -> Array:
+    return environment(spread, 1.0).points
+
+
 def evaluate(lens: Lens, solver: Lens | None = None) -> Evaluation:
     """Evaluate a lens with a solver that believes another one, by default the SVP lens."""
     localized = localize_spreads(lens, solver)
@@ -116,25 +127,28 @@ def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[Localized,
     """Localize at the three radii, one result a spread: Whole, Inner, Outer."""
     return tuple(
         localize_environments(
-            lens, np.stack([environment(spread, radius).points for radius in RADII]), solver
+            lens, np.stack([landmarks_at(spread, radius) for radius in RADII]), solver
         )
         for spread in SPREADS
     )
 
 
 def calibrate_rigs(
-    lens: Lens, solver: Lens | None = None, poses: Pose | None = None
+    lens: Lens, solver: Lens | None = None, poses: Pose | None = None,
+    directions: Array | None = None,
 ) -> tuple[Array, StereoCalibration]:
     """Return table 3 or 4, rows (3 radii, 3 styles, 5), and the nine solved systems (section 4).
 
-    poses (V,): of the right camera in the world, `rig.calibration_poses` by default.
+    poses (V,): of the right camera in the world, `rig.calibration_poses` by default; directions
+    (N, 3), unit: of the landmarks, Whole by default.
     """
+    directions = landmarks_at('whole', 1.0) if directions is None else directions
     right = calibration_poses() if poses is None else poses
     systems = [(radius, rig(style)) for radius in RADII for style in STYLE_NAMES]
     views: list[list[Views]] = [[], []]
     model = ForwardModel(lens)
     for radius, left_in_right in systems:
-        points = environment('whole', radius).points
+        points = radius * directions
         for seen, pose in zip(views, (right.compose(_spread(left_in_right, right)), right),
                               strict=True):
             blank = views_of(points, np.zeros((len(right.position), len(points), 2)))
@@ -157,7 +171,7 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     ahead = np.array([0.0, 0.0, RIGHT_CAMERA_Z.get(lens.name, 0.0)])
     right = Pose(home.rotation, home.position + ahead)
     left_in_right = rig(style)
-    points = environment('whole', radius).points
+    points = landmarks_at('whole', radius)
     blank = views_of(points, np.zeros((1, len(points), 2)))
     model = ForwardModel(lens)
     uv_right = model.predict(right, blank).uv[0]

@@ -9,9 +9,15 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.evaluation.paper import Evaluation, evaluate, localize_environments, measure
+from fisheye_svp_ros.evaluation.paper import (
+    Evaluation,
+    evaluate,
+    landmarks_at,
+    localize_environments,
+    measure,
+)
 from fisheye_svp_ros.evaluation.paper_tables import STYLE_NAMES
-from fisheye_svp_ros.landmarks import RADII, SPREADS, environment
+from fisheye_svp_ros.landmarks import RADII, SPREADS
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.observations import views_of
 from fisheye_svp_ros.pose import Pose
@@ -59,7 +65,7 @@ def calibrated_shift(lens: Lens) -> Lens:
     right = Pose(np.tile(poses.rotation, (len(RADII), 1, 1)),
                  np.tile(poses.position, (len(RADII), 1)))
     points = np.repeat(
-        np.stack([environment('whole', radius).points for radius in RADII]),
+        np.stack([landmarks_at('whole', radius) for radius in RADII]),
         len(poses.position), axis=0,
     )
     exact = ForwardModel(lens).predict(right, views_of(points, np.zeros((*points.shape[:2], 2))))
@@ -91,8 +97,8 @@ def crossings(lens: Lens) -> list[Crossings]:
     """Return at which ranges the SVP errors of a lens drop under the noise."""
     found = []
     for spread in SPREADS:
-        directions = environment(spread, 1.0).points
-        localized = localize_environments(lens, _RANGES[:, None, None] * directions)
+        points = np.stack([landmarks_at(spread, radius) for radius in _RANGES.tolist()])
+        localized = localize_environments(lens, points)
         deviation = 1e3 * np.sqrt(localized.solved.covariance[:, 2, 2])  # mm for 1 px
         error = np.abs(localized.rows[:, 2])
         found.append(Crossings(lens.name, 'position', spread,

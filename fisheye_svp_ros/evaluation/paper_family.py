@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ from fisheye_svp_ros.evaluation.paper_search import (
     Recovered,
     lens_with,
 )
-from fisheye_svp_ros.evaluation.paper_tables import LENSES, agreeing
+from fisheye_svp_ros.evaluation.paper_tables import CALIBRATION, LENSES, agreeing
 from fisheye_svp_ros.files import read_yaml
 from fisheye_svp_ros.lens import Lens, lens_to_dict
 from fisheye_svp_ros.share import config_path
@@ -45,6 +45,21 @@ class Member(NamedTuple):
         return self.within_10 >= CELLS_NEEDED
 
 
+class Family(NamedTuple):
+    """members: all fits; low, high (2, 3, 3, 5): tables 3 and 4 over random sets of ten poses,
+    5 % and 95 % quantiles, in the paper's units.
+    """
+
+    members: tuple[Member, ...]
+    low: Array
+    high: Array
+
+    @property
+    def fits(self) -> list[Member]:
+        """The members that reproduce tables 1 and 2."""
+        return [one for one in self.members if one.fits]
+
+
 def best_of(found: Sequence[Recovered]) -> Recovered:
     """Return the solution of lowest cost; figures 9 and 10 have no say in it."""
     return min(found, key=lambda one: one.cost)
@@ -63,8 +78,20 @@ def layout_document(best: Recovered, starts: int) -> dict[str, Any]:
     return {'inner': rows[:INNER], 'outer': rows[INNER:], 'provenance': _provenance(best, starts)}
 
 
-def family_document(found: Sequence[Recovered]) -> dict[str, Any]:
-    """Return the YAML mapping that `load_family` reads."""
+def whole_directions(best: Recovered) -> Array:
+    """Return the unit directions (33, 3), world, of the layout as `layout_document` rounds it."""
+    incidence, azimuth = np.radians(np.degrees(best.layout).round(2)).T
+    return np.stack([np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth),
+                     -np.cos(incidence)], axis=-1)
+
+
+def family_document(
+    found: Sequence[Recovered], ranges: Mapping[str, tuple[Array, Array]]
+) -> dict[str, Any]:
+    """Return the YAML mapping that `load_family` reads.
+
+    ranges: by lens, `paper_poses.calibration_range` with the recovered lens and layout.
+    """
     return {
         'command': COMMAND,
         'members': [
@@ -83,10 +110,14 @@ def family_document(found: Sequence[Recovered]) -> dict[str, Any]:
             }
             for one in found
         ],
+        'calibration_range': {
+            lens: {'low': _numbers(low), 'high': _numbers(high)}
+            for lens, (low, high) in ranges.items()
+        },
     }
 
 
-def load_family(path: str | Path | None = None) -> list[Member]:
+def load_family(path: str | Path | None = None) -> Family:
     """Read the family, by default the one in config/.
 
     Raises ParameterError, naming the file, for one that `family_document` did not make.
@@ -94,16 +125,22 @@ def load_family(path: str | Path | None = None) -> list[Member]:
     path = config_path('paper_search.yaml') if path is None else Path(path)
     document = read_yaml(path, ParameterError)
     try:
-        return [
+        members = tuple(
             Member(
                 one['seed'], one['misfit'], one['cost'], one['within_10'], one['within_5'],
                 np.array([[one[lens][name] for name in NAMES] for lens in LENSES]),
                 np.radians(np.array([one['incidence_deg'], one['azimuth_deg']], dtype=float)).T,
             )
             for one in document['members']
-        ]
+        )
+        low, high = (
+            np.array([document['calibration_range'][lens][end] for lens in LENSES])
+            .reshape(CALIBRATION.shape)
+            for end in ('low', 'high')
+        )
     except (KeyError, TypeError, ValueError) as cause:
         raise ParameterError(f'{path}: not a family of fits; make one with: {COMMAND}') from cause
+    return Family(members, low, high)
 
 
 def shift_curves(members: Sequence[Member], lens: str, theta: Array) -> Array:
@@ -127,3 +164,7 @@ def _degrees(angles: Array) -> list[float]:
 
 def _rounded(numbers: Array) -> list[float]:
     return [round(float(numbers[0]), 2), *(round(float(value), 7) for value in numbers[1:])]
+
+
+def _numbers(table: Array) -> list[float]:
+    return [round(float(value), 5) for value in table.ravel()]
