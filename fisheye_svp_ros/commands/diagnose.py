@@ -89,7 +89,7 @@ def _print(
         print_table(
             f'{diagnosis.observations} points in {diagnosis.frames} frames, held-out rms '
             f'{diagnosis.base.heldout_rms_px:.4f} px without any cause',
-            text.CAUSE_HEADER, text.cause_rows(diagnosis),
+            text.CAUSE_HEADER, text.cause_rows(diagnosis), words=text.CAUSE_WORDS,
         )
     if folder:
         print(f'{folder}: report.html, diagnosis.json, {text.EXTENDED}, residuals.csv')

@@ -215,6 +215,7 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
 
 
 CAUSE_HEADER = ('cause', 'size', 'p', 'held-out rms px', 'gain', 'may as well be')
+CAUSE_WORDS = ('size', 'may as well be')
 
 
 def listed(names: Sequence[str], word: str = 'and') -> str:

@@ -7,18 +7,25 @@ import sys
 from collections.abc import Iterable, Sequence
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, JustifyMethod
 from rich.padding import Padding
 from rich.table import Table
 
 _WIDE = 200  # columns where no terminal says how many it has
 
 
-def print_table(title: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print a table: the first column flush left, the others, numbers, flush right."""
+def print_table(
+    title: str, header: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[str] = ()
+) -> None:
+    """Print a table: the first column flush left, the others, numbers, flush right.
+
+    words: further columns that hold text; it is broken into lines where the table is too wide.
+    """
     table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(header):
-        table.add_column(name, justify='right' if i else 'left', no_wrap=True)
+        text = name in words
+        justify: JustifyMethod = 'right' if i and not text else 'left'
+        table.add_column(name, justify=justify, no_wrap=not text)
     for row in rows:
         table.add_row(*row)
     out = console()
