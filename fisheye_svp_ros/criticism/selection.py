@@ -16,13 +16,15 @@ from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transf
 from fisheye_svp_ros.criticism.structure import Structure, remaining_structure
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 
 # False alarms: this much for all effects together, the same again for what is left.
 SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
-WITHDRAWN = 0.3
+# So many single landmarks are not single ones any more.
+MANY = 0.15
 MAX_STEPS = 20
 _GAPS = 4
 
@@ -179,11 +181,13 @@ def withdraw(
         linear = Linearised(data, selection.state, free)
         left = significant(remaining_structure(linear, Nuisance(linear), stated))
         misfit = float((linear.residual**2).sum())
-        unexplained = max((s.share for s in left if s.of_mean), default=0.0) * misfit
+        unexplained = max((s.weighty * s.share for s in left), default=0.0) * misfit
         weak = [
             name for name, candidate in selection.evidence.items()
-            if candidate.score.statistic < WITHDRAWN * unexplained
+            if candidate.score.statistic < unexplained
         ]
+        if left and not weak and _many_landmarks(selection.state, data):
+            weak = ['landmark_survey']
         if not weak:
             return selection, left
         name = min(weak, key=lambda n: selection.evidence[n].score.statistic)
@@ -191,6 +195,16 @@ def withdraw(
         selection.evidence.pop(name)
         selection.trace.append(_gone(name, 'explains little beside what stays unexplained'))
         selection = replace(selection, state=state)
+
+
+def _many_landmarks(state: State, data: Data) -> bool:
+    """Whether single landmarks were added until they stand for something else."""
+    known = len(np.unique(data.views.landmark[data.views.used]))
+    return any(
+        isinstance(effect, LandmarkSurveyEffect)
+        and not effect.everywhere and len(effect.landmarks) > max(3, MANY * known)
+        for effect, _ in state.terms
+    )
 
 
 def significant(found: Sequence[Structure]) -> list[Structure]:
