@@ -16,6 +16,7 @@ from typing import NoReturn
 from fisheye_svp_ros.errors import FisheyeSvpError
 
 COMMANDS = {
+    'budget': 'at which range and angle the SVP error passes what the application allows',
     'calibrate': 'a lens from measured observations: poses unknown, no start values',
     'demo': 'the whole node graph as processes, recorded, summarised and plotted',
     'diagnose': 'what a simulation gets wrong about measured observations, and why',

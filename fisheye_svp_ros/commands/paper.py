@@ -4,23 +4,71 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.evaluation.paper_results import Results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=Path, default=Path('out/paper'), metavar='DIR',
-                        help='folder for paper.json, the reports and the pictures '
-                        '(default: %(default)s)')
+    parser.add_argument('-o', '--output', type=Path, default=Path('paper'), metavar='DIR',
+                        help='folder for paper.json, paper.md, paper.html and the pictures; '
+                        'default: paper')
     parser.add_argument('--search', action='store_true',
-                        help='instead, solve for the lens curves and the layout that the paper '
+                        help='solve instead for the lens curves and the layout that the paper '
                         'does not print, and write them to DIR/lenses, DIR/environments and '
-                        'DIR/paper_search.yaml; some minutes')
+                        'DIR/paper_search.yaml (some minutes)')
 
 
 def run(args: argparse.Namespace) -> None:
     """Evaluate and report, or search."""
     if args.search:
         _search(args.output)
+    else:
+        _report(args.output)
+
+
+def _report(folder: Path) -> None:
+    import os
+
+    from fisheye_svp_ros.commands.executors import local
+    from fisheye_svp_ros.evaluation.paper_results import compute, tasks
+    from fisheye_svp_ros.reporting.paper_report import write_report
+    from fisheye_svp_ros.reporting.progress import progress
+
+    with local(os.cpu_count() or 1) as workers:
+        with progress('evaluating', tasks()) as step:
+            results = compute(workers.executor, step)
+        with progress('drawing'):
+            written = write_report(results, folder, workers.executor)
+    _print(results)
+    for path in written:
+        print(f'  {path}')
+
+
+def _print(results: Results) -> None:
+    import numpy as np
+
+    from fisheye_svp_ros.evaluation.paper_claims import FAILS, HOLDS, IN_PART
+    from fisheye_svp_ros.evaluation.paper_tables import LENSES, agreeing
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    tables = np.stack([results.svp[name].localization for name in LENSES])
+    print_table(
+        f'Tables 1 and 2: {agreeing(tables, 0.10)} of 36 z and residual cells within 10 % of the '
+        f'published ones, {agreeing(tables, 0.05)} within 5 %',
+        ('cell', 'published', 'ours', 'unit', 'difference %'),
+        [
+            (f'{cell.lens} {cell.radius} m {cell.row} {cell.quantity}', f'{cell.published:.4f}',
+             f'{cell.ours:.4f}', cell.unit, f'{100 * cell.relative:+.1f}')
+            for cell in results.cells()
+            if cell.table < 3 and cell.quantity in ('z', 'residual')
+        ],
+    )
+    verdicts = [claim.verdict for claim in results.claims]
+    print(f'  {len(verdicts)} statements of the text: {verdicts.count(HOLDS)} hold, '
+          f'{verdicts.count(IN_PART)} hold in part, {verdicts.count(FAILS)} do not')
 
 
 def _search(folder: Path) -> None:

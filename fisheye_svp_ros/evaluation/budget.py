@@ -113,13 +113,15 @@ def at_point(
     limits: by quantity, in SI and px; None: what noise alone causes there.
     Raises ParameterError for a spread or range outside the budget and for an impossible limit.
     """
-    _check(spread, budget.spreads, 'spread', 'rad')
+    _check(np.degrees(spread), np.degrees(budget.spreads), 'spread', 'degrees')
     _check(working_range, budget.ranges, 'range', 'm')
     found = []
     for quantity in QUANTITIES:
         limit = limits.get(quantity)
         if limit is not None and not (np.isfinite(limit) and limit > 0):
-            raise ParameterError(f'limit of {quantity} is {limit}; it must be above 0')
+            raise ParameterError(
+                f'limit of {quantity} is {limit:.4g} {UNITS[quantity]}; it must be above 0'
+            )
         error, noise = budget.error[quantity], budget.noise[quantity]
         allowed = noise if limit is None else np.full_like(noise, limit)
         # The excess in log is linear where both follow powers of the range.

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.evaluation.paper import Evaluation, Localized
+from fisheye_svp_ros.evaluation.paper import Evaluation, Localized, shift_at
 from fisheye_svp_ros.evaluation.paper_family import Family, shift_curves
 from fisheye_svp_ros.evaluation.paper_tables import LENSES, STYLE_NAMES
 from fisheye_svp_ros.landmarks import RADII, SPREADS, environment
@@ -35,10 +35,8 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
             theta = np.linspace(0, lens.max_incidence, 200)
             curves = 1e3 * shift_curves(family.fits, name, theta)
             axis.plot(np.degrees(theta), curves.T, color=COLOURS[name], alpha=0.18, linewidth=0.8)
-            if lens.viewpoint_shift is not None:
-                shift, _ = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))
-                axis.plot(np.degrees(theta), 1e3 * shift, color=COLOURS[name], linewidth=2,
-                          label=f'{NAMES[name]} (light: all {len(family.fits)} fits)')
+            axis.plot(np.degrees(theta), 1e3 * shift_at(lens, theta), color=COLOURS[name],
+                      linewidth=2, label=f'{NAMES[name]} (light: all {len(family.fits)} fits)')
         axis.axvline(88, color=FAINT, linestyle=':')
         axis.annotate('outermost landmarks', (88, axis.get_ylim()[1]), ha='right', va='top',
                       rotation=90, color=INK, fontsize=8)

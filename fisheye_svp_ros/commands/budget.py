@@ -1,0 +1,85 @@
+"""`fisheye-svp budget`: at which range and angle the SVP error passes what the user allows."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+# Limits by quantity: option, unit, factor from the unit to SI.
+_LIMITS = {
+    'position': ('--max-position', 'MM', 1e-3, 'position error of a localized camera'),
+    'axis': ('--max-axis', 'DEG', 3.141592653589793 / 180, 'error of its viewing axis'),
+    'residual': ('--max-residual', 'PX', 1.0, 'mean residual of localization'),
+    'epipolar': ('--max-epipolar', 'PX', 1.0, 'mean distance from the epipolar curve'),
+    'depth': ('--max-depth', 'MM', 1e-3, 'mean error of stereo points'),
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('--lens', required=True, metavar='LENS',
+                        help='a lens file with a viewpoint_shift, or the name of one that comes '
+                        'with the package')
+    parser.add_argument('--range', type=float, default=0.5, metavar='M', dest='working_range',
+                        help='nearest range of the landmarks or targets; default: 0.5')
+    parser.add_argument('--spread', type=float, metavar='DEG',
+                        help='largest angle of the landmarks from the axis; default: all of the '
+                        'field of view but 1 degree')
+    parser.add_argument('--noise', type=float, default=0.3, metavar='PX',
+                        help='noise of u and of v; default: 0.3')
+    parser.add_argument('--baseline', type=float, default=0.15, metavar='M',
+                        help='of the stereo rig; default: 0.15')
+    parser.add_argument('--style', default='parallel', metavar='STYLE',
+                        help='of the rig: parallel, vergent or divergent; default: parallel')
+    for option, unit, _, what in _LIMITS.values():
+        parser.add_argument(option, type=float, metavar=unit,
+                            help=f'{what} that is allowed; where none is stated, all are held '
+                            'against what noise alone causes')
+    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+                        help='folder for budget.json and budget.png')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Tabulate, answer, draw."""
+    import numpy as np
+
+    from fisheye_svp_ros.evaluation.budget import Setup, at_point, make_budget, widest_spread
+    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.reporting.budget_report import (
+        HEADER,
+        Asked,
+        answer,
+        document,
+        draw,
+        rows,
+    )
+    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.reporting.results import write_json
+    from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.rig import rig
+    from fisheye_svp_ros.share import lens_path
+
+    lens = load_lens(lens_path(args.lens))
+    spread = widest_spread(lens) if args.spread is None else np.radians(args.spread).item()
+    limits = _limits(args)
+    with progress('solving'):
+        budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))
+    points = at_point(budget, spread, args.working_range, limits)
+    given = frozenset(name for name, value in limits.items() if value is not None)
+    asked = Asked(lens.name, spread, args.working_range, given)
+    print_table(
+        f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '
+        f'{args.working_range:g} m, {args.noise:g} px of noise', HEADER, rows(points, asked),
+    )
+    print(f'  {answer(points, asked)}')
+    if args.output:
+        draw(args.output / 'budget.png', budget, points, asked)
+        write_json(args.output / 'budget.json', document(budget, points, asked))
+
+
+def _limits(args: argparse.Namespace) -> dict[str, float | None]:
+    limits: dict[str, float | None] = {}
+    for name, (option, _, factor, _) in _LIMITS.items():
+        value = getattr(args, option.removeprefix('--').replace('-', '_'))
+        limits[name] = None if value is None else factor * value
+    return limits

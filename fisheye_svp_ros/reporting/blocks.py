@@ -1,0 +1,71 @@
+"""Reports as a list of blocks, rendered as Markdown and as one self-contained HTML page."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jinja2
+
+from fisheye_svp_ros.files import write_text
+
+
+class Heading(NamedTuple):
+    """A heading; level 1 is the title of the report."""
+
+    text: str
+    level: int = 2
+    kind: str = 'heading'
+
+
+class Text(NamedTuple):
+    """A paragraph."""
+
+    text: str
+    kind: str = 'text'
+
+
+class Table(NamedTuple):
+    """A table; the first `names` columns hold names, the others numbers."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    names: int = 1
+    kind: str = 'table'
+
+
+class Picture(NamedTuple):
+    """A picture file in the report's folder."""
+
+    file: str
+    caption: str
+    kind: str = 'picture'
+
+
+Block = Heading | Text | Table | Picture
+
+
+def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]:
+    """Write NAME.md and NAME.html into a folder that holds the pictures; return both.
+
+    Raises OutputError where one cannot be written.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'),
+        autoescape=jinja2.select_autoescape(['html']),
+        undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+    )
+    pictures = {
+        block.file: base64.b64encode((folder / block.file).read_bytes()).decode('ascii')
+        for block in blocks if isinstance(block, Picture)
+    }
+    written = []
+    for suffix in ('md', 'html'):
+        page = environment.get_template(f'blocks.{suffix}').render(
+            blocks=blocks, title=blocks[0], pictures=pictures
+        )
+        write_text(folder / f'{name}.{suffix}', page)
+        written.append(folder / f'{name}.{suffix}')
+    return written

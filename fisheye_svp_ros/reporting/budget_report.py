@@ -1,0 +1,142 @@
+"""The budget of the SVP error, for people: a table, an answer, a picture; and budget.json."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.colors import LogNorm
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.evaluation.budget import QUANTITIES, UNITS, Budget, Point
+from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
+
+HEADER = ('error', 'SVP causes', 'noise causes', 'limit', 'unit', 'kept', 'SVP keeps it from',
+          'and up to')
+_PEOPLE = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
+_WORDS = {
+    'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
+    'epipolar': 'epipolar distance', 'depth': 'stereo points',
+}
+
+
+class Asked(NamedTuple):
+    """What the user asked for: lens; spread, rad; working range, m; quantities with a limit.
+
+    Where the user states no limit at all, what noise causes is the limit of every quantity.
+    """
+
+    lens: str
+    spread: float
+    working_range: float
+    given: frozenset[str]
+
+    def judged(self, points: Sequence[Point]) -> list[Point]:
+        """Return the points that the answer rests on."""
+        return [point for point in points if not self.given or point.quantity in self.given]
+
+
+def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
+    """Return the table's rows, under HEADER."""
+    found = []
+    for point in asked.judged(points):
+        unit, factor = _PEOPLE[UNITS[point.quantity]]
+        found.append((
+            _WORDS[point.quantity],
+            *(f'{factor * value:.3g}' for value in (point.error, point.noise, point.limit)),
+            unit, 'yes' if point.kept else 'no',
+            f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
+            f'{np.degrees(point.largest_spread):.0f} deg'
+            if np.isfinite(point.largest_spread) else 'nowhere',
+        ))
+    return found
+
+
+def answer(points: Sequence[Point], asked: Asked) -> str:
+    """Answer: may the viewpoint shift be neglected?"""
+    where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
+             f'{asked.working_range:g} m')
+    judged = asked.judged(points)
+    broken = [point for point in judged if not point.kept]
+    if not broken:
+        return f'Yes: {where} SVP keeps every limit.'
+    worst = max(broken, key=lambda point: point.error / point.limit)
+    unit, factor = _PEOPLE[UNITS[worst.quantity]]
+    limit = 'what you allow' if asked.given else 'what noise causes'
+    needed = max(point.nearest_range for point in broken)
+    remedy = (f'it may be neglected from {needed:.2f} m on' if np.isfinite(needed)
+              else 'no range within the budget helps')
+    return (
+        f'No: {where} SVP breaks {len(broken)} of {len(judged)} limits, worst the '
+        f'{_WORDS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
+        f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}.'
+    )
+
+
+def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str, Any]:
+    """Return the mapping of budget.json, SI and px."""
+    return {
+        'lens': asked.lens,
+        'spread_rad': asked.spread,
+        'range_m': asked.working_range,
+        'negligible': all(point.kept for point in asked.judged(points)),
+        'answer': answer(points, asked),
+        'at_point': [
+            {**point._asdict(), 'unit': UNITS[point.quantity],
+             'limit_is': 'given' if point.quantity in asked.given else 'noise'}
+            for point in points
+        ],
+        'spreads_rad': budget.spreads.tolist(),
+        'ranges_m': budget.ranges.tolist(),
+        'error': {name: budget.error[name].tolist() for name in QUANTITIES},
+        'noise': {name: budget.noise[name].tolist() for name in QUANTITIES},
+    }
+
+
+def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> None:
+    """Draw SVP errors over range and spread, with the line on which each limit is met."""
+    with picture(path, 12.5, 6.4) as figure:
+        axes = figure.subplots(2, 3)
+        for axis, point in zip(axes.flat, points, strict=False):
+            unit, factor = _PEOPLE[UNITS[point.quantity]]
+            error = np.ma.masked_invalid(factor * budget.error[point.quantity])
+            mesh = axis.pcolormesh(
+                budget.ranges, np.degrees(budget.spreads), error, shading='nearest',
+                norm=LogNorm(), cmap='Blues',
+            )
+            figure.colorbar(mesh, ax=axis, label=unit)
+            _draw_limit(axis, budget, point, point.quantity in asked.given)
+            axis.plot(asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED,
+                      markersize=11)
+            kept = 'kept' if point.kept else 'broken'
+            axis.set_title(f'{_WORDS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
+                           f'{kept}', fontsize=9.5)
+            axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
+            axis.xaxis.set_major_formatter('{x:g}')
+            axis.grid(visible=False)
+        _explain(axes.flat[len(points)])
+
+
+def _draw_limit(axis: Any, budget: Budget, point: Point, given: bool) -> None:
+    allowed: Array | float = point.limit if given else budget.noise[point.quantity]
+    with np.errstate(divide='ignore', invalid='ignore'):
+        excess = np.log(budget.error[point.quantity] / allowed)
+    # Beyond where nothing can be solved a limit is not kept either.
+    excess = np.where(np.isnan(excess), 1.0, np.maximum(excess, -50.0))
+    place = (budget.ranges, np.degrees(budget.spreads))
+    axis.contourf(*place, excess, levels=[0, np.inf], colors='none', hatches=['////'])
+    axis.contour(*place, excess, levels=[0], colors=OURS, linewidths=1.8)
+
+
+def _explain(axis: Any) -> None:
+    axis.axis('off')
+    axis.text(
+        0.02, 0.95,
+        'Colour: what SVP causes.\nHatched: more than the limit; SVP will not do.\n'
+        'Line: the limit is just met.\nStar: where you work.\n'
+        'Limits that you do not state are what noise causes.\n\n'
+        'Spread: largest incidence angle of the\nlandmarks, which fill a cap about the axis.',
+        va='top', transform=axis.transAxes, linespacing=1.5,
+    )
