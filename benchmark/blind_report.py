@@ -31,7 +31,8 @@ from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 _GOALS = {1.0: 0.98, 0.5: 0.95, 0.2: 0.85}
 _HEAD = """# Blind tests
 
-Made by `make blind` (everything), or by the command above each table. Each trial draws a scene:
+`make blind` runs 200 trials a mode (and a size, for one effect); how many were run for the tables
+below stands in the command above each, which makes the same trials again. Each trial draws a scene:
 mono or stereo, boards or a cloud of landmarks, 30 frames, about 3000 numbers, four noise levels,
 fish180, fish214 or a random Kannala-Brandt lens, intrinsics fixed or free. It hides something in
 it and hands nothing but table and lens to `diagnose`. What is hidden is simulated by what causes

@@ -24,9 +24,9 @@ from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
 # A sound build misses a threshold less than once in this many runs.
 RUNS = 10_000
-# Rates that a sound build keeps, from docs/blind.md: the lower ends of the intervals at 0.5 times
-# the noise and of clean data.  Then hits follow a binomial distribution at least this good.
-NAMED, ADEQUATE = 0.93, 0.93
+# Rates that a sound build keeps: the lower ends (95 %) of what docs/blind.md has measured, 48 of
+# 48 at sizes from 0.2 times the noise, 93 of 95 for clean data.  Successes are then binomial.
+NAMED, ADEQUATE = 0.92, 0.92
 FIXED = tuple(
     Task('one', 0.5, (name,), 2024, 0) for name in (
         'viewpoint_shift', 'radial_profile', 'sensor_tilt', 'focal_drift', 'board_pose',
