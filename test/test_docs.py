@@ -18,7 +18,7 @@ from conftest import ROOT
 from fisheye_svp_ros import standalone
 from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS
 
-PAGES = ('sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md')
+PAGES = ('sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md', 'whats_wrong.md')
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```bash\n(.*?)```', re.DOTALL)
 BLOCKS = [
     pytest.param(block, id=f'{page} {number}')
