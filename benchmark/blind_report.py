@@ -32,7 +32,7 @@ _GOALS = {1.0: 0.98, 0.5: 0.95, 0.2: 0.85}
 _HEAD = """# Blind tests
 
 `make blind` runs 200 trials a mode (and a size, for one effect); how many were run for the tables
-below stands in the command above each, which makes the same trials again. Each trial draws a scene:
+below stands in the command above each, which runs the same ones again. Each trial draws a scene:
 mono or stereo, boards or a cloud of landmarks, 30 frames, about 3000 numbers, four noise levels,
 fish180, fish214 or a random Kannala-Brandt lens, intrinsics fixed or free. It hides something in
 it and hands nothing but table and lens to `diagnose`. What is hidden is simulated by what causes
@@ -210,6 +210,7 @@ def _draw_power(outcomes: Sequence[Outcome], path: Path) -> None:
         axis.errorbar(steps, [r.value for r in named], reach, color=OURS, marker='o', capsize=3,
                       label='diagnosis: the class named holds the effect')
         axis.plot(steps, [r.value for r in oracle], color=PUBLISHED, marker='s', fillstyle='none',
+                  markersize=10, linestyle='--', zorder=3,
                   label='oracle: told which effect to look for')
         axis.plot(list(_GOALS), list(_GOALS.values()), '_', color='#404850', markersize=14,
                   label='goal')
