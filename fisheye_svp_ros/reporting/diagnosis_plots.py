@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy import stats
 
@@ -138,7 +139,7 @@ def _grid(
             if log:
                 axis.set_xscale('log')
                 axis.xaxis.set_major_formatter('{x:g}')
-        _legend(axes[0, 1], 1.1)
+        _legend(figure, axes[0, 1])
 
 
 def _binned(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
@@ -164,9 +165,11 @@ def _binned(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
     return float((np.abs(mean) + error).max())
 
 
-def _legend(axis: Axes, height: float) -> None:
-    """Put the legend above an axis."""
-    axis.legend(loc='lower right', bbox_to_anchor=(1.0, height), ncols=3, fontsize=8)
+def _legend(figure: Figure, axis: Axes) -> None:
+    """Put the legend of an axis above all of them, where a blank title keeps a place for it."""
+    figure.suptitle(' ')
+    handles, labels = axis.get_legend_handles_labels()
+    figure.legend(handles, labels, loc='upper right', ncols=len(labels), fontsize=8)
 
 
 def _by_group(path: Path, shown: Shown, group: Index, x: Array | None, label: str) -> None:
@@ -186,7 +189,7 @@ def _by_group(path: Path, shown: Shown, group: Index, x: Array | None, label: st
             axis.plot(place[order], rms[order], 'o' if len(names) > 60 else 'o-', ms=3.5, lw=1,
                       color=colour, label=side)
         axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
-        _legend(axis, 1.0)
+        _legend(figure, axis)
 
 
 def _image_frame(axis: Axes, lens: Lens) -> None:
