@@ -10,8 +10,9 @@ from targets import plane, poses_around
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.criticism.diagnosis import diagnose
-from fisheye_svp_ros.criticism.known_truth import known_errors
+from fisheye_svp_ros.criticism.known_truth import Compared, known_errors
 from fisheye_svp_ros.criticism.model import Linearised
+from fisheye_svp_ros.criticism.points import point_residuals
 from fisheye_svp_ros.criticism.structure import Structure
 from fisheye_svp_ros.curves import KannalaBrandt
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -21,6 +22,7 @@ from fisheye_svp_ros.lens import Lens, load_lens, save_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.readers import write_observations, write_poses
 from fisheye_svp_ros.readers.table import Table
+from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, verdict_sentences
 from fisheye_svp_ros.reporting.target_map import board_maps
 from fisheye_svp_ros.simulation import simulate, simulate_stereo
@@ -211,6 +213,14 @@ class TestWords:
         assert 'no extension improved on it' in gained
         assert following.startswith('Look for the reason')
 
+    def test_errors_against_the_truth_go_or_stay(self, found):
+        _, gained, _ = verdict_sentences(found, {
+            'position_error_m': Compared(0.002, 0.001, 0.5, 0.3, 0.6),
+            'depth_error_m': Compared(0.0021, 0.002, 0.05, -0.1, 0.2),
+        })
+        assert 'the position error goes from 2 mm to 1 mm' in gained
+        assert 'the stereo error stays at 2 mm' in gained
+
     def test_many_causes_are_counted(self, found):
         wrong, *_ = verdict_sentences(replace(found, causes=5 * found.causes))
         assert wrong.count('viewpoint_shift') == 3
@@ -223,6 +233,15 @@ class TestWords:
             'nothing': {'value': 0.0, 'stderr': float('nan'), 'unit': '1'}})
         row, = cause_rows(replace(found, causes=[cause]))
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
+
+
+def test_a_single_frame_is_drawn(tmp_path):
+    table, _ = seen({})
+    found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
+    points = point_residuals(found.before, found.after)
+    for name, draw, arguments in residual_pictures(Shown.of(found, points)):
+        draw(tmp_path / f'{name}.png', *arguments)
+    assert len(list(tmp_path.glob('*.png'))) == 7
 
 
 def test_the_bow_of_a_board_is_measured_between_its_extremes():

@@ -222,7 +222,7 @@ def _arrows(
 
 
 def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
-    """Return places and means of the cells that hold three points or more."""
+    """Return places and means of the cells that hold three points or more (or the most)."""
     _, label, count = np.unique(
         np.floor(uv / cell), axis=0, return_inverse=True, return_counts=True
     )
@@ -230,7 +230,7 @@ def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
         np.bincount(label.reshape(-1), weights=column) / count
         for column in (*uv.T, *residual.T)
     ]
-    table = np.stack(means, axis=-1)[count >= 3]
+    table = np.stack(means, axis=-1)[count >= min(3, count.max())]
     return table[:, :2], table[:, 2:]
 
 

@@ -166,8 +166,12 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
     text = (f'Corrected, held-out data are predicted to {after:.3g} px rms instead of '
             f'{before:.3g}, which takes away {percent(d.gain.value)} (95 % interval '
             f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
-    for label, base, extended, _ in known_rows(known):
-        text += f'; the {label} goes from {base} to {extended}'
+    for (label, base, extended, _), compared in zip(
+        known_rows(known), known.values(), strict=True
+    ):
+        changed = compared.low > 0 or compared.high < 0
+        text += f'; the {label} ' + (f'goes from {base} to' if changed else 'stays at') + (
+            f' {extended}')
     return text + '.'
 
 
