@@ -15,11 +15,14 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+# Asked before any test installs the standalone client, which answers to the name of rclpy.
+GENUINE = find_spec('rclpy') is not None
 ROOT = Path(__file__).resolve().parent.parent
 TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is
 

@@ -105,9 +105,9 @@ def test_a_right_lens_is_adequate_and_another_scenario_starts_anew(
     results = g.hear(DiagnosticArray, 'model_critic/result')
     critic = g.start(ModelCritic)
     camera = g.start(SyntheticCamera)
-    g.until(lambda: results)
-    assert numbers(results[0])['verdict'] == 'adequate'
-    assert results[0].status[0].level == results[0].status[0].OK
+    # One look in a hundred finds something in clean data; the next one has other noise.
+    g.until(lambda: results and numbers(results[-1])['verdict'] == 'adequate')
+    assert results[-1].status[0].level == results[-1].status[0].OK
     assert set_parameter(camera, 'lens', f'{scene}/hidden.yaml').successful
     g.until(lambda: numbers(results[-1])['verdict'] in EXPLAINED)
     assert set_parameter(critic, 'min_frames', 300).successful is False

@@ -5,16 +5,15 @@ from __future__ import annotations
 import shutil
 import subprocess
 from collections.abc import Callable
-from importlib.util import find_spec
 
 import pytest
-from conftest import TIMEOUT, NodeProcess
+from conftest import GENUINE, TIMEOUT, NodeProcess
 from test_standalone_topics import RECEIVE_CLOUD, SEND_CLOUD
 
 pytest.importorskip('cyclonedds')
 pytest.importorskip('rosbags')
 pytestmark = pytest.mark.skipif(
-    find_spec('rclpy') is None or shutil.which('ros2') is None,
+    not GENUINE or shutil.which('ros2') is None,
     reason='ROS 2 is not installed here',
 )
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Callable
-from importlib.util import find_spec
 
 import pytest
-from conftest import NodeProcess
+from conftest import GENUINE, NodeProcess
 
 pytest.importorskip('cyclonedds')
 pytest.importorskip('rosbags')
@@ -188,7 +187,7 @@ except ModuleNotFoundError as error:
         assert name in line
 
 
-@pytest.mark.skipif(find_spec('rclpy') is None, reason='ROS 2 is not installed here')
+@pytest.mark.skipif(not GENUINE, reason='ROS 2 is not installed here')
 def test_nothing_is_installed_where_ros_is(run_node: Callable[..., NodeProcess]) -> None:
     code = """
 from fisheye_svp_ros import standalone
