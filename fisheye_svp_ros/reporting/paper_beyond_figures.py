@@ -12,7 +12,7 @@ from fisheye_svp_ros.evaluation.paper import Evaluation
 from fisheye_svp_ros.evaluation.paper_beyond import NOISES, Crossings
 from fisheye_svp_ros.evaluation.paper_tables import LENSES
 from fisheye_svp_ros.reporting.paper_figures import COLOURS, INK, NAMES
-from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.plots import legend_below, picture
 
 _ZERO = 1e-6  # below it an error is nought but rounding
 _LINES = ('-', '--', ':')
@@ -43,7 +43,7 @@ def draw_solvers(path: Path, found: Mapping[str, Mapping[str, Evaluation]]) -> N
             axis.annotate('none', (low, place[exact]), xytext=(4, 0), va='center', color=INK,
                           textcoords='offset points', fontsize=8)
         axes[0].set_yticks(place, list(found))
-        figure.legend(*axes[0].get_legend_handles_labels(), loc='outside lower center', ncols=2)
+        legend_below(figure, axes[0])
 
 
 def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:

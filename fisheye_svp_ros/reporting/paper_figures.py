@@ -16,7 +16,7 @@ from fisheye_svp_ros.evaluation.paper_tables import LENSES, STYLE_NAMES
 from fisheye_svp_ros.landmarks import RADII, SPREADS, environment
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.rig import calibration_poses, rig
 
 COLOURS = {'fish180': OURS, 'fish214': PUBLISHED}
@@ -118,7 +118,7 @@ def draw_calibration_poses(path: Path) -> None:
                           markersize=4, label=f'{name} camera and its viewing axis')
             axis.set(xlabel=x_name, ylabel=y_name)
             axis.set_aspect('equal')
-        figure.legend(*axis.get_legend_handles_labels(), loc='outside lower center', ncols=2)
+        legend_below(figure, axis)
 
 
 def fixed_grid(figure: Figure, rows: int, columns: int) -> Array:

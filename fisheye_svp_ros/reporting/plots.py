@@ -34,6 +34,7 @@ _STYLE: Any = {
     'xtick.color': '#404850',
     'ytick.color': '#404850',
 }
+_LEGEND_COLUMNS = 4
 _TITLES = {
     'localization': 'Localization: error along the axis',
     'calibration': 'Stereo calibration: error of the left camera',
@@ -52,6 +53,23 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
             figure.savefig(temporary, dpi=150)
 
 
+def legend_below(figure: Figure, *axes: Any) -> None:
+    """Put what axes have to explain below them, each label once.
+
+    Matplotlib before 3.7 has no legend outside the axes in a constrained layout.
+    """
+    entries = {
+        label: handle for axis in axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    columns = min(len(entries), _LEGEND_COLUMNS)
+    lines = -(-len(entries) // columns)
+    height = (0.1 + 0.2 * lines) / figure.get_figheight()
+    layout: Any = figure.get_layout_engine()
+    layout.set(rect=(0.0, height, 1.0, 1.0 - height))
+    figure.legend(list(entries.values()), list(entries), loc='lower center', ncols=columns)
+
+
 def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
     """Draw the errors of the demo beside the published ones: a column a task, a row a lens."""
     lenses = list(dict.fromkeys(row.lens for row in rows))
@@ -64,11 +82,7 @@ def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
                 axis.set_title(f'{title}\n{lens}' if lens == lenses[0] else lens, loc='left')
                 if lens == lenses[-1]:
                     axis.set_xlabel('mm')
-        entries = {
-            label: handle for axis in axes[0]
-            for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-        }
-        figure.legend(entries.values(), entries, loc='outside lower center', ncols=len(entries))
+        legend_below(figure, *axes[0])
 
 
 def _draw_errors(axis: Any, rows: Sequence[Shown]) -> None:

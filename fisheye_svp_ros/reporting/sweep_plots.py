@@ -19,7 +19,7 @@ from fisheye_svp_ros.evaluation.dependence import (
     noise_spreads,
     swept_parameters,
 )
-from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.reporting.runs_plot import draw_runs
 
 _COLOURS = 'viridis'
@@ -104,8 +104,7 @@ def _draw_curves(
         for axis in axes[len(shown):]:
             axis.remove()
         if by:
-            handles = axes[0].get_legend_handles_labels()
-            figure.legend(*handles, loc='outside right upper', fontsize=7)
+            legend_below(figure, axes[0])
         what = f'median over all {", ".join(merged)}' if merged else 'median; band: 5 to 95 %'
         figure.suptitle(what, x=0.01, ha='left', fontsize=8)
 
@@ -162,7 +161,7 @@ def _draw_spreads(table: Table, by: str | None, path: Path) -> None:
             axis.set(xlabel='rms residual / noise', yticks=[], xlim=(0.0, edges[-1]))
         for axis in axes[len(spreads):]:
             axis.remove()
-        figure.legend(*axes[0].get_legend_handles_labels(), loc='outside lower center', ncols=2)
+        legend_below(figure, axes[0])
 
 
 def draw_residuals(clouds: Sequence[Points], path: Path) -> None:
