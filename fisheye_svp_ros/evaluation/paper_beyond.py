@@ -16,12 +16,12 @@ from fisheye_svp_ros.evaluation.paper import (
     localize_environments,
     measure,
 )
+from fisheye_svp_ros.evaluation.paper_poses import pose_sets
 from fisheye_svp_ros.evaluation.paper_tables import STYLE_NAMES
 from fisheye_svp_ros.landmarks import RADII, SPREADS
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.observations import views_of
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.rig import calibration_poses
 from fisheye_svp_ros.solve.lens_adjustment import adjust
 from fisheye_svp_ros.solve.localization import localize
 
@@ -58,15 +58,14 @@ def scaled_shift(lens: Lens, factor: float) -> Lens:
 def calibrated_shift(lens: Lens) -> Lens:
     """Return the lens as a calibration from 30 noisy views gives it, with `_FREE` to be found.
 
-    Ten poses among Whole at each radius, 0.2 px of noise, fixed seed.  s0 is kept: with free poses
-    it cannot be told from where the camera's origin is said to be.
+    Ten random poses among Whole at each radius, 0.2 px of noise, fixed seed.  s0 is kept: with
+    free poses it cannot be told from where the camera's origin is said to be.
     """
-    poses = calibration_poses()
-    right = Pose(np.tile(poses.rotation, (len(RADII), 1, 1)),
-                 np.tile(poses.position, (len(RADII), 1)))
+    poses = pose_sets(len(RADII))
+    right = Pose(*(np.concatenate(parts) for parts in zip(*poses, strict=True)))
     points = np.repeat(
         np.stack([landmarks_at('whole', radius) for radius in RADII]),
-        len(poses.position), axis=0,
+        len(poses[0].position), axis=0,
     )
     exact = ForwardModel(lens).predict(right, views_of(points, np.zeros((*points.shape[:2], 2))))
     noise = CALIBRATION_NOISE * np.random.default_rng(0).standard_normal(exact.uv.shape)

@@ -195,8 +195,9 @@ def _solvers(results: Results) -> Iterator[Block]:
     yield Text(
         'The same image points, solved with the ShiftVP lens, with a shift that is 10 % or 30 % '
         'off, and with a shift that was calibrated (with f and the principal point) from 30 views '
-        f'of Whole with {CALIBRATION_NOISE} px of noise. What a shift is off by, the errors '
-        'keep of those of SVP. All cells are in paper.json.'
+        f'of Whole with {CALIBRATION_NOISE} px of noise, one draw. What a shift is off by, the '
+        'errors keep of those of SVP. What a calibration leaves in z grows with the range: it '
+        'comes from f. All cells are in paper.json.'
     )
     rows = []
     for variant, found in results.found.items():
