@@ -1,4 +1,4 @@
-"""The layout of sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
+"""Stamps, and sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
 
 Messages come as rclpy, the standalone client or a bag reader made them: only attributes count.
 """
@@ -24,6 +24,12 @@ RESIDUALS = np.dtype([
 # sensor_msgs/PointField: datatype numbers.
 DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _KINDS = {'u': ('iu', 'a whole number'), 'f': ('f', 'a floating-point number')}
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp of a message with a header, ns."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def structured(layout: np.dtype[np.void], landmark: Index, *columns: Array) -> Points:

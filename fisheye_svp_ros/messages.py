@@ -75,12 +75,6 @@ def header(stamp: int, frame: str = '') -> Any:
     return Header(stamp=time_message(stamp), frame_id=frame)
 
 
-def stamp_of(message: Any) -> int:
-    """Return the stamp of a message with a header, ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * _NS + int(stamp.nanosec)
-
-
 def cloud_message(points: Points, stamp: int, frame: str) -> Any:
     """Return sensor_msgs/PointCloud2 of a structured array (N,)."""
     fields = []

@@ -18,7 +18,7 @@ standalone.install()
 from sensor_msgs.msg import PointCloud2, PointField  # noqa: E402
 
 from fisheye_svp_ros import messages  # noqa: E402
-from fisheye_svp_ros.clouds import RESIDUALS, structured, unpack  # noqa: E402
+from fisheye_svp_ros.clouds import RESIDUALS, stamp_of, structured, unpack  # noqa: E402
 from fisheye_svp_ros.errors import ObservationError  # noqa: E402
 from fisheye_svp_ros.landmarks import environment  # noqa: E402
 from fisheye_svp_ros.lens import load_lens  # noqa: E402
@@ -44,7 +44,7 @@ def test_image_points_survive_bit_by_bit() -> None:
     back = messages.read_image_points(message)
     assert back.landmark.tolist() == [7, 4_294_967_295, 0]
     assert back.uv.tolist() == [[0.1, 1e-300], [1535.9, -3.25], [1 / 3, 7.0]]
-    assert back.frame == 'camera' and messages.stamp_of(message) == STAMP
+    assert back.frame == 'camera' and stamp_of(message) == STAMP
 
 
 def test_landmarks_survive_bit_by_bit() -> None:

@@ -18,7 +18,7 @@ from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.camera import incidence
-from fisheye_svp_ros.clouds import LANDMARKS, RESIDUALS, unpack
+from fisheye_svp_ros.clouds import LANDMARKS, RESIDUALS, stamp_of, unpack
 from fisheye_svp_ros.landmarks import Landmarks, environment
 from fisheye_svp_ros.lens import load_lens
 from fisheye_svp_ros.nodes import camera
@@ -57,7 +57,7 @@ def values(message: Any) -> dict[str, str]:
 
 
 def stamps(heard: list[Any]) -> list[int]:
-    return [messages.stamp_of(message) for message in heard]
+    return [stamp_of(message) for message in heard]
 
 
 def test_one_set_carries_one_stamp_on_all_topics(graph: Callable[..., Graph]) -> None:

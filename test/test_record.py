@@ -24,6 +24,7 @@ import graph  # noqa: F401 - supplies the message packages
 from fisheye_svp_ros import bags, messages, standalone
 from fisheye_svp_ros.bags import Bag, BagWriter
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.clouds import stamp_of
 from fisheye_svp_ros.errors import BagError, ObservationError
 from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
 from fisheye_svp_ros.readers import read_observations
@@ -296,7 +297,7 @@ def test_measured_camera_and_localizer_agree_with_the_command(
     for record in Bag(tmp_path / 'bag').records(
         lambda topic, _: topic in ('/scenario', '/localizer/pose')
     ):
-        stamp = messages.stamp_of(record.message)
+        stamp = stamp_of(record.message)
         if record.topic == '/scenario':
             frames[stamp] = int(messages.read_key_values(record.message)['frame'])
         else:

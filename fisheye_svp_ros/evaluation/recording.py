@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
+from fisheye_svp_ros.clouds import stamp_of
+
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
 
@@ -38,7 +40,7 @@ def tabulate(records: Iterable[_Record]) -> Columns:
     results: list[tuple[str, int, dict[str, str]]] = []
     for record in records:
         base, _, name = record.topic.rpartition('/')
-        stamp = _stamp(record.message)
+        stamp = stamp_of(record.message)
         values = {pair.key: pair.value for status in record.message.status
                   for pair in status.values}
         if name == 'scenario':
@@ -81,10 +83,6 @@ def _typed(cells: list[str | None]) -> list[Any]:
         except ValueError:
             continue
     return cells
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def _level(level: Any) -> int:

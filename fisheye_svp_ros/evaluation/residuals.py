@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.clouds import RESIDUALS, Points, unpack
+from fisheye_svp_ros.clouds import RESIDUALS, Points, stamp_of, unpack
 
 
 class ResidualField(NamedTuple):
@@ -39,8 +39,7 @@ def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
     tags: dict[tuple[str, int], dict[str, str]] = {}
     clouds: dict[tuple[str, int], Points] = {}
     for record in records:
-        stamp = record.message.header.stamp
-        when = int(stamp.sec) * 10**9 + int(stamp.nanosec)
+        when = stamp_of(record.message)
         if record.topic.endswith('/scenario'):
             namespace = record.topic.removesuffix('/scenario')
             tags[namespace, when] = {p.key: p.value for p in record.message.status[0].values}

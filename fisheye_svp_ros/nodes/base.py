@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from fisheye_svp_ros import messages
+from fisheye_svp_ros.clouds import stamp_of
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.parameters import Row, changed, rows
 from fisheye_svp_ros.settings import Settings
@@ -115,7 +116,7 @@ class BaseNode(Node):  # type: ignore[misc]
         def receive(message: Any) -> None:
             self._inputs[topic].received += 1
             try:
-                use(messages.stamp_of(message), read(message, topic))
+                use(stamp_of(message), read(message, topic))
             except FisheyeSvpError as error:
                 self.drop(topic, error)
 

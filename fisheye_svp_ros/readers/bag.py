@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.bags import Bag
-from fisheye_svp_ros.clouds import IMAGE_POINTS, LANDMARKS, Points, unpack
+from fisheye_svp_ros.clouds import IMAGE_POINTS, LANDMARKS, Points, stamp_of, unpack
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.landmarks import Landmarks
 from fisheye_svp_ros.observations import Observations, make_observations
@@ -35,8 +35,7 @@ def read(path: str | Path) -> Observations:
     worlds: set[str] = set()
     sets: list[_Set] = []
     for record in bag.records(_is_wanted):
-        stamp = int(record.message.header.stamp.sec) * 10**9
-        stamp += int(record.message.header.stamp.nanosec)
+        stamp = stamp_of(record.message)
         namespace, _, name = record.topic.rpartition('/')
         where = f'{path}, {record.topic}'
         if name == 'landmarks':
