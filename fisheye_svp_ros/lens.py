@@ -21,6 +21,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.files import read_yaml, write_text
 
 INTRINSICS = ('fx', 'fy', 'cx', 'cy')
+_MOVE_VIEWPOINT = ('viewpoint_shift', 'flat_port')  # effects that the approximation neglects
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,8 @@ class Lens:
 
     def svp(self) -> Lens:
         """Return the same lens under the single-viewpoint approximation."""
-        return replace(self, viewpoint_shift=None)
+        effects = {k: v for k, v in self.effects.items() if k not in _MOVE_VIEWPOINT}
+        return replace(self, viewpoint_shift=None, effects=effects)
 
 
 def check_lens(lens: Lens, where: str) -> Lens:

@@ -1,6 +1,7 @@
 """Lens YAML: what is written is read back, what is broken is refused with its reason."""
 
 import copy
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,8 @@ def test_parameters_by_name():
     assert moved.parameters == {**lens.parameters, 'fx': 1.0, 'fy': 1.0, 'cx': 2.0, 'k2': 3.0,
                                 's0': 4.0, 'e1': 5.0}
     assert moved.svp().viewpoint_shift is None
+    found = {name: {'e0': 0.1} for name in ('viewpoint_shift', 'skew', 'flat_port')}
+    assert set(replace(moved, effects=found).svp().effects) == {'skew'}
     with pytest.raises(LensError, match=r"no parameter 'k5'; it has fx, fy, .* e2"):
         lens.with_parameters(['k5'], [0.0])
     with pytest.raises(LensError, match="no parameter 's0'"):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from std_msgs.msg import Float64  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros import messages
+from fisheye_svp_ros.bags import BagWriter
 from fisheye_svp_ros.camera import incidence
 from fisheye_svp_ros.clouds import LANDMARKS, RESIDUALS, stamp_of, unpack
 from fisheye_svp_ros.landmarks import Landmarks, environment
@@ -24,6 +27,7 @@ from fisheye_svp_ros.lens import load_lens
 from fisheye_svp_ros.nodes import camera
 from fisheye_svp_ros.nodes.base import Finished
 from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.recorder import Recorder
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
@@ -485,3 +489,19 @@ def test_optimal_depth_has_the_smaller_error_under_noise(graph: Callable[..., Gr
     run_to_the_end(g)
     g.until(lambda: results)
     assert 0 < float(values(results[0])['error3_m']) < 0.5
+
+
+def test_a_recorder_joins_a_topic_that_is_waited_for_once_its_publisher_is_there(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    one = graph()
+    one.hear(DiagnosticArray, '/localizer/result')
+    one.hear(Float64, '/localizer/metrics/rms_px')
+    with BagWriter(tmp_path / 'bag') as bag:
+        recorder = one.start(lambda: Recorder(bag, re.compile('/localizer/.*')))
+        one.until(lambda: recorder.topics)
+        one.idle(0.5)
+        # A node that publishes this one last, and sees it recorded, may start.
+        assert recorder.topics == {'/localizer/metrics/rms_px'}
+        one.probe.create_publisher(DiagnosticArray, '/localizer/result', 10)
+        one.until(lambda: '/localizer/result' in recorder.topics)

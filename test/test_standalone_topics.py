@@ -107,11 +107,20 @@ node.create_subscription(String, 'chatter', lambda data: print('raw', type(data)
 while '/chatter' not in (topics := dict(node.get_topic_names_and_types())):
     rclpy.spin_once(node, timeout_sec=0.05)
 print('topics', topics['/chatter'], topics['/rosout'], flush=True)
+while not node.count_publishers('chatter'):
+    rclpy.spin_once(node, timeout_sec=0.05)
+node.create_subscription(String, 'only_heard', print, 10)
+while '/only_heard' not in dict(node.get_topic_names_and_types()):
+    rclpy.spin_once(node, timeout_sec=0.05)
+print('publishers', node.count_publishers('/chatter'), node.count_publishers('only_heard'),
+      flush=True)
 rclpy.spin(node)
 """, 'recorder')  # fmt: skip
-    raw = [recorder.wait_for("raw <class 'bytes'> (.*)|topics (.*)") for _ in range(4)]
+    raw = [recorder.wait_for("raw <class 'bytes'> (.*)|topics (.*)|publishers (.*)")
+           for _ in range(5)]
     (topics,) = (match[2] for match in raw if match[2])
     assert topics == "['std_msgs/msg/String'] ['rcl_interfaces/msg/Log']"
+    assert [match[3] for match in raw if match[3]] == ['1 0']
     first = next(match[1] for match in raw if match[1])
     assert bytes.fromhex(first)[:10] == b'\0\1\0\0' + b'\2\0\0\0' + b'c\0'
 

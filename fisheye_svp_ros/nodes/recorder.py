@@ -27,7 +27,7 @@ class Recorder(Node):  # type: ignore[misc]
         self.topics: set[str] = set()
         self._bag = bag
         self._wanted = wanted
-        self.create_timer(_LOOK_EVERY, self._look)
+        self._timer = self.create_timer(_LOOK_EVERY, self._look)
 
     def spin(self) -> None:
         """Record until SIGINT or SIGTERM, and then until nothing more arrives."""
@@ -37,18 +37,26 @@ class Recorder(Node):  # type: ignore[misc]
             signal.signal(number, lambda *_: ended.append(True))
         while not ended:
             executor.spin_once(timeout_sec=_LOOK_EVERY)
-        last, count = time.monotonic(), self._bag.count
-        while time.monotonic() - last < _QUIET:
+        self._timer.cancel()
+        # Only a whole wait that brought nothing says so: this process may have been held up.
+        waited, count = 0.0, -1
+        while waited < _QUIET or self._bag.count > count:
+            start, count = time.monotonic(), self._bag.count
             executor.spin_once(timeout_sec=_QUIET)
-            if self._bag.count > count:
-                last, count = time.monotonic(), self._bag.count
+            waited = time.monotonic() - start
 
     def _look(self) -> None:
         # A node that waits for its listeners counts those of image_points or ~/result: when it
-        # sees this node there, this node must be on its other topics already.
+        # sees this node there, this node must be on its other topics already.  That topic is the
+        # last a node publishes, so where its publisher is known, those found now are all.
+        names = [name for name, _ in self.get_topic_names_and_types()]
+        complete = {name for name in names
+                    if name.endswith(_COUNTED) and self.count_publishers(name)}
         found = self.get_topic_names_and_types()
         for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED)):
-            if topic not in self.topics and self._wanted.fullmatch(topic) and len(types) == 1:
+            if topic in self.topics or (topic.endswith(_COUNTED) and topic not in complete):
+                continue
+            if self._wanted.fullmatch(topic) and len(types) == 1:
                 self._subscribe(topic, types[0])
 
     def _subscribe(self, topic: str, typename: str) -> None:

@@ -10,6 +10,7 @@ import itertools
 import os
 import struct
 import time
+from collections.abc import Collection
 from functools import cache, cached_property
 from typing import Any, ClassVar, NamedTuple
 from uuid import UUID
@@ -144,24 +145,46 @@ class Participant:
     def topics(self) -> dict[str, set[str]]:
         """Return the types of every topic that somebody on the domain writes or reads, by name."""
         found: dict[str, set[str]] = {}
-        for reader in self._endpoints:
-            for endpoint in reader.read(_MANY):
-                alive = endpoint.sample_info.instance_state == InstanceState.Alive
-                name, typename = endpoint.topic_name, endpoint.type_name
-                if alive and name.startswith('rt/'):
+        for endpoints in (self._writers, self._readers):
+            for name, typename in endpoints.alive():
+                if name.startswith('rt/'):
                     plain = typename.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
                     found.setdefault(name[2:], set()).add(plain)
         return found
 
+    def count_writers(self, name: str) -> int:
+        """Return how many on the domain write a DDS topic."""
+        return sum(topic == name for topic, _ in self._writers.alive())
+
     @cached_property
-    def _endpoints(self) -> list[BuiltinDataReader]:
-        builtin = (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
-        return [BuiltinDataReader(self.entity, topic) for topic in builtin]
+    def _writers(self) -> _Endpoints:
+        return _Endpoints(self.entity, BuiltinTopicDcpsPublication)
+
+    @cached_property
+    def _readers(self) -> _Endpoints:
+        return _Endpoints(self.entity, BuiltinTopicDcpsSubscription)
 
     def service_id(self) -> str:
         """Return a new user-data entry that ties the two halves of a service together."""
         identifier = self.guid.bytes[:12] + next(self._service_ids).to_bytes(4, 'big')
         return f'serviceid={".".join(f"{byte:x}" for byte in identifier)};'
+
+
+class _Endpoints:
+    """All writers, or all readers, on a domain; each look takes in only what has changed."""
+
+    def __init__(self, participant: DomainParticipant, kind: Any) -> None:
+        self._reader = BuiltinDataReader(participant, kind)
+        self._alive: dict[UUID, tuple[str, str]] = {}
+
+    def alive(self) -> Collection[tuple[str, str]]:
+        """Return topic and type of every endpoint that is there now."""
+        for endpoint in self._reader.take(_MANY):
+            if endpoint.sample_info.instance_state == InstanceState.Alive:
+                self._alive[endpoint.key] = endpoint.topic_name, endpoint.type_name
+            else:
+                self._alive.pop(endpoint.key, None)
+        return self._alive.values()
 
 
 def _configuration() -> str:

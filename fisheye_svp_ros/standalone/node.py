@@ -260,6 +260,10 @@ class Node(ParameterHolder):
         """Return every topic on the domain with its types."""
         return sorted((n, sorted(t)) for n, t in self.context.participant.topics().items())
 
+    def count_publishers(self, topic_name: str) -> int:
+        """Return how many publishers a topic has on the domain."""
+        return self.context.participant.count_writers(f'rt{self.resolve_topic_name(topic_name)}')
+
     def create_publisher(
         self, msg_type: type[Message], topic: str, qos_profile: QoSProfile | int
     ) -> Publisher:
