@@ -7,7 +7,9 @@ import pytest
 from scenes import lens, observe, scene
 from scipy import stats
 
+from fisheye_svp_ros.criticism.correlation import Correlation
 from fisheye_svp_ros.criticism.diagnosis import diagnose
+from fisheye_svp_ros.criticism.held_out import held_out_gain
 from fisheye_svp_ros.criticism.model import (
     Linearised,
     dense_frames,
@@ -20,6 +22,7 @@ from fisheye_svp_ros.criticism.model import (
 from fisheye_svp_ros.criticism.noise import quantisation_step
 from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import single_landmarks
+from fisheye_svp_ros.criticism.standard_errors import standard_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
@@ -176,6 +179,65 @@ def test_swapped_ids_are_found_and_left_out():
     value = found.causes[0].parameters['fraction']['value']
     assert value == pytest.approx(6 / len(table))
     assert found.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+
+
+def test_landmarks_far_from_their_place_are_no_gross_errors():
+    rng = np.random.default_rng(20)
+    pose, views = scene(rng)
+    moves = np.array([0.15, 0.1, 0.0, 0.1, -0.15, 0.0])
+    table = observe(
+        lens(), [(LandmarkSurveyEffect((3, 44)), moves)], pose, views, SIGMA, rng
+    )
+    uv = table.uv.copy()
+    uv[[5, 200, 700, 900]] += [15.0, -12.0]
+    found = diagnose(replace(table, uv=uv), lens())
+    assert [cause.effect for cause in found.causes] == ['landmark_survey']
+    values = found.causes[0].parameters
+    assert list(values) == ['3.x', '3.y', '3.z', '44.x', '44.y', '44.z']
+    for parameter, true in zip(values.values(), moves, strict=True):
+        assert abs(parameter['value'] - true) < 5 * parameter['stderr']
+    assert [s.variable for s in found.remaining] == ['outliers']
+
+
+def test_standard_errors_of_free_landmarks_are_those_of_the_dense_matrix():
+    data, state, _ = fitted(21)
+    often = LandmarkSurveyEffect(tuple(range(60)), everywhere=True)
+    term = (often, np.zeros(180))
+    linear = Linearised(data, replace(state, terms=(term,)), ())
+    nuisance = Nuisance(linear)
+    (errors,) = standard_errors(linear, nuisance, Correlation(0.0, 1.0, lambda _: 1.0))
+    rows, others = dense(linear)
+    place = flat_rows(linear.effect_columns(often))[rows]
+    outside = place - others @ np.linalg.lstsq(others, place, rcond=None)[0]
+    covariance = np.linalg.pinv(outside.T @ outside, rcond=1e-9, hermitian=True)
+    variance = nuisance.misfit / nuisance.freedom
+    np.testing.assert_allclose(errors, np.sqrt(variance * np.diag(covariance)), rtol=1e-5)
+
+
+def test_what_has_no_effect_has_no_standard_error():
+    data, state, _ = fitted(22)
+    nothing = (LandmarkSurveyEffect((4, 999)), np.zeros(6))
+    linear = Linearised(data, replace(state, terms=(nothing,)), ())
+    (errors,) = standard_errors(
+        linear, Nuisance(linear), Correlation(0.0, 1.0, lambda _: 1.0)
+    )
+    assert np.isfinite(errors[:3]).all() and np.isnan(errors[3:]).all()
+
+
+def test_a_range_band_objects_to_an_effect_that_holds_in_the_others_only():
+    rng = np.random.default_rng(23)
+    pose, views = scene(rng)
+    near = np.linalg.norm(pose.into_body(views.points), axis=-1) < 0.8
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    skewed = observe(lens(), [(CATALOGUE['skew'](), np.array([0.004]))], pose, views, SIGMA, rng)
+    here = near[table.frame, table.landmark][:, None]
+    mixed = np.where(here, skewed.uv, 2 * table.uv - skewed.uv)
+    for uv, holds in ((skewed.uv, True), (mixed, False)):
+        data = prepare(replace(table, uv=uv))
+        state = fit(data, start(data, lens()), ())
+        linear = Linearised(data, state, ())
+        gains = held_out_gain(data, linear, Nuisance(linear), (), CATALOGUE['skew']())
+        assert (gains['range_bands'] > 0) == holds, gains
 
 
 def test_quantisation_is_read_off_the_numbers():

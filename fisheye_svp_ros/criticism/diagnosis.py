@@ -131,9 +131,8 @@ def diagnose(
     free = intrinsic_names(lens) if free_intrinsics else ()
     progress('fitting the simulation as it is')
     everything = prepare(observations, poses)
-    data, gross = find_gross_errors(everything, start(everything, lens))
+    data, gross, selection = _selected(everything, start(everything, lens), free, progress)
     base = fit(data, start(data, lens), free)
-    selection = settle(data, select(data, base, free, progress), free)
     progress('looking at what is left')
     stated = bool(np.isfinite(observations.sigma).all())
     selection, left = withdraw(data, selection, free, stated)
@@ -165,6 +164,24 @@ def diagnose(
         after=after,
         neighbour_correlation=selection.correlation.coefficient,
     )
+
+
+def _selected(
+    everything: Data, simulation: State, free: Sequence[str], progress: Callable[[str], None]
+) -> tuple[Data, Gross, Selection]:
+    """Return the data without gross errors, what these were, and the effects that were found.
+
+    What is far from the simulation may be near the extended one: gross errors are judged twice.
+    """
+    data, gross = find_gross_errors(everything, simulation)
+    selection = settle(data, select(data, fit(data, simulation, free), free, progress), free)
+    if selection.evidence:
+        data, judged = find_gross_errors(everything, selection.state)
+        if set(judged.rows) != set(gross.rows):
+            state = fit(data, selection.state, free)
+            selection = settle(data, select(data, state, free, progress, selection), free)
+        gross = judged
+    return data, gross, selection
 
 
 def noise_px(linear: Linearised, nuisance: Nuisance) -> float:
@@ -287,7 +304,8 @@ def _table_causes(
             value = {'value': fraction, 'stderr': stderr, 'unit': '1'}
             causes.append(_plain_cause('wrong_ids', {'fraction': value}, 0.0))
         if swapped < len(gross.rows):
-            left = [*left, Structure('outliers', 0.0, 1 - swapped / len(gross.rows))]
+            left = [s for s in left if s.variable != 'outliers']
+            left.append(Structure('outliers', 0.0, 1 - swapped / len(gross.rows)))
     step = quantisation_step(observations.uv)
     if step / np.sqrt(12) > _STEP_OVER_NOISE * noise:
         value = {'value': step, 'stderr': 0.0, 'unit': 'px'}

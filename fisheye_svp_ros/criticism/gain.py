@@ -47,7 +47,7 @@ def held_out(data: Data, state: State, free: Sequence[str], test: Data | None) -
     linear = Linearised(data, state, free)
     if survey_of(state.terms) is None:
         folds = np.broadcast_to(frame_folds(data)[:, None], linear.residual.shape)
-        return _figures(data, predicted_residuals(linear, linear.shared_columns, folds, True))
+        return _figures(data, predicted_residuals(linear, linear.shared_columns, folds))
     parts = [
         _figures(other, Linearised(other, start_poses(other, trained), ()).residual)
         for trained, other in (

@@ -8,7 +8,16 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, is_shared, start_poses
+from fisheye_svp_ros.criticism.model import (
+    Data,
+    Linearised,
+    State,
+    fit,
+    flat_rows,
+    is_shared,
+    start_poses,
+)
+from fisheye_svp_ros.criticism.projection import Nuisance
 from fisheye_svp_ros.effects.base import Effect
 
 FRAME_FOLDS = 5
@@ -17,7 +26,7 @@ RANGE_BANDS = 3
 
 
 def held_out_gain(
-    data: Data, linear: Linearised, free: Sequence[str], effect: Effect
+    data: Data, linear: Linearised, nuisance: Nuisance, free: Sequence[str], effect: Effect
 ) -> dict[str, float]:
     """Return by how much (whitened squares) an effect lowers the misfit of held-out data.
 
@@ -28,20 +37,38 @@ def held_out_gain(
         return {'frames': _survey_gain(data, linear.state, free, effect)}
     extra = linear.effect_columns(effect)
     frames = np.broadcast_to(frame_folds(data)[:, None], linear.residual.shape)
-    landmarks = np.unique(linear.rows.landmark, return_inverse=True)[1] % LANDMARK_FOLDS
     both = [linear.shared_columns, np.concatenate([linear.shared_columns, extra], axis=-1)]
-    gains = {}
-    for name, folds, whole_frames in (
-        ('frames', frames, True),
-        ('landmarks', landmarks.reshape(frames.shape), False),
-        ('range_bands', _range_bands(linear), False),
-    ):
-        before, after = (
-            float((predicted_residuals(linear, columns, folds, whole_frames) ** 2).sum())
-            for columns in both
-        )
-        gains[name] = before - after
-    return gains
+    before, after = (
+        float((predicted_residuals(linear, columns, frames) ** 2).sum()) for columns in both
+    )
+    landmarks = np.unique(linear.rows.landmark, return_inverse=True)[1] % LANDMARK_FOLDS
+    parts = {
+        'landmarks': landmarks.reshape(linear.residual.shape), 'range_bands': _range_bands(linear)
+    }
+    return {'frames': before - after} | {
+        name: _part_gain(linear, nuisance, effect, extra, folds) for name, folds in parts.items()
+    }
+
+
+def _part_gain(
+    linear: Linearised, nuisance: Nuisance, effect: Effect, extra: Array, folds: Index
+) -> float:
+    """Predict parts of the rows (F, M) by an effect as it comes out of the other parts.
+
+    extra: its columns (F, M, P).  All else stays as all parts together have it: a part of a frame
+    leaves its pose too open, and one range the intrinsics.
+    """
+    used = linear.rows.used
+    columns = flat_rows(nuisance.outside(extra)[used])
+    residual, folds = nuisance.residual[used], folds[used]
+    # What the other parts do not tell stays within a size that would be large.
+    prior = np.diag([1 / parameter.large**2 for parameter in effect.parameters])
+    gain = 0.0
+    for fold in np.unique(folds):
+        train, test, left = columns[folds != fold], columns[folds == fold], residual[folds == fold]
+        values = np.linalg.solve(train.T @ train + prior, train.T @ residual[folds != fold])
+        gain += float((left**2).sum() - ((left - test @ values) ** 2).sum())
+    return gain
 
 
 def frame_folds(data: Data) -> Index:
@@ -58,34 +85,25 @@ def _range_bands(linear: Linearised) -> Index:
     return np.searchsorted(edges, blocks)
 
 
-def predicted_residuals(
-    linear: Linearised, columns: Array, folds: Index, whole_frames: bool
-) -> Array:
-    """Return residuals (F, M) of rows in turn held out, the rest fitted, whitened.
+def predicted_residuals(linear: Linearised, columns: Array, folds: Index) -> Array:
+    """Return residuals (F, M) of frames in turn held out, whitened.
 
-    whole_frames: held-out frames fit their own pose (all else fixed); otherwise every frame's
-    pose comes from the rows that were kept.
+    Held-out frames fit their own pose; all else, the columns (F, M, K), is fitted to the others.
     """
     predicted = np.zeros_like(linear.residual)
     stacked = np.concatenate([columns, linear.residual[..., None]], axis=-1)
-    clean = _less_poses(linear, stacked, np.ones(folds.shape, dtype=bool))
+    poses = linear.frame_columns
+    clean = stacked - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ stacked)
+    # Over all frames, so that what shows in the held-out ones alone is nothing in the others.
+    norms = np.maximum(np.sqrt((clean[..., :-1] ** 2).sum(axis=(0, 1))), 1e-12)
     for fold in np.unique(folds[linear.rows.used]):
         kept = folds != fold
-        if not whole_frames:
-            clean = _less_poses(linear, stacked, kept)
         train, test = clean[kept & linear.rows.used], clean[~kept]
-        norms = np.maximum(np.sqrt((train[:, :-1] ** 2).sum(axis=0)), 1e-12)
         scaled = train[:, :-1] / norms
         gram = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12, hermitian=True)
         values = gram @ (scaled.T @ train[:, -1]) / norms
         predicted[~kept] = test[:, -1] - test[:, :-1] @ values
     return predicted
-
-
-def _less_poses(linear: Linearised, columns: Array, kept: Mask) -> Array:
-    poses = linear.frame_columns
-    inverse = np.linalg.pinv(poses * kept[..., None], rcond=1e-9)
-    return np.asarray(columns - poses @ (inverse @ (columns * kept[..., None])))
 
 
 def misfit(test: Data, trained: State) -> float:
@@ -117,6 +135,7 @@ def _chosen(data: Data, frames: Mask) -> Data:
     views = frames[data.frame_of]
     frame_of = np.unique(data.frame_of[views], return_inverse=True)[1].reshape(-1)
     poses = None if data.poses is None else data.poses.take(frames)
-    return Data(
-        data.observations, data.views.take(views), frame_of, data.camera_of[views], poses
+    return replace(
+        data, views=data.views.take(views), frame_of=frame_of, camera_of=data.camera_of[views],
+        poses=poses,
     )

@@ -27,7 +27,8 @@ class Data:
     """A table in the batch forms that criticism needs.
 
     views: S views of up to N points; frame_of, camera_of (S,): which frame (0..F-1) and camera
-    (0..C-1) a view belongs to; poses: true poses (F,) of the rig where they are known.
+    (0..C-1) a view belongs to; poses: true poses (F,) of the rig where they are known; displaced:
+    landmarks so far off in most of their views that they have to be tested together.
     """
 
     observations: Observations
@@ -35,6 +36,7 @@ class Data:
     frame_of: Index
     camera_of: Index
     poses: Pose | None = None
+    displaced: tuple[int, ...] = ()
 
     @property
     def frames(self) -> int:

@@ -22,6 +22,7 @@ _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to
 _GATE = 6.0  # and within which it belongs to another one
 _SUSPECT = 6.0  # below this no point is worth a robust fit
 _FADE = 2.0
+_MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
 
 
@@ -41,11 +42,12 @@ class NoiseCause(NamedTuple):
 
 
 def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
-    """Return the data without gross errors, and what they were.
+    """Return the data without gross errors and with `displaced`, and what the errors were.
 
     Every view is localized with weights that fade for points far from their prediction (Cauchy),
     on the scale of the median residual of that view or of all, whichever is larger: a view that
-    a model error bends as a whole holds no gross error.
+    a model error bends as a whole holds no gross error, nor does a landmark that is off in most
+    of its views.
     """
     model = ForwardModel(state.lens, state.terms)
     views, pose = data.views, state.view_poses(data)
@@ -56,14 +58,17 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
             weight = np.where(views.used, views.weight * fading, 0.0)
             pose = localize(model, views._replace(weight=weight), pose).pose
             scale, offset = _scale(views, _offset(model, pose, views))
-    far = views.used & (offset > _GROSS * scale)
+    of_landmark = _scale_of_landmark(views, offset)
+    far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark))
+    displaced = np.unique(views.landmark[views.used & (of_landmark > _GROSS * scale)])
     swapped = _fits_another(model, pose, views, far, _GATE * float(np.median(scale)))
     rows = views.row[far]
     order = np.argsort(rows)
     clean = views._replace(
         weight=np.where(far, 0.0, views.weight), row=np.where(far, -1, views.row)
     )
-    return replace(data, views=clean), Gross(rows[order], swapped[far][order])
+    found = replace(data, views=clean, displaced=tuple(displaced.tolist()))
+    return found, Gross(rows[order], swapped[far][order])
 
 
 def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
@@ -75,8 +80,16 @@ def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
 def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
     """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
     median = np.nanmedian(offset, axis=1, keepdims=True)
-    # The median of the norm of two normal coordinates is 1.1774 of their standard deviation.
-    return np.maximum(median, np.nanmedian(offset)) / 1.1774, offset
+    return np.maximum(median, np.nanmedian(offset)) / _MEDIAN, offset
+
+
+def _scale_of_landmark(views: Views, offset: Array) -> Array:
+    """Robust standard deviations (S, N) of a coordinate, one a landmark."""
+    scale = np.zeros_like(offset)
+    for landmark in np.unique(views.landmark[views.used]):
+        mine = views.used & (views.landmark == landmark)
+        scale[mine] = np.median(offset[mine]) / _MEDIAN
+    return scale
 
 
 def quantisation_step(uv: Array) -> float:

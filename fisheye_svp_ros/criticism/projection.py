@@ -55,12 +55,12 @@ class Nuisance:
             shared = np.concatenate([shared, extra], axis=-1)
         survey = survey or survey_of(linear.state.terms)
         if survey is None:
-            self._group, self._blocks = None, _block_basis(linear.frame_columns)
+            self._group, self._blocks = None, block_basis(linear.frame_columns)
         else:
             free = linear.rows.used & (survey.slots(linear.rows.landmark) >= 0)
             self._group = landmark_groups(linear.rows.landmark, free)
             place = linear.whitened(linear.linear.d_target)
-            self._blocks = _block_basis(gather(place, self._group))
+            self._blocks = block_basis(gather(place, self._group))
             shared = np.concatenate([dense_frames(linear.frame_columns), shared], axis=-1)
         self.shared_basis = _in_rows(
             basis(self.outside_blocks(shared), _norms(shared)), self.shape
@@ -178,7 +178,23 @@ def _norms(columns: Array) -> Array:
     return np.asarray(np.sqrt((columns**2).sum(axis=(0, 1))))
 
 
-def _block_basis(columns: Array) -> Array:
+def landmark_crossings(
+    place: Array, group: Index, frame_basis: Array, shared_basis: Array
+) -> tuple[Array, Array]:
+    """Return how columns by a landmark's place (L, m, 3) lie along bases (F, M, B), (F, M, K).
+
+    group: the rows (L, m) of each landmark.  Returns (L, 3, F, B), frame by frame, and (L, 3, K).
+    """
+    frames, height, width = frame_basis.shape
+    label, row = np.nonzero(group < frames * height)
+    mine = place[label, row][:, :, None] * flat_rows(frame_basis)[group[label, row]][:, None, :]
+    by_frame = np.zeros((len(group), frames, 3, width))
+    np.add.at(by_frame, (label, group[label, row] // height), mine)
+    shared = np.einsum('lma,lmk->lak', place, gather(shared_basis, group))
+    return np.swapaxes(by_frame, 1, 2), shared
+
+
+def block_basis(columns: Array) -> Array:
     """Orthonormal bases (B, M, 6) of each block's columns; zero columns where rank is missing."""
     scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
     u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)

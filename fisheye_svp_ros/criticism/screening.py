@@ -10,7 +10,13 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.criticism.correlation import Correlation
 from fisheye_svp_ros.criticism.model import Linearised, gather, landmark_groups
-from fisheye_svp_ros.criticism.projection import Nuisance, Score, p_value, score
+from fisheye_svp_ros.criticism.projection import (
+    Nuisance,
+    Score,
+    landmark_crossings,
+    p_value,
+    score,
+)
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
@@ -70,6 +76,9 @@ def screen(
         if name == LandmarkSurveyEffect.name and nuisance.frame_basis is not None:
             tested = [(effect, result, 2) for effect, result, _ in tested]
             tested += single_landmarks(linear, nuisance)
+            if linear.data.displaced:
+                together = LandmarkSurveyEffect(linear.data.displaced)
+                tested.append((together, _test(linear, nuisance, correlation, together), 2))
         if all(result.rank == 0 for _, result, _ in tested):
             untestable[name] = 'what it would do is taken up by what is free already'
         for effect, result, count in tested:
@@ -120,23 +129,20 @@ def single_landmarks(
     Each frame shows a landmark once, so what a frame's residuals share does not add up here.
     """
     assert nuisance.frame_basis is not None
-    rows, (frames, height) = linear.rows, nuisance.shape
-    place = linear.whitened(linear.linear.d_target)
+    rows = linear.rows
     group = landmark_groups(rows.landmark, rows.used)
-    mine = gather(place, group)
-    shared = np.einsum('lma,lmk->lak', mine, gather(nuisance.shared_basis, group))
-    own = np.einsum('lma,lmb->lab', mine, mine) - shared @ np.swapaxes(shared, -1, -2)
-    label, row = np.nonzero(group < frames * height)
-    frame = group[label, row] // height
-    crossed = np.zeros((len(group), frames, 3, nuisance.frame_basis.shape[-1]))
-    flat = nuisance.frame_basis.reshape(frames * height, -1)[group[label, row]]
-    np.add.at(crossed, (label, frame), mine[label, row][:, :, None] * flat[:, None, :])
-    own -= np.einsum('lfak,lfbk->lab', crossed, crossed)
+    mine = gather(linear.whitened(linear.linear.d_target), group)
+    taken = landmark_crossings(mine, group, nuisance.frame_basis, nuisance.shared_basis)
+    own = np.swapaxes(mine, -1, -2) @ mine
+    for part in taken:
+        flat = part.reshape(len(group), 3, -1)
+        own -= flat @ np.swapaxes(flat, -1, -2)
     gradient = np.einsum('lma,lm->la', mine, gather(nuisance.residual[..., None], group)[..., 0])
     estimate = (np.linalg.pinv(own, rcond=1e-6, hermitian=True) @ gradient[..., None])[..., 0]
     statistic = np.einsum('la,la->l', estimate, gradient)
     ids = rows.landmark.ravel()[group[:, 0]]
-    views = np.array([len(np.unique(frame[label == i])) for i in range(len(group))])
+    frame = np.where(group < rows.landmark.size, group // rows.landmark.shape[1], -1)
+    views = np.array([len(np.unique(mine[mine >= 0])) for mine in frame])
     return [
         (
             LandmarkSurveyEffect((int(ids[i]),)),

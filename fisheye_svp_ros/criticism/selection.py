@@ -23,8 +23,8 @@ from fisheye_svp_ros.effects.session_step import SessionStepEffect
 SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
-# So many single landmarks are not single ones any more.
-MANY = 0.15
+# So many landmarks are not single ones any more, nor so many steps single events.
+MANY = 0.12
 MAX_STEPS = 20
 _GAPS = 4
 
@@ -55,23 +55,26 @@ class Selection:
 
 
 def select(
-    data: Data, state: State, free: Sequence[str], progress: Callable[[str], None]
+    data: Data, state: State, free: Sequence[str], progress: Callable[[str], None],
+    before: Selection | None = None,
 ) -> Selection:
     """Add effects to a fitted state for as long as each is significant and predicts better.
 
     Every candidate must have a corrected p-value below SIGNIFICANCE and lower the misfit of
-    frames, landmarks and range bands that were held out.
+    frames, landmarks and range bands that were held out.  before: what led to the state.
     """
-    trace: list[Step] = []
+    trace = [] if before is None else before.trace
+    evidence = {} if before is None else before.evidence
+    untestable: dict[str, str] | None = None if before is None else before.untestable
     refused: set[str] = set()
-    evidence: dict[str, Candidate] = {}
     while True:
         progress(f'screening {len(CATALOGUE)} effects, step {len(trace) + 1}')
         linear = Linearised(data, state, free)
         correlation = judge_correlation(linear, generic_columns(linear))
-        screening = screen(linear, Nuisance(linear), correlation)
-        if len(evidence) == 0 and not trace:
-            first = screening
+        nuisance = Nuisance(linear)
+        screening = screen(linear, nuisance, correlation)
+        if untestable is None:
+            untestable = screening.untestable
         eligible = [
             c for c in screening.eligible(SIGNIFICANCE)
             if c.effect.key not in refused and (c.merit > 0 or not _is_survey(c.effect))
@@ -79,7 +82,7 @@ def select(
         if not eligible or len(trace) >= MAX_STEPS:
             break
         chosen = _first(eligible)
-        gains = held_out_gain(data, linear, free, chosen.effect)
+        gains = held_out_gain(data, linear, nuisance, free, chosen.effect)
         good = _worth(chosen, gains, linear, correlation)
         trace.append(_step(chosen, gains, good))
         if not good:
@@ -87,7 +90,7 @@ def select(
             continue
         state = extended(data, state, chosen, free)
         evidence.setdefault(chosen.effect.name, chosen)
-    return Selection(state, trace, first.untestable, correlation, evidence)
+    return Selection(state, trace, untestable, correlation, evidence)
 
 
 def generic_columns(linear: Linearised) -> Array:
@@ -186,8 +189,8 @@ def withdraw(
             name for name, candidate in selection.evidence.items()
             if candidate.score.statistic < unexplained
         ]
-        if left and not weak and _many_landmarks(selection.state, data):
-            weak = ['landmark_survey']
+        if left and not weak:
+            weak = _scattered(selection.state, data)
         if not weak:
             return selection, left
         name = min(weak, key=lambda n: selection.evidence[n].score.statistic)
@@ -197,14 +200,20 @@ def withdraw(
         selection = replace(selection, state=state)
 
 
-def _many_landmarks(state: State, data: Data) -> bool:
-    """Whether single landmarks were added until they stand for something else."""
+def _scattered(state: State, data: Data) -> list[str]:
+    """Return the effects that were added piece by piece until they stand for something else."""
     known = len(np.unique(data.views.landmark[data.views.used]))
-    return any(
-        isinstance(effect, LandmarkSurveyEffect)
-        and not effect.everywhere and len(effect.landmarks) > max(3, MANY * known)
-        for effect, _ in state.terms
-    )
+    names = []
+    for effect, _ in state.terms:
+        if isinstance(effect, LandmarkSurveyEffect) and not effect.everywhere:
+            pieces, whole = len(effect.landmarks), known
+        elif isinstance(effect, SessionStepEffect):
+            pieces, whole = len(effect.starts), data.frames
+        else:
+            continue
+        if pieces > max(3, MANY * whole):
+            names.append(effect.name)
+    return names
 
 
 def significant(found: Sequence[Structure]) -> list[Structure]:
@@ -267,15 +276,17 @@ def _worth(
 ) -> bool:
     """Whether held-out data gain a fair part of what the fitted data gain.
 
-    Frames decide; landmarks may object, except to an effect on the target itself, of which those
-    left out say nothing.  Range bands are told in the trace only: what is free extrapolates badly
-    from one band to another.  Where residuals depend on each other, a cause must also explain a
-    hundredth of the misfit.
+    Held-out landmarks and range bands may object, landmarks not to a survey of single ones, of
+    which the others say nothing.  Where residuals depend on each other, a cause must also explain
+    a hundredth of the misfit.
     """
-    explained = candidate.score.statistic
-    fair = gains['landmarks' if candidate.effect.per_frame else 'frames'] > 0.2 * explained
-    if candidate.effect.stage != 'target':
-        fair = fair and gains['landmarks'] > 0
+    effect, explained = candidate.effect, candidate.score.statistic
+    fair = gains['landmarks' if effect.per_frame else 'frames'] > 0.2 * explained
+    if not _is_survey(effect):
+        objections = ['range_bands']
+        if effect.name != LandmarkSurveyEffect.name:
+            objections.append('landmarks')
+        fair = fair and all(gains[name] > 0 for name in objections)
     material = explained > 0.01 * float((linear.residual**2).sum())
     return fair and (material or not correlation.dependent)
 

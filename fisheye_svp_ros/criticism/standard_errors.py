@@ -4,10 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.criticism.correlation import Correlation
-from fisheye_svp_ros.criticism.model import Linearised, is_shared
-from fisheye_svp_ros.criticism.projection import Nuisance
+from fisheye_svp_ros.criticism.model import (
+    Linearised,
+    gather,
+    is_shared,
+    landmark_groups,
+    on_target,
+    survey_of,
+)
+from fisheye_svp_ros.criticism.projection import (
+    Nuisance,
+    basis,
+    block_basis,
+    landmark_crossings,
+)
 
 
 def standard_errors(
@@ -17,26 +29,63 @@ def standard_errors(
 
     From the information matrix with poses (and free landmarks) projected out.  Where neighbours'
     residuals agree, sums over frames and over landmarks take the place of independent rows
-    (two-way clusters), never below the independent figure.
+    (two-way clusters), never below the independent figure.  NaN: not determined, or of the noise.
     """
+    variance = nuisance.misfit / max(nuisance.freedom, 1)
     width = linear.shared_columns.shape[-1]
     columns = nuisance.outside_blocks(linear.shared_columns).reshape(linear.residual.size, width)
-    scale = np.maximum(np.sqrt((linear.shared_columns**2).sum(axis=(0, 1))), 1e-300)
-    columns = columns / scale
-    variance = nuisance.misfit / max(nuisance.freedom, 1)
-    inverse = np.linalg.pinv(columns.T @ columns, rcond=1e-14, hermitian=True)
+    scale = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
+    columns = columns / np.maximum(scale, 1e-300)
+    inverse, open_ = _inverse(columns.T @ columns)
     errors = np.sqrt(variance * np.diag(inverse))
     if correlation.dependent:
         errors = np.maximum(errors, _clustered(linear, nuisance, columns @ inverse))
-    errors = errors / scale
+    errors = np.where(open_, np.nan, errors / np.maximum(scale, 1e-300))
     result, at = [], width - _count(linear)
     for effect, values in linear.state.terms:
         if is_shared(effect):
             result.append(errors[at : at + len(values)])
             at += len(values)
+        elif effect is survey_of(linear.state.terms):
+            result.append(_survey_errors(linear, variance, len(values) // 3))
         else:
             result.append(np.full(len(values), np.nan))
     return result
+
+
+def _inverse(gram: Array) -> tuple[Array, Mask]:
+    """Return the pseudoinverse (P, P) and which parameters (P,) it leaves open."""
+    values, vectors = np.linalg.eigh(gram)
+    kept = values > 1e-14 * values.max(initial=0.0)
+    inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    return inverse, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+
+
+def _survey_errors(linear: Linearised, variance: float, landmarks: int) -> Array:
+    """Return the standard errors (3 L,) of all landmarks, with their common motion held at zero.
+
+    The free landmarks leave the place, and in part the size and shape, of the target open; the
+    pseudoinverse settles that (free network adjustment).
+    """
+    rows, poses = linear.rows, block_basis(linear.frame_columns)
+    shared = linear.shared_columns[..., ~on_target(linear)]
+    outside = shared - poses @ (np.swapaxes(poses, -1, -2) @ shared)
+    norms = np.sqrt((shared**2).sum(axis=(0, 1)))
+    group = landmark_groups(rows.landmark, rows.survey >= 0)
+    place = gather(linear.whitened(linear.linear.d_target), group)
+    taken = landmark_crossings(
+        place, group, poses, basis(outside, norms).reshape(*poses.shape[:2], -1)
+    )
+    count = len(group)
+    crossed = np.concatenate([part.reshape(3 * count, -1) for part in taken], axis=-1)
+    information = -crossed @ crossed.T
+    blocks = information.reshape(count, 3, count, 3)
+    blocks[np.arange(count), :, np.arange(count)] += np.swapaxes(place, -1, -2) @ place
+    covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
+    errors = np.full((landmarks, 3), np.nan)
+    slot = rows.survey.ravel()[group[:, 0]]
+    errors[slot] = np.sqrt(variance * np.maximum(np.diag(covariance), 0.0)).reshape(-1, 3)
+    return errors.ravel()
 
 
 def _clustered(linear: Linearised, nuisance: Nuisance, influence: Array) -> Array:

@@ -36,8 +36,8 @@ class Structure(NamedTuple):
 
     @property
     def of_mean(self) -> bool:
-        """Whether it speaks of a pattern, not of scatter or of neighbours alone."""
-        return self.variable in (*_PLACES, *_TIMES, 'landmark')
+        """Whether it speaks of a pattern, not of scatter alone."""
+        return self.variable in (*_PLACES, *_TIMES, 'landmark', 'neighbour_correlation')
 
     @property
     def weighty(self) -> float:
@@ -45,7 +45,7 @@ class Structure(NamedTuple):
 
         Half of a pattern in time: fields of their own in every frame hold a lot of any remainder.
         """
-        return 1.0 * (self.variable in _PLACES) + 0.5 * (self.variable in _TIMES)
+        return 1.0 * (self.variable in (*_PLACES, 'landmark')) + 0.5 * (self.variable in _TIMES)
 
 
 _PLACES = ('image', 'theta', 'range', 'pixel_phase')
