@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 
+@cache
 def share_directory() -> Path:
     """Return the directory that holds config/: the source tree, or <prefix>/share/<package>."""
     package = Path(__file__).resolve().parent

@@ -19,7 +19,8 @@ from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.settings import SolverSettings
-from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.flat_target import localize_both_sides
+from fisheye_svp_ros.solve.localization import Localization
 
 
 class Localizer(SolverNode):
@@ -42,7 +43,7 @@ class Localizer(SolverNode):
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         seen: messages.ImagePoints = items['image_points']
         views, model = self.views(stamp, landmarks, seen), self.model(items)
-        solution = localize(model, views)
+        solution = localize_both_sides(model, views)
         if not solution.converged[0]:
             raise GeometryError(NO_POSE)
         pose, world = solution.pose.take(0), landmarks.frame

@@ -17,10 +17,12 @@ from fisheye_svp_ros.solve.localization import Localization, localize
 _FLAT = 0.1  # thickness of a target relative to its length
 
 
-def localize_both_sides(model: ForwardModel, views: Views, start: Pose) -> Localization:
+def localize_both_sides(
+    model: ForwardModel, views: Views, start: Pose | None = None
+) -> Localization:
     """Return the better of the poses that the starts (S,) and their reflections lead to.
 
-    Raises GeometryError as `localize` does.
+    No start value is needed.  Raises GeometryError as `localize` does.
     """
     found = localize(model, views, start)
     centred, centre = _centred(views)

@@ -11,7 +11,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
-from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, start_poses
+from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization
 
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
 
@@ -36,7 +36,7 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
     """
     views, left_out = posable_views(observations, model)
-    result = localize_both_sides(model, views, start_poses(model, views))
+    result = localize_both_sides(model, views)
     fixed = result.converged
     if not fixed.all():
         left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
