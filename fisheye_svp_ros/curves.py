@@ -1,17 +1,23 @@
 """Lens curves: image height h(theta)/f and viewpoint shift s(theta), with their derivatives.
 
 A new curve is one class here and one line in its registry.  All angles in rad, shifts in m.
-Curves take arrays of any shape and return arrays of that shape.
+Curves take arrays of any shape and return arrays of that shape.  A curve whose `formula` is in
+`formulas` is faster: it need not start from theta alone, and it can be compiled.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import numpy as np
 
+from fisheye_svp_ros import formulas
 from fisheye_svp_ros.arrays import Array
+
+# (theta, sin, cos, *coefficients) -> value and slope; of a shift: value and slope times sin
+Formula = Callable[..., tuple[Array, Array]]
 
 
 class ImageHeight(Protocol):
@@ -61,69 +67,67 @@ class ViewpointShift(Protocol):
         """Return the derivatives of s with respect to the coefficients, shape (..., K)."""
 
 
-class _NoCoefficients:
+class _Height:
     coefficient_names: ClassVar[tuple[str, ...]] = ()
-    coefficients: tuple[float, ...] = ()
+    formula: ClassVar[Formula]
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        return tuple(getattr(self, name) for name in self.coefficient_names)
+
+    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
+        return self.formula(theta, np.sin(theta), np.cos(theta), *self.coefficients)
 
     def columns(self, theta: Array) -> Array:
         return np.empty((*np.shape(theta), 0))
 
 
 @dataclass(frozen=True)
-class Orthographic(_NoCoefficients):
+class Orthographic(_Height):
     """h = f sin(theta)."""
 
     limit: ClassVar[float] = np.pi / 2
-
-    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        return np.sin(theta), np.cos(theta)
+    formula = staticmethod(formulas.orthographic)
 
     def angle(self, height: Array) -> Array:
         return np.arcsin(np.minimum(height, 1.0))
 
 
 @dataclass(frozen=True)
-class Equidistant(_NoCoefficients):
+class Equidistant(_Height):
     """h = f theta."""
 
     limit: ClassVar[float] = np.pi
-
-    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        return theta, np.ones_like(theta)
+    formula = staticmethod(formulas.equidistant)
 
     def angle(self, height: Array) -> Array:
         return height
 
 
 @dataclass(frozen=True)
-class Equisolid(_NoCoefficients):
+class Equisolid(_Height):
     """h = 2 f sin(theta / 2)."""
 
     limit: ClassVar[float] = np.pi
-
-    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        return 2 * np.sin(theta / 2), np.cos(theta / 2)
+    formula = staticmethod(formulas.equisolid)
 
     def angle(self, height: Array) -> Array:
         return 2 * np.arcsin(np.minimum(height / 2, 1.0))
 
 
 @dataclass(frozen=True)
-class Stereographic(_NoCoefficients):
+class Stereographic(_Height):
     """h = 2 f tan(theta / 2)."""
 
     limit: ClassVar[float] = np.pi
-
-    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        half = np.tan(theta / 2)
-        return 2 * half, 1 + half * half
+    formula = staticmethod(formulas.stereographic)
 
     def angle(self, height: Array) -> Array:
         return 2 * np.arctan(height / 2)
 
 
 @dataclass(frozen=True)
-class KannalaBrandt:
+class KannalaBrandt(_Height):
     """h = f (theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9).
 
     Source: Kannala and Brandt, PAMI 2006, eq. 6, with the factor f taken out (OpenCV's fisheye).
@@ -134,10 +138,7 @@ class KannalaBrandt:
     k3: float = 0.0
     k4: float = 0.0
     coefficient_names: ClassVar[tuple[str, ...]] = ('k1', 'k2', 'k3', 'k4')
-
-    @property
-    def coefficients(self) -> tuple[float, ...]:
-        return self.k1, self.k2, self.k3, self.k4
+    formula = staticmethod(formulas.kannala_brandt)
 
     @property
     def limit(self) -> float:
@@ -145,13 +146,6 @@ class KannalaBrandt:
         roots = np.roots([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         return float(min(np.sqrt(real.min()), np.pi)) if real.size else np.pi
-
-    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        k1, k2, k3, k4 = self.coefficients
-        z = theta * theta
-        height = theta * (1 + z * (k1 + z * (k2 + z * (k3 + z * k4))))
-        slope = 1 + z * (3 * k1 + z * (5 * k2 + z * (7 * k3 + z * (9 * k4))))
-        return height, slope
 
     def angle(self, height: Array) -> Array:
         return invert_height(self, height)
@@ -161,8 +155,25 @@ class KannalaBrandt:
         return theta[..., None] * z[..., None] ** np.arange(1, 5)
 
 
+class _Shift:
+    coefficient_names: ClassVar[tuple[str, ...]]
+    formula: ClassVar[Formula]
+
+    @property
+    def coefficients(self) -> tuple[float, ...]:
+        return tuple(getattr(self, name) for name in self.coefficient_names)
+
+    def value_and_slope(self, theta: Array, half_tan: Array) -> tuple[Array, Array]:
+        # The guards only matter on the axis, where the slope of every shift vanishes.
+        t, theta = np.maximum(half_tan, formulas.NOWHERE), np.maximum(theta, 2 * formulas.NOWHERE)
+        scale = 1 / (1 + t * t)
+        sin, cos = 2 * t * scale, (1 - t * t) * scale
+        value, rise = self.formula(theta, sin, cos, *self.coefficients)
+        return value, np.where(theta > 1e-9, rise / sin, 0.0)
+
+
 @dataclass(frozen=True)
-class Gennery:
+class Gennery(_Shift):
     """s = s0 + (theta / sin(theta) - 1) (e0 + e1 theta^2 + e2 theta^4), all in m.
 
     Source: Gennery, IJCV 68(3), 2006 (CAHVORE); the entrance pupil moves this way when s0 = 0.
@@ -174,22 +185,7 @@ class Gennery:
     e2: float = 0.0
     coefficient_names: ClassVar[tuple[str, ...]] = ('s0', 'e0', 'e1', 'e2')
     limit: ClassVar[float] = np.pi
-
-    @property
-    def coefficients(self) -> tuple[float, ...]:
-        return self.s0, self.e0, self.e1, self.e2
-
-    def value_and_slope(self, theta: Array, half_tan: Array) -> tuple[Array, Array]:
-        # 1 / sin(theta) = (1 + t^2) / 2t; the guard only matters at theta = 0, where g = g' = 0.
-        t = np.maximum(half_tan, 1e-150)
-        cosecant = (1 + t * t) / (2 * t)
-        ratio = theta * cosecant
-        growth = np.where(theta > 0, ratio - 1, 0.0)
-        growth_slope = np.where(theta > 1e-9, cosecant - ratio * (1 - t * t) / (2 * t), 0.0)
-        z = theta * theta
-        factor = self.e0 + z * (self.e1 + z * self.e2)
-        factor_slope = theta * (2 * self.e1 + 4 * self.e2 * z)
-        return self.s0 + growth * factor, growth_slope * factor + growth * factor_slope
+    formula = staticmethod(formulas.gennery)
 
     def columns(self, theta: Array) -> Array:
         growth = 1 / np.sinc(theta / np.pi) - 1
@@ -198,7 +194,7 @@ class Gennery:
 
 
 @dataclass(frozen=True)
-class FlatPort:
+class FlatPort(_Shift):
     """s = d (1 - cos(theta) / sqrt(n^2 - sin(theta)^2)): a plane window square to the axis.
 
     d: thickness, m; n: refractive index relative to the medium on both sides.  Snell's law: the
@@ -209,23 +205,33 @@ class FlatPort:
     refractive_index: float
     coefficient_names: ClassVar[tuple[str, ...]] = ('thickness', 'refractive_index')
     limit: ClassVar[float] = np.pi / 2
-
-    @property
-    def coefficients(self) -> tuple[float, ...]:
-        return self.thickness, self.refractive_index
-
-    def value_and_slope(self, theta: Array, half_tan: Array) -> tuple[Array, Array]:
-        t2 = half_tan * half_tan
-        cos, sin = (1 - t2) / (1 + t2), 2 * half_tan / (1 + t2)
-        n2 = self.refractive_index**2
-        root = np.sqrt(n2 - sin * sin)
-        shift = self.thickness * (1 - cos / root)
-        return shift, self.thickness * sin * (n2 - 1) / root**3
+    formula = staticmethod(formulas.flat_port)
 
     def columns(self, theta: Array) -> Array:
         cos, n = np.cos(theta), self.refractive_index
         root = np.sqrt(n * n - np.sin(theta) ** 2)
         return np.stack([1 - cos / root, self.thickness * cos * n / root**3], axis=-1)
+
+
+def height_at(
+    curve: ImageHeight, theta: Array, sin: Array, cos: Array
+) -> tuple[Array, Array]:
+    """Return h/f and its derivative where sine and cosine are at hand."""
+    formula: Formula | None = getattr(curve, 'formula', None)
+    if formula is None:
+        return curve.value_and_slope(theta)
+    return formula(theta, sin, cos, *curve.coefficients)
+
+
+def shift_at(
+    curve: ViewpointShift, theta: Array, sin: Array, cos: Array
+) -> tuple[Array, Array]:
+    """Return s and sin ds/dtheta where sine and cosine are at hand; theta above 0."""
+    formula: Formula | None = getattr(curve, 'formula', None)
+    if formula is None:
+        value, slope = curve.value_and_slope(theta, sin / (1 + cos))
+        return value, slope * sin
+    return formula(theta, sin, cos, *curve.coefficients)
 
 
 def invert_height(curve: ImageHeight, height: Array) -> Array:

@@ -1,0 +1,97 @@
+"""The formulas of a lens, point by point: what every engine computes, written once.
+
+Each works alike on arrays and on single numbers, so that one engine can run them with NumPy and
+another can compile them.  Angles in rad, lengths in m; `sin` and `cos` are those of theta.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+
+NOWHERE = 1e-30  # m; added to X, it gives points on the axis a direction and changes no other
+
+
+def orthographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Return sin(theta) and its derivative."""
+    return sin, cos
+
+
+def equidistant(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Return theta and its derivative."""
+    return theta, theta * 0.0 + 1.0
+
+
+def equisolid(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Return 2 sin(theta / 2) and its derivative."""
+    half_sin, half_cos = _halved(sin, cos)
+    return 2.0 * half_sin, half_cos
+
+
+def stereographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Return 2 tan(theta / 2) and its derivative."""
+    half_sin, half_cos = _halved(sin, cos)
+    half_tan = half_sin / half_cos
+    return 2.0 * half_tan, 1.0 + half_tan * half_tan
+
+
+def kannala_brandt(
+    theta: Array, sin: Array, cos: Array, k1: float, k2: float, k3: float, k4: float
+) -> tuple[Array, Array]:
+    """Return theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9 and its derivative."""
+    z = theta * theta
+    height = theta * (1.0 + z * (k1 + z * (k2 + z * (k3 + z * k4))))
+    slope = 1.0 + z * (3.0 * k1 + z * (5.0 * k2 + z * (7.0 * k3 + z * (9.0 * k4))))
+    return height, slope
+
+
+def gennery(
+    theta: Array, sin: Array, cos: Array, s0: float, e0: float, e1: float, e2: float
+) -> tuple[Array, Array]:
+    """Return s = s0 + (theta / sin - 1) (e0 + e1 theta^2 + e2 theta^4) and sin ds/dtheta."""
+    ratio = theta / sin
+    growth = ratio - 1.0
+    z = theta * theta
+    factor = e0 + z * (e1 + z * e2)
+    factor_rise = theta * sin * (2.0 * e1 + (4.0 * e2) * z)
+    return s0 + growth * factor, (1.0 - ratio * cos) * factor + growth * factor_rise
+
+
+def flat_port(
+    theta: Array, sin: Array, cos: Array, thickness: float, refractive_index: float
+) -> tuple[Array, Array]:
+    """Return s = d (1 - cos / sqrt(n^2 - sin^2)) and sin ds/dtheta."""
+    n2, sin2 = refractive_index * refractive_index, sin * sin
+    inverse = 1.0 / np.sqrt(n2 - sin2)
+    rise = thickness * (n2 - 1.0) * sin2 * inverse * inverse * inverse
+    return thickness * (1.0 - cos * inverse), rise
+
+
+def approach(
+    r: Array, z: Array, sin: Array, cos: Array, shift: Array, rise: Array
+) -> tuple[Array, Array]:
+    """Return Newton's step of theta in r cos - (z - s) sin = 0, and the clearance, m.
+
+    The clearance is the equation's derivative, its sign turned; rise: sin ds/dtheta.
+    """
+    reach = z - shift
+    clearance = r * sin + reach * cos - rise
+    return (r * cos - reach * sin) / clearance, clearance
+
+
+def point_derivatives(
+    height: Array, slope: Array, sin: Array, cos: Array, inverse_r: Array, clearance: Array
+) -> tuple[Array, Array, Array]:
+    """Return the derivatives of h/f across, along (less across) and parallel to the axis, 1/m."""
+    steep = slope / clearance
+    across = height * inverse_r
+    return across, steep * cos - across, -steep * sin
+
+
+def _halved(sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Sine and cosine of theta / 2; the larger comes first, as rounding wants it."""
+    larger = np.sqrt(0.5 + 0.5 * np.abs(cos))
+    smaller = 0.5 * sin / larger
+    ahead = cos >= 0.0
+    return np.where(ahead, smaller, larger), np.where(ahead, larger, smaller)
