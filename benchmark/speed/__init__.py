@@ -1,0 +1,1 @@
+"""`make bench`: speed beside what a user would pick instead, written to docs/benchmarks.md."""

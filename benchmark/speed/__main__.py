@@ -1,0 +1,47 @@
+"""`python -m benchmark.speed`: measure everything and write docs/benchmarks.md."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+
+# One core: read when NumPy and its peers are imported.
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+
+from benchmark.speed import commands, cores, growth, localization, nodes, projection, stereo  # noqa: E402
+from benchmark.speed.report import document  # noqa: E402
+from benchmark.speed.scenes import NOISE_PX  # noqa: E402
+from fisheye_svp_ros.files import write_text  # noqa: E402
+from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
+
+_PARTS = {
+    'projection': projection.rows,
+    'localization': localization.rows,
+    'stereo': stereo.rows,
+    'cores': cores.rows,
+    'growth': growth.tables,
+    'nodes': nodes.tables,
+    'commands': commands.tables,
+}
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(prog='python -m benchmark.speed', description=__doc__)
+    parser.add_argument('--only', nargs='+', choices=_PARTS, default=list(_PARTS))
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/benchmarks.md'))
+    args = parser.parse_args()
+    sections = []
+    with progress('measuring', len(args.only)) as advance:
+        for part in args.only:
+            sections += _PARTS[part]()
+            advance()
+    chosen = '' if args.only == list(_PARTS) else f' --only {" ".join(args.only)}'
+    write_text(args.output, document(f'python -m benchmark.speed{chosen}', NOISE_PX, sections))
+    print(args.output)
+
+
+if __name__ == '__main__':
+    main()

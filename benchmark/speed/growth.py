@@ -1,0 +1,127 @@
+"""Table: how time and memory grow with the size of a problem."""
+
+from __future__ import annotations
+
+import tracemalloc
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmark.speed.harness import Side, exponent, measure
+from benchmark.speed.report import Table, number
+from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
+from fisheye_svp_ros.camera import project
+from fisheye_svp_ros.criticism.correlation import Correlation
+from fisheye_svp_ros.criticism.diagnosis import diagnose
+from fisheye_svp_ros.criticism.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.criticism.projection import Nuisance
+from fisheye_svp_ros.criticism.screening import screen
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.landmarks import environment
+from fisheye_svp_ros.observations import Observations
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.rig import paper_pose
+from fisheye_svp_ros.simulation import simulate
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
+
+_TEXT = """Time is the median of repeats in turns, memory the peak of what was allocated on top (as
+tracemalloc sees it), by the engine that the package picks itself. The exponents are fitted over
+all sizes: 1 is proportional growth."""
+
+
+class Growth(NamedTuple):
+    """Work whose size grows: what `make` prepares for a size is timed."""
+
+    work: str
+    what: str
+    sizes: Sequence[int]
+    make: Callable[[int], Callable[[], Any]]
+
+
+def tables(repeats: int = 5) -> list[Table]:
+    """Return the table."""
+    header = ('work', 'that grows', 'sizes', 'time, ms', 'exponent', 'memory, MB', 'exponent')
+    return [Table('Growth', header, [line(growth, repeats) for growth in growths()], _TEXT)]
+
+
+def line(growth: Growth, repeats: int) -> tuple[str, ...]:
+    """Return the line of the table of one kind of work."""
+    runs = {size: growth.make(size) for size in growth.sizes}
+    timings = measure([Side(str(size), run) for size, run in runs.items()], repeats)
+    seconds = [timing.median for timing in timings]
+    memory = [_peak(run) for run in runs.values()]
+    return (
+        growth.work, growth.what, ' '.join(map(str, growth.sizes)),
+        ' '.join(number(1e3 * value) for value in seconds),
+        f'{exponent(growth.sizes, seconds):.2f}',
+        ' '.join(number(value / 1e6) for value in memory),
+        f'{exponent(growth.sizes, memory):.2f}',
+    )
+
+
+def growths() -> list[Growth]:
+    """Return what grows."""
+    return [
+        Growth('projection, ShiftVP', 'points', (20_000, 100_000, 500_000), _projection),
+        Growth('a localization, ShiftVP', 'landmarks', (100, 1000, 10_000), _landmarks),
+        Growth('localizations, ShiftVP', 'views', (100, 1000, 10_000), _views),
+        Growth('stereo calibration', 'views', (10, 40, 160), _stereo),
+        Growth('screening, 30 frames', 'effects', (5, 10, 20), _screening),
+        Growth('diagnosis', 'frames', (10, 20, 40), _diagnosis),
+    ]
+
+
+def _projection(count: int) -> Callable[[], Any]:
+    lens, seen = shift_lens(), points(count, np.radians(100.0))
+    return lambda: project(lens, seen)
+
+
+def _landmarks(count: int) -> Callable[[], Any]:
+    scene = localization(shift_lens(), 1, count)
+    model = ForwardModel(scene.lens)
+    return lambda: localize(model, scene.views)
+
+
+def _views(count: int) -> Callable[[], Any]:
+    scene = localization(shift_lens(), count, LANDMARKS)
+    model = ForwardModel(scene.lens)
+    return lambda: localize(model, scene.views)
+
+
+def _stereo(count: int) -> Callable[[], Any]:
+    scene = stereo(svp_lens(), count)
+    model = ForwardModel(scene.lens)
+    return lambda: calibrate_stereo(model, model, scene.left, scene.right)
+
+
+def _screening(count: int) -> Callable[[], Any]:
+    data = prepare(_seen(30))
+    linear = Linearised(data, fit(data, start(data, shift_lens().svp()), ()), ())
+    nuisance, independent = Nuisance(linear), Correlation(0.0, 1.0, lambda _: 1.0)
+    names = [name for name, effect in CATALOGUE.items() if effect.stage != 'noise'][:count]
+    return lambda: screen(linear, nuisance, independent, names)
+
+
+def _diagnosis(count: int) -> Callable[[], Any]:
+    seen, lens = _seen(count), shift_lens().svp()
+    return lambda: diagnose(seen, lens)
+
+
+def _seen(frames: int) -> Observations:
+    """Return what a lens with a shift sees of the paper's landmarks, at 0.5 m."""
+    rng = np.random.default_rng(1)
+    turn = rotation_from_vector(rng.uniform(-0.5, 0.5, (frames, 3)))
+    poses = Pose(turn @ paper_pose(frames).rotation, rng.uniform(-0.1, 0.1, (frames, 3)))
+    return simulate(ForwardModel(shift_lens()), environment('whole', 0.5), poses, 0.2, rng)
+
+
+def _peak(run: Callable[[], Any]) -> float:
+    tracemalloc.start()
+    try:
+        run()
+        return float(tracemalloc.get_traced_memory()[1])
+    finally:
+        tracemalloc.stop()

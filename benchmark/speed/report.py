@@ -1,0 +1,130 @@
+"""docs/benchmarks.md from what was measured."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Iterator, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import NamedTuple
+
+from benchmark.speed.compiled import compiler, mrcal_revision
+from benchmark.speed.harness import OURS, NotHereError, Row
+
+_PACKAGES = ('numpy', 'scipy', 'numba', 'opencv-python-headless', 'poselib', 'pycolmap', 'gtsam',
+             'cyclonedds')
+# Columns of words; all others hold numbers.
+_WORDS = ('what', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met')
+_HEAD = """# Benchmarks
+
+Written by `make bench`, which runs `{command}` in an environment of its own
+(`benchmark/requirements.txt`); no peer is a dependency of this package.
+
+All sides of a table do the same work with the same lens (of `config/lenses`), the same data with
+{noise} px of noise, and the same start; they run in turns in one process, on one core unless said
+otherwise. Figures are medians over the turns. "Off" is the largest distance of a result from that
+of the common answer: image points from those of the NumPy engine, poses and rigs from those of
+SciPy's `least_squares` with tolerances of 1e-14 and a last Gauss-Newton step (SciPy compares sums
+of squares, which cannot tell poses 1e-10 m apart). Ratios say how many times faster the package is
+than the peer in that line.
+"""
+
+
+class Table(NamedTuple):
+    """A section with one table; `notes` stand below."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    text: str = ''
+    notes: Sequence[str] = ()
+
+
+def document(command: str, noise: float, sections: Sequence[Row | Table]) -> str:
+    """Return the report as Markdown."""
+    rows = [section for section in sections if isinstance(section, Row)]
+    parts = [_HEAD.format(command=command, noise=noise)]
+    tables = [versions(), goals(rows), *(
+        of_row(section) if isinstance(section, Row) else section for section in sections
+    )]
+    return '\n'.join([*parts, *(markdown(table) for table in tables)])
+
+
+def markdown(table: Table) -> str:
+    """Return a section as Markdown."""
+    lines = [f'## {table.title}', '']
+    if table.text:
+        lines += [table.text, '']
+    if table.rows:
+        marks = ['---' if name in _WORDS else '---:' for name in table.header]
+        lines += ['| ' + ' | '.join(row) + ' |' for row in (table.header, marks, *table.rows)]
+        lines.append('')
+    lines += [f'- {note}' for note in table.notes]
+    return '\n'.join(lines) + ('\n' if table.notes else '')
+
+
+def number(value: float) -> str:
+    """Return a number to three digits."""
+    return f'{value:.0f}' if value >= 100 else f'{value:.3g}'
+
+
+def versions() -> Table:
+    """Say what was compared, and on what."""
+    found = {'Python': platform.python_version(), 'processor': _processor()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = 'not installed'
+    for name, look in (('C compiler', compiler), ('mrcal (source)', mrcal_revision)):
+        try:
+            found[name] = look()
+        except NotHereError as reason:
+            found[name] = str(reason)
+    return Table('Versions', ('what', 'version'), list(found.items()))
+
+
+def goals(rows: Sequence[Row]) -> Table:
+    """Compare with what is to be reached."""
+    lines = []
+    for row in rows:
+        for goal in row.goals:
+            reached = row.ratio(goal.ours, goal.peer)
+            met = '-' if reached is None else 'yes' if reached >= goal.ratio else 'no'
+            lines.append((
+                f'{row.title}: {goal.ours} against {goal.peer}', f'{goal.ratio:.3g} ×',
+                'not measured' if reached is None else f'{number(reached)} ×', met,
+            ))
+    return Table('Goals', ('what', 'goal', 'reached', 'met'), lines)
+
+
+def of_row(row: Row) -> Table:
+    """Return the table of one row: a line a side."""
+    ours = [timing.name for timing in row.timings if timing.name.startswith(OURS)]
+    header = (
+        'who', row.unit, 'quartiles', f'off, {row.error_unit}',
+        *(f'{name.removeprefix(OURS + ", ")} is faster by' for name in ours), 'notes',
+    )
+    lines = []
+    for timing in row.timings:
+        low, middle, high = (number(value / row.scale) for value in timing.quartiles)
+        ratios = (
+            '' if name == timing.name else f'{number(row.ratio(name, timing.name))} ×'
+            for name in ours
+        )
+        off = '' if timing.error is None else f'{timing.error:.1e}'
+        lines.append((timing.name, middle, f'{low} to {high}', off, *ratios, timing.note))
+    notes = [f'{name} did not take part: {why}.' for name, why in row.left_out.items()]
+    return Table(row.title, header, lines, row.text, notes)
+
+
+def _processor() -> str:
+    for line in _lines(Path('/proc/cpuinfo')):
+        if line.startswith('model name'):
+            return line.split(':', 1)[1].strip()
+    return platform.processor() or platform.machine()
+
+
+def _lines(path: Path) -> Iterator[str]:
+    if path.is_file():
+        yield from path.read_text(encoding='utf-8', errors='replace').splitlines()

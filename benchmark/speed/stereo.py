@@ -1,0 +1,92 @@
+"""Rows: calibration of a stereo rig from views of a board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from benchmark.speed import engines
+from benchmark.speed.harness import Goal, Row, Side, available, measure, require
+from benchmark.speed.peers import TOLERANCE
+from benchmark.speed.rig_adjustment import gtsam_rig, mrcal_pose, mrcal_rig, opencv_rig, scipy_rig
+from benchmark.speed.scenes import StereoScene, stereo, svp_lens
+from fisheye_svp_ros.curves import Stereographic
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
+
+OPENCV = 'cv2.fisheye.stereoCalibrate'
+_EXACT = 1e-14
+_PEERS = {
+    OPENCV: ('cv2', opencv_rig, 'finds its own start'),
+    'GTSAM': ('gtsam', gtsam_rig, 'two custom factors a view, with the hand-written C'),
+    'SciPy': ('scipy', partial(scipy_rig, tolerance=TOLERANCE), 'dense, with the hand-written C'),
+}
+
+
+def rows(views: int = 10, repeats: int = 15) -> list[Row]:
+    """Return the rows about a rig and `views` poses."""
+    return [_kannala_brandt(views, repeats), _stereographic(views, repeats)]
+
+
+def _kannala_brandt(views: int, repeats: int) -> Row:
+    scene = stereo(svp_lens(), views)
+    off = _off(scene)
+    makers = engines.sides(_ours(scene), error=off, note='finds its own start')
+    makers |= {
+        name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()
+    }
+    goals = [Goal(engines.name_of(e), OPENCV, ratio) for e, ratio in (('numpy', 4), ('numba', 20))]
+    return _row(scene, 'SVP Kannala-Brandt', makers, repeats, goals)
+
+
+def _stereographic(views: int, repeats: int) -> Row:
+    scene = stereo(replace(svp_lens(), image_height=Stereographic()), views)
+    off = _off(scene)
+    with ExitStack() as stack:
+
+        def mrcal() -> Side:
+            run = stack.enter_context(mrcal_rig(scene))
+            return Side(
+                'mrcal', run, 1.0, lambda answer: off(mrcal_pose(answer)),
+                lambda answer: float(answer['seconds']),
+                'in a process of its own that reports its own time',
+            )
+
+        makers = engines.sides(_ours(scene), error=off, note='finds its own start')
+        goals = [Goal(engines.name_of('numba'), 'mrcal', 3.0)]
+        return _row(
+            scene, 'SVP stereographic', makers | {'mrcal': mrcal}, repeats, goals
+        )
+
+
+def _peer(
+    name: str, module: str, solve: Callable[[StereoScene], Pose], note: str,
+    scene: StereoScene, off: Callable[[Pose], float],
+) -> Side:
+    require(module)
+    return Side(name, lambda: solve(scene), error=off, note=note)
+
+
+def _ours(scene: StereoScene) -> Callable[[], Pose]:
+    model = ForwardModel(scene.lens)
+    return lambda: calibrate_stereo(model, model, scene.left, scene.right).rig.take(0)
+
+
+def _off(scene: StereoScene) -> Callable[[Pose], float]:
+    exact = scipy_rig(scene, _EXACT, exact=True)
+    return lambda rig: float(np.linalg.norm(rig.position - exact.position))
+
+
+def _row(
+    scene: StereoScene, lens: str, makers: dict[str, Callable[[], Side]], repeats: int,
+    goals: list[Goal],
+) -> Row:
+    sides, left_out = available(makers)
+    views, board = len(scene.left.uv), len(scene.board)
+    title = f'Stereo calibration, {views} × {board}, {6 * views + 6} unknowns, {lens}'
+    return Row(title, 'ms', 1e-3, measure(sides, repeats), 'm', left_out, goals)
