@@ -7,7 +7,7 @@ Curves take arrays of any shape and return arrays of that shape.  A curve whose 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -45,7 +45,7 @@ class ImageHeight(Protocol):
         """Return the derivatives of h/f with respect to the coefficients, shape (..., K)."""
 
 
-class ViewpointShift(Protocol):
+class ViewpointShift(Hashable, Protocol):
     """A viewpoint-shift curve s(theta), m."""
 
     @property

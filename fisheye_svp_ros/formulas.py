@@ -81,11 +81,11 @@ def approach(
 
 
 def point_derivatives(
-    height: Array, slope: Array, sin: Array, cos: Array, inverse_r: Array, clearance: Array
+    height: Array, slope: Array, sin: Array, cos: Array, r: Array, clearance: Array
 ) -> tuple[Array, Array, Array]:
     """Return the derivatives of h/f across, along (less across) and parallel to the axis, 1/m."""
     steep = slope / clearance
-    across = height * inverse_r
+    across = height / r
     return across, steep * cos - across, -steep * sin
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.camera import Image, LinearImage, Rays, back_project, project
-from fisheye_svp_ros.camera import project_with_jacobian as _linear
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
@@ -24,21 +24,36 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 Term = tuple[Effect, Array]
 
 
-class LinearViews(NamedTuple):
+@dataclass(frozen=True)
+class LinearViews:
     """Predicted image points of views and their derivatives.
 
     uv (S, N, 2), px; valid (S, N); d_pose (S, N, 2, 6), px/m and px/rad, by the small change of
-    `pose.Pose.retract`; d_target (S, N, 2, 3), px/m; image: the lens's own derivatives;
-    ideal, optical (S, N, 2), px: uv before image effects, and before detector effects.
+    `pose.Pose.retract`; ideal, optical (S, N, 2), px: uv before image effects, and before detector
+    effects; lens, pose (S,), points (S, N, 3), m: what was seen, after target and pose effects.
     """
 
     uv: Array
     valid: Mask
     d_pose: Array
-    d_target: Array
-    image: LinearImage
     ideal: Array
     optical: Array
+    lens: Lens
+    pose: Pose
+    points: Array
+    limited: bool
+
+    @cached_property
+    def d_target(self) -> Array:
+        """Derivatives (S, N, 2, 3) by the places of the points in the world, px/m."""
+        return -self.d_pose[..., :3]
+
+    @cached_property
+    def image(self) -> LinearImage:
+        """The lens's own derivatives."""
+        d_point = self.d_target @ self.pose.rotation[:, None]
+        local = self.pose.into_body(self.points)
+        return LinearImage(self.lens, local, self.limited, self.ideal, self.valid, d_point)
 
 
 class ForwardModel:
@@ -47,10 +62,12 @@ class ForwardModel:
     def __init__(self, lens: Lens, terms: Sequence[Term] | None = None) -> None:
         """Take the effects of the lens, or others in their place.
 
+        `plain`: what the lens's own curves do is all there is.
         Raises LensError for an effect that is unknown or incomplete.
         """
         self.terms = load_effects(lens.effects, lens.name) if terms is None else tuple(terms)
         self.lens = _extended(lens, self.terms)
+        self.plain = not self._of('target', 'pose', 'image', 'detector')
 
     @property
     def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
@@ -62,7 +79,7 @@ class ForwardModel:
 
         limited: refuse points outside the field of view, as a camera does.
         """
-        if not self.terms:
+        if self.plain:
             return project(self.lens, pose.into_body(views.points), limited)
         linear = self._through(pose, views, limited)
         return Image(linear.uv, linear.valid)
@@ -113,26 +130,32 @@ class ForwardModel:
         return np.asarray(stage @ columns)
 
     def _through(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
-        arm = views.points - pose.position[..., None, :]
+        points = self._seen_points(pose, views)
+        ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
+        linear = LinearViews(
+            ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited
+        )
+        if not self._of('image', 'detector'):
+            return linear
+        uv = [ideal]
+        for stage in ('image', 'detector'):
+            scene = Scene(views, self.lens, pose, uv[-1], linear.image.incidence)
+            uv.append(uv[-1] + self._moved(scene, stage))
+        return replace(linear, uv=uv[2], optical=uv[1])
+
+    def _seen_points(self, pose: Pose, views: Views) -> Array:
+        """Return the points (S, N, 3), m, where target and pose effects make them be seen."""
+        points = views.points
         if self._of('target', 'pose'):
-            arm = arm + self._moved(Scene(views, self.lens, pose, views.uv), 'target')
+            points = points + self._moved(Scene(views, self.lens, pose, views.uv), 'target')
         if self._of('pose'):
             # When a row was exposed depends on where the point is seen: predict that first.
-            seen = project(self.lens, arm @ pose.rotation, limited=False).uv
+            seen = project(self.lens, pose.into_body(points), limited=False).uv
             move = np.asarray(self._moved(Scene(views, self.lens, pose, seen), 'pose'))
             turn = rotation_from_vector(-move[..., 3:])
-            arm = (turn @ (arm - move[..., :3])[..., None])[..., 0]
-        image = _linear(self.lens, arm @ pose.rotation, limited)
-        # Columns by the camera's place and turn share d_point R^T (see pose.Pose.retract).
-        d_target = image.d_point @ np.swapaxes(pose.rotation, -1, -2)[..., None, :, :]
-        d_turn = np.cross(d_target, arm[..., None, :])
-        d_pose = np.concatenate([-d_target, d_turn], axis=-1)
-        uv = [image.uv]
-        for stage in ('image', 'detector'):
-            scene = Scene(views, self.lens, pose, uv[-1], image.incidence)
-            uv.append(uv[-1] + self._moved(scene, stage))
-        ideal, optical, detected = uv
-        return LinearViews(detected, image.valid, d_pose, d_target, image, ideal, optical)
+            place = pose.position[..., None, :]
+            points = place + (turn @ (points - place - move[..., :3])[..., None])[..., 0]
+        return points
 
     def _of(self, *stages: str) -> list[Term]:
         return [term for term in self.terms if term[0].stage in stages]

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
@@ -103,14 +104,24 @@ class _Localization:
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         views = self._views.take(index)
-        linear = self._model.linearise(Pose(*state), views)
-        return normal_equations(linear.uv, linear.d_pose, views)
+        return pose_equations(self._model, Pose(*state), views)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         return dense_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return tuple(Pose(*state).retract(step[0]))
+
+
+def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
+    """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
+    if model.plain:
+        cost, *normal = engines.pose_equations(
+            model.lens, *pose, views.points, views.uv, views.weight
+        )
+        return cost, tuple(normal)
+    linear = model.linearise(pose, views)
+    return normal_equations(linear.uv, linear.d_pose, views)
 
 
 def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, Arrays]:

@@ -13,7 +13,7 @@ from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
-from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, normal_equations
+from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations
 
 _MEAN_ROUNDS = 10
 
@@ -93,10 +93,7 @@ class _Rigs:
             self._models, self._views, poses, changes, strict=True
         ):
             seen = views.take(self._rows[index].ravel())
-            linear = model.linearise(_flat(pose), seen)
-            own_cost, (own_hessian, own_gradient) = normal_equations(
-                linear.uv, linear.d_pose, seen
-            )
+            own_cost, (own_hessian, own_gradient) = pose_equations(model, _flat(pose), seen)
             transposed = np.swapaxes(change, -1, -2)
             cost += own_cost.reshape(shape)
             hessian += transposed @ own_hessian.reshape(*shape, 6, 6) @ change

@@ -1,0 +1,161 @@
+"""Where points meet a lens: the ray equation r cos(theta) - (Z - s(theta)) sin(theta) = 0.
+
+Source: Kita, section 2 and figure 2.  Newton's method far from the lens; near it, where there may
+be no ray or two, a search.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.curves import ViewpointShift, shift_at
+from fisheye_svp_ros.formulas import approach
+from fisheye_svp_ros.lens import Lens
+
+NEWTON_STEPS = 6
+SETTLED = 1e-7  # a last Newton step this small leaves an error of its square
+CLEAR = 1e-20  # m; a clearance of 0 but for rounding
+_HALVINGS = 48
+_EXACT = 1e-13  # rad
+_MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still gets an answer
+_ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
+_BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
+
+
+class Incidence(NamedTuple):
+    """Where points meet the lens; every field (...).
+
+    theta: rad; sin, cos: of theta; ex, ey: unit vector of the image height; radius: distance from
+    the axis, m; clearance: derivative of the ray equation, m, positive where theta is unique.
+    """
+
+    theta: Array
+    sin: Array
+    cos: Array
+    ex: Array
+    ey: Array
+    radius: Array
+    clearance: Array
+    valid: Mask
+
+
+def meet(lens: Lens, x: Array, y: Array, z: Array, limited: bool) -> Incidence:
+    """Return where points (...) in the camera frame meet the lens; no x is exactly 0 where y is.
+
+    limited: see `edge`.
+    """
+    r2 = x * x + y * y
+    r, distance = np.sqrt(r2), np.sqrt(r2 + z * z)
+    scale = 1.0 / distance
+    theta, sin, cos = np.arctan2(r, z), r * scale, z * scale
+    clearance = distance
+    if lens.viewpoint_shift is not None:
+        theta, sin, cos, clearance = _past_shift(lens, r, z, distance, (theta, sin, cos))
+    valid = (clearance > CLEAR) & (theta <= edge(lens, limited))
+    inverse_r = 1.0 / r
+    return Incidence(theta, sin, cos, x * inverse_r, y * inverse_r, r, clearance, valid)
+
+
+def edge(lens: Lens, limited: bool) -> float:
+    """Return the largest angle that counts, rad: the lens's own, if `limited` to it."""
+    return min(lens.max_incidence + _ANGLE_SLACK, _BEHIND) if limited else _BEHIND
+
+
+def search_limit(shift: ViewpointShift, max_incidence: float) -> float:
+    """Return the angle up to which rays are searched for near the lens, rad."""
+    return min(shift.limit, max_incidence + _MARGIN, np.pi - _MARGIN)
+
+
+@lru_cache(maxsize=256)
+def caustic_range(shift: ViewpointShift, limit: float) -> float:
+    """Return the distance of the outermost point of the caustic of the rays up to `limit`, m."""
+    theta = np.linspace(0.0, min(limit, np.pi - _MARGIN), 257)
+    value, slope = shift.value_and_slope(theta, np.tan(theta / 2))
+    along = slope * np.sin(theta)
+    outer = np.hypot(along * np.sin(theta), value + along * np.cos(theta))
+    # A viewpoint ahead of the origin hides what lies between the two, caustic or not.
+    return float(max(np.max(outer[along > 0], initial=0.0), np.max(np.abs(value))))
+
+
+def _past_shift(
+    lens: Lens, r: Array, z: Array, distance: Array, start: tuple[Array, Array, Array]
+) -> tuple[Array, Array, Array, Array]:
+    """Return theta, its sine and cosine, and the clearance; NaN where there is no ray."""
+    shift = lens.viewpoint_shift
+    assert shift is not None
+    theta, sin, cos, clearance, settled = _newton(shift, r, z, *start)
+    limit = search_limit(shift, lens.max_incidence)
+    apart = ~settled | (distance < caustic_range(shift, limit))
+    if apart.any():
+        found = _scan(shift, limit, r[apart], z[apart])
+        theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
+        value, rise = shift_at(shift, found, sin[apart], cos[apart])
+        clearance[apart] = approach(r[apart], z[apart], sin[apart], cos[apart], value, rise)[1]
+    return theta, sin, cos, clearance
+
+
+def _newton(
+    shift: ViewpointShift, r: Array, z: Array, theta: Array, sin: Array, cos: Array
+) -> tuple[Array, Array, Array, Array, Mask]:
+    for count in range(1, NEWTON_STEPS + 1):
+        step, clearance = approach(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
+        theta = theta + step
+        size = np.abs(step)
+        if count == NEWTON_STEPS or (count > 2 and not (size > SETTLED).any()):
+            break
+        half_tan = np.tan(0.5 * theta)
+        scale = half_tan * half_tan
+        cos = 1.0 - scale
+        scale += 1.0
+        scale = 1.0 / scale
+        cos *= scale
+        sin = 2.0 * half_tan * scale
+    # The last step is so small that sine and cosine follow it in a straight line.
+    return theta, sin + step * cos, cos - step * sin, clearance, (size < SETTLED) & (theta > 0)
+
+
+def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:
+    """Find the smallest root up to `limit` of the ray equation of points (N,); NaN for none."""
+    low = np.zeros((len(r), 1))
+    high = np.full((len(r), 1), limit)
+    for _ in range(2):
+        grid = low + (high - low) * np.linspace(0, 1, 65)
+        values, _ = _ray_equation(shift, r[:, None], z[:, None], grid)
+        falls = (values[:, :-1] >= 0) & (values[:, 1:] < 0)
+        found = falls.any(axis=1)
+        # Where no sign changes, two roots may hide between neighbours of the lowest value.
+        lowest = np.clip(np.argmin(values, axis=1), 1, 63)
+        first = np.argmax(falls, axis=1)
+        left = np.where(found, first, lowest - 1)[:, None]
+        right = np.where(found, first + 1, lowest + 1)[:, None]
+        low = np.take_along_axis(grid, left, axis=1)
+        high = np.take_along_axis(grid, right, axis=1)
+    theta = np.full(len(r), np.nan)
+    if found.any():
+        theta[found] = _bracketed(shift, r[found], z[found], low[found, 0], high[found, 0])
+    return theta
+
+
+def _bracketed(shift: ViewpointShift, r: Array, z: Array, low: Array, high: Array) -> Array:
+    """Newton steps that fall back to halving the bracket; the equation falls through zero."""
+    theta = (low + high) / 2
+    for _ in range(_HALVINGS):
+        value, slope = _ray_equation(shift, r, z, theta)
+        low, high = np.where(value >= 0, theta, low), np.where(value >= 0, high, theta)
+        step = theta - value / slope
+        inside = (step >= low) & (step <= high)
+        before, theta = theta, np.where(inside, step, (low + high) / 2)
+        if np.all(np.abs(theta - before) < _EXACT):
+            break
+    return theta
+
+
+def _ray_equation(shift: ViewpointShift, r: Array, z: Array, theta: Array) -> tuple[Array, Array]:
+    """Return r cos(theta) - (Z - s(theta)) sin(theta) and its derivative."""
+    value, slope = shift.value_and_slope(theta, np.tan(theta / 2))
+    sin, cos, reach = np.sin(theta), np.cos(theta), z - value
+    return r * cos - reach * sin, slope * sin - r * sin - reach * cos
