@@ -56,15 +56,16 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
         if raw.dtype[name].kind not in kinds:
             given = raw.dtype[name]
             raise ObservationError(f'{what}: field {name!r} is {given}; {kind} is needed')
-        bad = np.flatnonzero(~_representable(raw[name], layout[name]))
-        if bad.size:
+        usable = _representable(raw[name], layout[name])
+        if not usable.all():
+            bad = int(np.argmin(usable))
             raise ObservationError(
-                f'{what}: field {name!r} of point {bad[0]} is {raw[name][bad[0]]}; leave out '
+                f'{what}: field {name!r} of point {bad} is {raw[name][bad]}; leave out '
                 'points without a value'
             )
         points[name] = raw[name]
-    ids, counts = np.unique(points['landmark'], return_counts=True)
-    if np.any(counts > 1):
+    if len(set(points['landmark'].tolist())) < len(points):
+        ids, counts = np.unique(points['landmark'], return_counts=True)
         raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} stands there twice')
     return points
 
