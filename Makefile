@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint blind test-oldest clean
+.PHONY: demo test lint blind bench test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -20,6 +20,18 @@ lint: $(VENV)/ready
 blind: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind --trials 200
 
+# Speed beside what a user would pick instead, into docs/benchmarks.md; leave the machine alone.
+bench: .venv-bench/ready
+	.venv-bench/bin/python -m benchmark.speed
+
+.venv-bench/ready: setup.py benchmark/requirements.txt
+	$(PYTHON) -m venv .venv-bench
+	.venv-bench/bin/pip install --quiet --upgrade pip
+	.venv-bench/bin/pip install --quiet -e '.[standalone]' -r benchmark/requirements.txt
+	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
+		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
+	touch $@
+
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
 	$(PYTHON) -m venv .venv-oldest
@@ -33,4 +45,4 @@ $(VENV)/ready: setup.py
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-oldest $(OUT)
+	rm -rf $(VENV) .venv-oldest .venv-bench $(OUT)
