@@ -21,12 +21,13 @@ from fisheye_svp_ros.criticism.model import (
 )
 from fisheye_svp_ros.criticism.noise import quantisation_step
 from fisheye_svp_ros.criticism.projection import Nuisance, score
-from fisheye_svp_ros.criticism.screening import single_landmarks
+from fisheye_svp_ros.criticism.screening import screen, single_landmarks, single_steps
 from fisheye_svp_ros.criticism.standard_errors import standard_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
 SIGMA = 0.2
+INDEPENDENT = Correlation(0.0, 1.0, lambda _: 1.0)
 
 
 def fitted(seed, terms=(), cameras=1, free=(), simulated=None):
@@ -96,6 +97,28 @@ def test_single_landmarks_are_scored_like_any_effect():
         slow = score(nuisance, linear.effect_columns(effect))
         assert quick.statistic == pytest.approx(slow.statistic, rel=1e-6)
         np.testing.assert_allclose(quick.estimate, slow.estimate, rtol=1e-5)
+
+
+def test_single_steps_are_scored_like_any_effect():
+    _, _, linear = fitted(8, free=intrinsic_names(lens()))
+    nuisance = Nuisance(linear)
+    steps = CATALOGUE['session_step'].candidates(linear.scene)
+    for effect, quick, count in single_steps(linear, nuisance, steps):
+        slow = score(nuisance, linear.effect_columns(effect))
+        assert quick.statistic == pytest.approx(slow.statistic, rel=1e-6)
+        assert (quick.rank, count) == (slow.rank, len(steps))
+        np.testing.assert_allclose(quick.estimate, slow.estimate, rtol=1e-5)
+
+
+def test_all_landmarks_together_are_scored_like_nested_fits():
+    _, _, linear = fitted(9)
+    nuisance = Nuisance(linear)
+    survey = LandmarkSurveyEffect.candidates(linear.scene)[0]
+    freed = Nuisance(linear, survey=survey)
+    found = next(c for c in screen(linear, nuisance, INDEPENDENT, ['landmark_survey']).candidates
+                 if c.effect == survey)
+    assert found.score.statistic == pytest.approx(nuisance.misfit - freed.misfit, rel=1e-6)
+    assert found.score.rank == freed.rank - nuisance.rank
 
 
 def test_free_landmarks_are_projected_out_like_any_columns():
@@ -205,7 +228,7 @@ def test_standard_errors_of_free_landmarks_are_those_of_the_dense_matrix():
     term = (often, np.zeros(180))
     linear = Linearised(data, replace(state, terms=(term,)), ())
     nuisance = Nuisance(linear)
-    (errors,) = standard_errors(linear, nuisance, Correlation(0.0, 1.0, lambda _: 1.0))
+    (errors,) = standard_errors(linear, nuisance, INDEPENDENT)
     rows, others = dense(linear)
     place = flat_rows(linear.effect_columns(often))[rows]
     outside = place - others @ np.linalg.lstsq(others, place, rcond=None)[0]
@@ -218,9 +241,7 @@ def test_what_has_no_effect_has_no_standard_error():
     data, state, _ = fitted(22)
     nothing = (LandmarkSurveyEffect((4, 999)), np.zeros(6))
     linear = Linearised(data, replace(state, terms=(nothing,)), ())
-    (errors,) = standard_errors(
-        linear, Nuisance(linear), Correlation(0.0, 1.0, lambda _: 1.0)
-    )
+    (errors,) = standard_errors(linear, Nuisance(linear), INDEPENDENT)
     assert np.isfinite(errors[:3]).all() and np.isnan(errors[3:]).all()
 
 

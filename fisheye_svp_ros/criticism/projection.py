@@ -47,7 +47,6 @@ class Nuisance:
         survey: LandmarkSurveyEffect | None = None,
     ) -> None:
         """Take a linearised state, columns (F, M, P) that are free as well, free landmarks."""
-        self._linear = linear
         self.shape = linear.residual.shape
         self.rows = int(linear.rows.used.sum())
         shared = linear.shared_columns
@@ -68,10 +67,6 @@ class Nuisance:
         blocks = int((np.abs(self._blocks).sum(axis=1) > 0).sum())
         self.rank = blocks + self.shared_basis.shape[-1]
         self.residual = self.outside(linear.residual[..., None])[..., 0]
-
-    def with_survey(self, survey: LandmarkSurveyEffect) -> Nuisance:
-        """Return the nuisance with all landmarks free as well."""
-        return Nuisance(self._linear, survey=survey)
 
     @property
     def frame_basis(self) -> Array | None:
@@ -192,6 +187,22 @@ def landmark_crossings(
     np.add.at(by_frame, (label, group[label, row] // height), mine)
     shared = np.einsum('lma,lmk->lak', place, gather(shared_basis, group))
     return np.swapaxes(by_frame, 1, 2), shared
+
+
+def landmark_information(
+    place: Array, group: Index, frame_basis: Array, shared_basis: Array
+) -> Array:
+    """Return the information matrix (3 L, 3 L) of all landmarks' places, the bases projected out.
+
+    Arguments as of `landmark_crossings`.
+    """
+    count = len(group)
+    crossings = landmark_crossings(place, group, frame_basis, shared_basis)
+    crossed = np.concatenate([part.reshape(3 * count, -1) for part in crossings], axis=-1)
+    information = -crossed @ crossed.T
+    blocks = information.reshape(count, 3, count, 3)
+    blocks[np.arange(count), :, np.arange(count)] += np.swapaxes(place, -1, -2) @ place
+    return np.asarray(information)
 
 
 def block_basis(columns: Array) -> Array:

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.criticism.correlation import Correlation
 from fisheye_svp_ros.criticism.model import Linearised, gather, landmark_groups
 from fisheye_svp_ros.criticism.projection import (
+    IDENTIFIABLE,
     Nuisance,
     Score,
     landmark_crossings,
+    landmark_information,
     p_value,
     score,
 )
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
+from fisheye_svp_ros.effects.session_step import SessionStepEffect
 
 
 @dataclass(frozen=True)
@@ -69,10 +72,13 @@ def screen(
     effects = len(CATALOGUE) - len(untestable) if names is None else len(names)
     found: list[Candidate] = []
     for name, several in forms.items():
-        tested = [
-            (effect, _test(linear, nuisance, correlation, effect), len(several))
-            for effect in several
-        ]
+        if name == SessionStepEffect.name and _is_quick(nuisance, correlation):
+            tested = single_steps(linear, nuisance, several)
+        else:
+            tested = [
+                (effect, _test(linear, nuisance, correlation, effect), len(several))
+                for effect in several
+            ]
         if name == LandmarkSurveyEffect.name and nuisance.frame_basis is not None:
             tested = [(effect, result, 2) for effect, result, _ in tested]
             tested += single_landmarks(linear, nuisance)
@@ -99,7 +105,7 @@ def _test(
     linear: Linearised, nuisance: Nuisance, correlation: Correlation, effect: Effect
 ) -> Score:
     if isinstance(effect, LandmarkSurveyEffect) and effect.everywhere:
-        return _all_landmarks(nuisance, effect)
+        return _all_landmarks(linear, nuisance, effect)
     columns = linear.effect_columns(effect)
     result = score(nuisance, columns, correlation.inflation)
     bounded = [
@@ -110,14 +116,68 @@ def _test(
     return result._replace(p_value=1.0, statistic=0.0) if any(bounded) else result
 
 
-def _all_landmarks(nuisance: Nuisance, effect: LandmarkSurveyEffect) -> Score:
+def _all_landmarks(
+    linear: Linearised, nuisance: Nuisance, effect: LandmarkSurveyEffect
+) -> Score:
     nothing = np.zeros(len(effect.parameters))
     if nuisance.frame_basis is None or nuisance.freedom < 1.5 * len(nothing):
         return Score(0.0, 0, 1.0, nothing, 1.0)
-    freed = nuisance.with_survey(effect)
-    statistic = nuisance.misfit - freed.misfit
-    rank = freed.rank - nuisance.rank
+    group, mine = _places(linear)
+    information = landmark_information(
+        mine, group, nuisance.frame_basis, nuisance.shared_basis
+    )
+    scale = np.sqrt(np.maximum((mine**2).sum(axis=1).ravel(), 1e-300))
+    values, vectors = np.linalg.eigh(information / scale / scale[:, None])
+    kept = values > IDENTIFIABLE**2
+    gradient = _gradient(nuisance, group, mine).ravel() / scale
+    statistic = float(((vectors[:, kept].T @ gradient) ** 2 / values[kept]).sum())
+    rank = int(kept.sum())
     return Score(statistic, rank, p_value(nuisance, statistic, rank), nothing)
+
+
+def _is_quick(nuisance: Nuisance, correlation: Correlation) -> bool:
+    """Whether sums over single frames are enough for a test."""
+    return nuisance.frame_basis is not None and not correlation.dependent
+
+
+def single_steps(
+    linear: Linearised, nuisance: Nuisance, steps: Sequence[Effect]
+) -> list[tuple[Effect, Score, int]]:
+    """Test a step of the intrinsics at each instant by itself, all at once.
+
+    What a step explains is a matter of sums over the frames after it.
+    """
+    poses = nuisance.frame_basis
+    assert poses is not None
+    starts = np.array([step.starts[0] for step in steps if isinstance(step, SessionStepEffect)])
+    first = replace(steps[0], starts=(-np.inf,))  # type: ignore[call-arg]
+    place = linear.effect_columns(first)
+    clean = place - poses @ (np.swapaxes(poses, -1, -2) @ place)
+    across = np.swapaxes(clean, -1, -2)
+    views = linear.data.views
+    instant = linear.scene.times if np.isfinite(linear.scene.times).all() else views.frame
+    instant = instant[np.unique(linear.data.frame_of, return_index=True)[1]]
+    # (A, F): which frames come after a step; sums over them of what is outside the nuisance.
+    after = (instant >= starts[:, None]).astype(float)
+    shared = np.tensordot(after, across @ nuisance.shared_basis, 1)
+    own = np.tensordot(after, across @ clean, 1) - shared @ np.swapaxes(shared, -1, -2)
+    gradient = np.tensordot(after, (across @ nuisance.residual[..., None])[..., 0], 1)
+    norms = np.sqrt(np.maximum(after @ (place**2).sum(axis=1), 1e-300))
+    values, vectors = np.linalg.eigh(own / norms[:, None] / norms[..., None])
+    inverse = np.where(values > IDENTIFIABLE**2, 1 / np.maximum(values, IDENTIFIABLE**2), 0.0)
+    along = (gradient / norms)[:, None] @ vectors
+    statistic = (along[:, 0] ** 2 * inverse).sum(axis=1)
+    estimate = (vectors @ (along[:, 0] * inverse)[..., None])[..., 0] / norms
+    return [
+        (
+            step,
+            Score(float(size), int(rank), p_value(nuisance, float(size), int(rank)), values_),
+            len(steps),
+        )
+        for step, size, rank, values_ in zip(
+            steps, statistic, (inverse > 0).sum(axis=1), estimate, strict=True
+        )
+    ]
 
 
 def single_landmarks(
@@ -130,14 +190,13 @@ def single_landmarks(
     """
     assert nuisance.frame_basis is not None
     rows = linear.rows
-    group = landmark_groups(rows.landmark, rows.used)
-    mine = gather(linear.whitened(linear.linear.d_target), group)
+    group, mine = _places(linear)
     taken = landmark_crossings(mine, group, nuisance.frame_basis, nuisance.shared_basis)
     own = np.swapaxes(mine, -1, -2) @ mine
     for part in taken:
         flat = part.reshape(len(group), 3, -1)
         own -= flat @ np.swapaxes(flat, -1, -2)
-    gradient = np.einsum('lma,lm->la', mine, gather(nuisance.residual[..., None], group)[..., 0])
+    gradient = _gradient(nuisance, group, mine)
     estimate = (np.linalg.pinv(own, rcond=1e-6, hermitian=True) @ gradient[..., None])[..., 0]
     statistic = np.einsum('la,la->l', estimate, gradient)
     ids = rows.landmark.ravel()[group[:, 0]]
@@ -153,6 +212,18 @@ def single_landmarks(
         )
         for i in np.flatnonzero(views >= MIN_VIEWS)
     ]
+
+
+def _places(linear: Linearised) -> tuple[Index, Array]:
+    """Return the rows (L, m) of each landmark and their columns (L, m, 3) by its place."""
+    group = landmark_groups(linear.rows.landmark, linear.rows.used)
+    return group, gather(linear.whitened(linear.linear.d_target), group)
+
+
+def _gradient(nuisance: Nuisance, group: Index, place: Array) -> Array:
+    """Return how residuals pull at each landmark's place (L, 3)."""
+    residual = gather(nuisance.residual[..., None], group)
+    return np.asarray(np.swapaxes(place, -1, -2) @ residual)[..., 0]
 
 
 def transferred(old: Effect, values: Array, new: Effect) -> Array:

@@ -18,7 +18,7 @@ from fisheye_svp_ros.criticism.projection import (
     Nuisance,
     basis,
     block_basis,
-    landmark_crossings,
+    landmark_information,
 )
 
 
@@ -73,14 +73,9 @@ def _survey_errors(linear: Linearised, variance: float, landmarks: int) -> Array
     norms = np.sqrt((shared**2).sum(axis=(0, 1)))
     group = landmark_groups(rows.landmark, rows.survey >= 0)
     place = gather(linear.whitened(linear.linear.d_target), group)
-    taken = landmark_crossings(
+    information = landmark_information(
         place, group, poses, basis(outside, norms).reshape(*poses.shape[:2], -1)
     )
-    count = len(group)
-    crossed = np.concatenate([part.reshape(3 * count, -1) for part in taken], axis=-1)
-    information = -crossed @ crossed.T
-    blocks = information.reshape(count, 3, count, 3)
-    blocks[np.arange(count), :, np.arange(count)] += np.swapaxes(place, -1, -2) @ place
     covariance = np.linalg.pinv(information, rcond=1e-9, hermitian=True)
     errors = np.full((landmarks, 3), np.nan)
     slot = rows.survey.ravel()[group[:, 0]]
