@@ -82,7 +82,7 @@ def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     Source: Kita, section 2 and figure 2.
     """
     fields = engines.incidence(lens, points.reshape(-1, 3), limited)
-    return Incidence(*(field.reshape(points.shape[:-1]) for field in fields))
+    return Incidence._make(field.reshape(points.shape[:-1]) for field in fields)
 
 
 def project(lens: Lens, points: Array, limited: bool = True) -> Image:

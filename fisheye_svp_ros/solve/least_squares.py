@@ -36,12 +36,16 @@ class Problem(Protocol):
 
 
 class Solved(NamedTuple):
-    """state; cost (S,): sum of squared whitened residuals; converged (S,); iterations (S,)."""
+    """state; cost (S,): sum of squared whitened residuals; converged (S,); iterations (S,).
+
+    normal: the normal equations there, as of the last step but one.
+    """
 
     state: Arrays
     cost: Array
     converged: Mask
     iterations: Index
+    normal: Arrays
 
 
 def levenberg_marquardt(
@@ -50,7 +54,8 @@ def levenberg_marquardt(
     """Minimise every system from its own start, with a damping of its own.
 
     Source: Marquardt's scaling with Nielsen's damping (IMM-REP-1999-05, section 3).  A step that
-    leaves the domain of the lens costs infinity and is refused.
+    leaves the domain of the lens costs infinity and is refused; one too small to matter is taken
+    without another look, and is the last.
     """
     systems = start[0].shape[0]
     state = tuple(array.copy() for array in start)
@@ -59,31 +64,37 @@ def levenberg_marquardt(
     damping, growth = np.full(systems, 1e-4), np.full(systems, 2.0)
     converged = np.zeros(systems, dtype=bool)
     iterations = np.zeros(systems, dtype=np.int64)
-    active, normal = _keep(np.isfinite(total), active, normal)
+    active = active[np.isfinite(total)]
     for _ in range(max_iterations):
         if not active.size:
             break
         iterations[active] += 1
-        step, moved = problem.step(normal, damping[active])
+        step, moved = problem.step(_take(normal, active), damping[active])
         trial = problem.retract(_take(state, active), step)
-        cost, fresh = problem.linearise(trial, active)
         before = total[active]
-        better = cost <= before * (1 + _ROUNDING) + _NOISE * np.sqrt(before)
         done = (moved <= STEP_TOLERANCE**2 + _ROUNDING * before) & (damping[active] < 1)
-        accepted = active[better]
-        for array, new in zip(state, trial, strict=True):
-            array[accepted] = new[better]
+        if done.any():
+            last, on = active[done], ~done
+            converged[last] = True
+            total[last] = np.maximum(before - moved, 0.0)[done]
+            _put(state, last, trial, done)
+            active, before, moved = active[on], before[on], moved[on]
+            trial = tuple(array[on] for array in trial)
+            if not active.size:
+                break
+        cost, fresh = problem.linearise(trial, active)
+        better = cost <= before * (1 + _ROUNDING) + _NOISE * np.sqrt(before)
         with np.errstate(divide='ignore', invalid='ignore'):
             ratio = np.where(better, (before - cost) / moved, 0.0)
+        accepted = active[better]
         total[accepted] = cost[better]
+        _put(state, accepted, trial, better)
+        _put(normal, accepted, fresh, better)
         damping[active], growth[active] = _adjusted(
             damping[active], growth[active], better, np.nan_to_num(ratio)
         )
-        for kept, new in zip(normal, fresh, strict=True):
-            kept[better] = new[better]
-        converged[active] = done
-        active, normal = _keep(~done & (damping[active] < _STUCK), active, normal)
-    return Solved(state, total, converged, iterations)
+        active = active[damping[active] < _STUCK]
+    return Solved(state, total, converged, iterations, normal)
 
 
 def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
@@ -105,7 +116,8 @@ def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     """`Problem.step` for normal equations (H (A, P, P), g (A, P)) without structure."""
     hessian, gradient = normal
     step = solve_damped(hessian, gradient, damping)
-    return (step,), np.einsum('si,sij,sj->s', step, hessian, step)
+    moved: Array = (step * (hessian @ step[..., None])[..., 0]).sum(axis=-1)
+    return (step,), moved
 
 
 def _adjusted(damping: Array, growth: Array, better: Mask, ratio: Array) -> tuple[Array, Array]:
@@ -115,10 +127,11 @@ def _adjusted(damping: Array, growth: Array, better: Mask, ratio: Array) -> tupl
 
 
 def _take(arrays: Arrays, index: Index) -> Arrays:
+    if len(index) == len(arrays[0]):
+        return arrays
     return tuple(array[index] for array in arrays)
 
 
-def _keep(mask: Mask, active: Index, normal: Arrays) -> tuple[Index, Arrays]:
-    if mask.all():
-        return active, normal
-    return active[mask], tuple(array[mask] for array in normal)
+def _put(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> None:
+    for array, values in zip(arrays, new, strict=True):
+        array[index] = values[mask]

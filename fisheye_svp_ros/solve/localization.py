@@ -17,6 +17,7 @@ from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_ma
 
 MIN_POINTS = 4
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
+_FLOOR = 1e-15  # keeps an exactly singular information invertible
 
 
 class Localization(NamedTuple):
@@ -48,13 +49,19 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     problem = _Localization(model, views)
     solved = levenberg_marquardt(problem, tuple(start))
     pose = Pose(*solved.state)
-    _, (hessian, _) = problem.linearise(solved.state, np.arange(len(pose.position)))
-    predicted = model.linearise(pose, views).uv
-    residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
-    fixed = solved.converged & _determined(hessian)
-    covariance = np.full(hessian.shape, np.nan)
-    covariance[fixed] = np.linalg.inv(hessian[fixed])
-    return Localization(pose, covariance, residual, solved.cost, fixed, solved.iterations)
+    covariance, fixed = _covariance(solved.normal[0])
+    fixed &= solved.converged
+    covariance[~fixed] = np.nan
+    return Localization(
+        pose, covariance, residuals(model, pose, views), solved.cost, fixed, solved.iterations
+    )
+
+
+def residuals(model: ForwardModel, pose: Pose, views: Views) -> Array:
+    """Return measured minus predicted image points (S, N, 2), px, NaN for padding."""
+    off = views.uv - model.predict(pose, views, limited=False).uv
+    off[~views.used] = np.nan
+    return off
 
 
 def start_poses(model: ForwardModel, views: Views) -> Pose:
@@ -87,12 +94,17 @@ def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
         )
 
 
-def _determined(hessian: Array) -> Mask:
+def _covariance(hessian: Array) -> tuple[Array, Mask]:
+    """Return the inverses of information (S, 6, 6), and which (S,) are determined."""
     diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    relative = hessian / (scale[..., :, None] * scale[..., None, :])
-    fixed: Mask = np.linalg.eigvalsh(relative)[..., 0] > _UNDETERMINED
-    return fixed
+    scale = scale[..., :, None] * scale[..., None, :]
+    relative = hessian / scale
+    relative[..., range(6), range(6)] = 1 + _FLOOR
+    inverse = np.linalg.inv(relative)
+    # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
+    spread = np.trace(inverse, axis1=-2, axis2=-1)
+    return inverse / scale, (spread > 0) & (spread < 1 / _UNDETERMINED)
 
 
 class _Localization:
@@ -103,7 +115,9 @@ class _Localization:
         self._views = views
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
-        views = self._views.take(index)
+        views = self._views
+        if len(index) < len(views.frame):
+            views = views.take(index)
         return pose_equations(self._model, Pose(*state), views)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:

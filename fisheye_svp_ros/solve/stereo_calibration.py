@@ -13,7 +13,7 @@ from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
-from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations
+from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
 
 _MEAN_ROUNDS = 10
 
@@ -57,14 +57,14 @@ def calibrate_stereo(
     problem = _Rigs((left, right), (left_views, right_views), systems)
     solved = levenberg_marquardt(problem, (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
-    _, normal = problem.linearise(solved.state, np.arange(systems))
-    covariance = arrow_covariance(normal)
+    covariance = arrow_covariance(solved.normal)
     lost = ~solved.converged
+    shape = (*pose.position.shape[:2], -1, 2)
     covariance.shared[lost] = covariance.blocks[lost] = np.nan
     return StereoCalibration(
         rig, covariance.shared, pose, covariance.blocks,
-        _residual(left, _left_pose(pose, rig), left_views),
-        _residual(right, pose, right_views),
+        residuals(left, _flat(_left_pose(pose, rig)), left_views).reshape(shape),
+        residuals(right, _flat(pose), right_views).reshape(shape),
         solved.cost, solved.converged, solved.iterations,
     )
 
@@ -92,7 +92,9 @@ class _Rigs:
         for model, views, pose, change in zip(
             self._models, self._views, poses, changes, strict=True
         ):
-            seen = views.take(self._rows[index].ravel())
+            seen = views
+            if len(index) < len(self._rows):
+                seen = views.take(self._rows[index].ravel())
             own_cost, (own_hessian, own_gradient) = pose_equations(model, _flat(pose), seen)
             transposed = np.swapaxes(change, -1, -2)
             cost += own_cost.reshape(shape)
@@ -124,12 +126,6 @@ def _left_change(right: Pose, rig: Pose) -> Array:
 
 def _flat(pose: Pose) -> Pose:
     return Pose(pose.rotation.reshape(-1, 3, 3), pose.position.reshape(-1, 3))
-
-
-def _residual(model: ForwardModel, pose: Pose, views: Views) -> Array:
-    predicted = model.linearise(_flat(pose), views).uv
-    residual = np.where(views.used[..., None], views.uv - predicted, np.nan)
-    return residual.reshape(*pose.position.shape[:2], -1, 2)
 
 
 def _starts(
