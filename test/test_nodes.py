@@ -340,6 +340,24 @@ def test_without_the_truth_there_are_no_errors_but_a_pose(graph: Callable[..., G
     assert abs(sets.poses[0].pose.pose.position.z) < 1e-9
 
 
+def test_a_camera_that_jumps_is_found_again(graph: Callable[..., Graph]) -> None:
+    lens = load_lens(lens_path('fish214'))
+    points = environment('whole', 0.5)
+    turns = np.array([[0, 0, 0], [0.01, 0, 0], [0, np.pi, 0], [0, np.pi, 0.01], [2.0, 1.0, 0]])
+    places = np.random.default_rng(2).uniform(-0.1, 0.1, (len(turns), 3))
+    poses = Pose(rotation_from_vector(turns) @ paper_pose(len(turns)).rotation, places)
+    views = group_views(simulate(ForwardModel(lens), points, poses, 0.2, np.random.default_rng(2)))
+    sets = Sets(graph('lens:=fish214', 'svp:=false', 'patience:=0.2'))
+    sets.landmarks.publish(messages.landmarks_message(points, 0, 'world'))
+    for i, used in enumerate(views.used):
+        seen = views.landmark[i][used], views.uv[i][used]
+        sets.points.publish(messages.image_points_message(*seen, i + 1, 'camera'))
+        sets.graph.until(lambda count=i + 1: len(sets.poses) == count)
+    found = [message.pose.pose.position for message in sets.poses]
+    want = localize(ForwardModel(lens), views).pose.position
+    np.testing.assert_allclose([[p.x, p.y, p.z] for p in found], want, atol=1e-9)
+
+
 def test_a_flat_target_is_not_left_on_the_wrong_side(
     graph: Callable[..., Graph], tmp_path: Path
 ) -> None:

@@ -98,7 +98,7 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
             frames=_rt(scene.pose.inverse()), extrinsics=_rt(scene.rig.inverse())[None],
         )
         with subprocess.Popen(
-            [_PYTHON, str(_WORKER), str(problem)], text=True,
+            [_PYTHON, '-E', str(_WORKER), str(problem)], text=True,
             stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         ) as worker:
             assert worker.stdin is not None and worker.stdout is not None
@@ -114,7 +114,7 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
 
 def _require_mrcal() -> None:
     try:
-        subprocess.run([_PYTHON, '-c', 'import mrcal'], capture_output=True, check=True)
+        subprocess.run([_PYTHON, '-E', '-c', 'import mrcal'], capture_output=True, check=True)
     except (OSError, subprocess.CalledProcessError) as reason:
         raise NotHereError(f'no mrcal for {_PYTHON}; `apt install python3-mrcal`') from reason
 

@@ -21,6 +21,10 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.settings import SolverSettings
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.measured import rms_px
+
+_AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
+_EXACT = 1e-6  # px; what fits better fits perfectly
 
 
 class Localizer(SolverNode):
@@ -37,13 +41,14 @@ class Localizer(SolverNode):
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._residuals = self.announce(PointCloud2, '~/residuals')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
+        self._before: tuple[Pose | None, float] = None, 0.0
         self.start()
 
     def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         seen: messages.ImagePoints = items['image_points']
         views, model = self.views(stamp, landmarks, seen), self.model(items)
-        solution = localize_both_sides(model, views)
+        solution = self._localized(model, views)
         if not solution.converged[0]:
             raise GeometryError(NO_POSE)
         pose, world = solution.pose.take(0), landmarks.frame
@@ -62,6 +67,19 @@ class Localizer(SolverNode):
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
+
+
+    def _localized(self, model: ForwardModel, views: Views) -> Localization:
+        """Solve from where the camera was; from anywhere if that fits worse than it did there."""
+        start, rms = self._before
+        solution = localize_both_sides(model, views, start)
+        as_well = solution.converged[0] and rms_px(solution.residual) < _AS_WELL * rms
+        if start is not None and not as_well:
+            solution = localize_both_sides(model, views)
+        self._before = None, 0.0
+        if solution.converged[0]:
+            self._before = solution.pose, max(rms_px(solution.residual), _EXACT)
+        return solution
 
 
 def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:
