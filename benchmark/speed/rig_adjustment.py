@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from benchmark.speed.peers import (
     gtsam_pose,
 )
 from benchmark.speed.scenes import StereoScene
+from benchmark.speed.worker import worker
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, cross_matrix, rotation_from_vector, vector_from_rotation
 
@@ -97,19 +97,8 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
             left=scene.left.uv, right=scene.right.uv,
             frames=_rt(scene.pose.inverse()), extrinsics=_rt(scene.rig.inverse())[None],
         )
-        with subprocess.Popen(
-            [_PYTHON, '-E', str(_WORKER), str(problem)], text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        ) as worker:
-            assert worker.stdin is not None and worker.stdout is not None
-
-            def run() -> dict[str, Any]:
-                print('go', file=worker.stdin, flush=True)
-                answer: dict[str, Any] = json.loads(worker.stdout.readline())
-                return answer
-
+        with worker([_PYTHON, '-E', str(_WORKER), str(problem)]) as run:
             yield run
-            worker.stdin.close()
 
 
 def _require_mrcal() -> None:
