@@ -25,13 +25,13 @@ def equidistant(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
 
 def equisolid(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 sin(theta / 2) and its derivative."""
-    half_sin, half_cos = _halved(sin, cos)
+    half_sin, half_cos = halved(sin, cos)
     return 2.0 * half_sin, half_cos
 
 
 def stereographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 tan(theta / 2) and its derivative."""
-    half_sin, half_cos = _halved(sin, cos)
+    half_sin, half_cos = halved(sin, cos)
     half_tan = half_sin / half_cos
     return 2.0 * half_tan, 1.0 + half_tan * half_tan
 
@@ -68,6 +68,14 @@ def flat_port(
     return thickness * (1.0 - cos * inverse), rise
 
 
+def halved(sin: Array, cos: Array) -> tuple[Array, Array]:
+    """Sine and cosine of theta / 2; the larger comes first, as rounding wants it."""
+    larger = np.sqrt(0.5 + 0.5 * np.abs(cos))
+    smaller = 0.5 * sin / larger
+    ahead = cos >= 0.0
+    return np.where(ahead, smaller, larger), np.where(ahead, larger, smaller)
+
+
 def approach(
     r: Array, z: Array, sin: Array, cos: Array, shift: Array, rise: Array
 ) -> tuple[Array, Array]:
@@ -87,11 +95,3 @@ def point_derivatives(
     steep = slope / clearance
     across = height / r
     return across, steep * cos - across, -steep * sin
-
-
-def _halved(sin: Array, cos: Array) -> tuple[Array, Array]:
-    """Sine and cosine of theta / 2; the larger comes first, as rounding wants it."""
-    larger = np.sqrt(0.5 + 0.5 * np.abs(cos))
-    smaller = 0.5 * sin / larger
-    ahead = cos >= 0.0
-    return np.where(ahead, smaller, larger), np.where(ahead, larger, smaller)

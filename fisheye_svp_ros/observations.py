@@ -119,6 +119,11 @@ class Views(NamedTuple):
         return Views(*(array[index] for array in self))
 
     @property
+    def seen(self) -> tuple[Array, Array, Array]:
+        """What solvers look at: points, image points, weights."""
+        return self.points, self.uv, self.weight
+
+    @property
     def used(self) -> Mask:
         """Which entries (S, N) are observations and not padding."""
         return self.row >= 0

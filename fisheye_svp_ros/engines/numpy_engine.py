@@ -8,6 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.curves import height_at
+from fisheye_svp_ros.engines.answers import Seen
 from fisheye_svp_ros.engines.rays import Incidence, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
@@ -18,13 +19,13 @@ _BLOCK = 8192  # points; larger ones make malloc ask the system for every array
 
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
-    """Return where points (M, 3), m, in the camera frame meet the lens."""
+    """Do as `engines.incidence` says."""
     parts = [_meet(lens, points[part], limited) for part in _blocks(len(points))]
     return Incidence(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
-    """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
+    """Do as `engines.project` says."""
     uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=bool)
     for part in _blocks(len(points)):
         rays = _meet(lens, points[part], limited)
@@ -34,7 +35,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
 
 
 def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
-    """Return what `project` does, and the derivatives (M, 2, 3) by the point, px/m."""
+    """Do as `engines.linearise` says."""
     count = len(points)
     uv, valid, d_point = np.empty((count, 2)), np.empty(count, dtype=bool), np.empty((2, 3, count))
     for part in _blocks(count):
@@ -48,11 +49,7 @@ def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Ar
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """Return image points (S, N, 2) of points (S, N, 3) in the world, validity, derivatives.
-
-    rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
-    by the small changes of `pose.Pose.retract`, px/m and px/rad.
-    """
+    """Do as `engines.linearise_views` says."""
     shape = points.shape[:2]
     uv, valid = np.empty((*shape, 2)), np.empty(shape, dtype=bool)
     d_pose = np.empty((shape[0], 2, 2, 3, shape[1]))
@@ -69,13 +66,10 @@ def linearise_views(
 
 
 def pose_equations(
-    lens: Lens, rotation: Array, position: Array, points: Array, uv: Array, weight: Array
+    lens: Lens, rotation: Array, position: Array, seen: Seen
 ) -> tuple[Array, Array, Array]:
-    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses.
-
-    Arguments as of `linearise_views`, with what was measured: uv (S, N, 2), px, and weight (S, N),
-    1/px, 0 for what does not count.  A point without an image costs infinity.
-    """
+    """Do as `engines.pose_equations` says."""
+    points, uv, weight = seen
     systems, count = weight.shape
     gram = np.zeros((systems, 7, 7))
     for part in _tiles(systems, count):
@@ -92,6 +86,14 @@ def pose_equations(
         flat = rows.reshape(len(z), 7, -1)
         gram[part[0]] += flat @ np.swapaxes(flat, -1, -2)
     return _in_world(gram, rotation)
+
+
+def localize(*_: object) -> None:
+    """Leave it to `solve.localization`."""
+
+
+def adjust_rigs(*_: object) -> None:
+    """Leave it to `solve.stereo_calibration`."""
 
 
 def _blocks(count: int) -> Iterator[slice]:

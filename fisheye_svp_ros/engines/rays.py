@@ -23,7 +23,7 @@ _HALVINGS = 48
 _EXACT = 1e-13  # rad
 _MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still gets an answer
 _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
-_BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
+BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
 
 
 class Incidence(NamedTuple):
@@ -62,7 +62,7 @@ def meet(lens: Lens, x: Array, y: Array, z: Array, limited: bool) -> Incidence:
 
 def edge(lens: Lens, limited: bool) -> float:
     """Return the largest angle that counts, rad: the lens's own, if `limited` to it."""
-    return min(lens.max_incidence + _ANGLE_SLACK, _BEHIND) if limited else _BEHIND
+    return min(lens.max_incidence + _ANGLE_SLACK, BEHIND) if limited else BEHIND
 
 
 def search_limit(shift: ViewpointShift, max_incidence: float) -> float:

@@ -13,10 +13,10 @@ Arrays = tuple[Array, ...]
 MAX_ITERATIONS = 60
 # A step that would move the whitened residuals by less than this (their 2-norm) is the last one.
 STEP_TOLERANCE = 1e-9
-_ROUNDING = 1e-13
+ROUNDING = 1e-13
 # Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
-_NOISE = 1e-11
-_STUCK = 1e12
+NOISE = 1e-11
+STUCK = 1e12
 
 
 class Problem(Protocol):
@@ -72,7 +72,7 @@ def levenberg_marquardt(
         step, moved = problem.step(_take(normal, active), damping[active])
         trial = problem.retract(_take(state, active), step)
         before = total[active]
-        done = (moved <= STEP_TOLERANCE**2 + _ROUNDING * before) & (damping[active] < 1)
+        done = (moved <= STEP_TOLERANCE**2 + ROUNDING * before) & (damping[active] < 1)
         if done.any():
             last, on = active[done], ~done
             converged[last] = True
@@ -83,7 +83,7 @@ def levenberg_marquardt(
             if not active.size:
                 break
         cost, fresh = problem.linearise(trial, active)
-        better = cost <= before * (1 + _ROUNDING) + _NOISE * np.sqrt(before)
+        better = cost <= before * (1 + ROUNDING) + NOISE * np.sqrt(before)
         with np.errstate(divide='ignore', invalid='ignore'):
             ratio = np.where(better, (before - cost) / moved, 0.0)
         accepted = active[better]
@@ -93,7 +93,7 @@ def levenberg_marquardt(
         damping[active], growth[active] = _adjusted(
             damping[active], growth[active], better, np.nan_to_num(ratio)
         )
-        active = active[damping[active] < _STUCK]
+        active = active[damping[active] < STUCK]
     return Solved(state, total, converged, iterations, normal)
 
 

@@ -43,11 +43,31 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     Kita, section 3: bundle adjustment of one camera against known landmarks.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
-    check_views(views, MIN_POINTS)
     if start is None:
+        check_views(views, MIN_POINTS)
         start = start_poses(model, views)
-    problem = _Localization(model, views)
-    solved = levenberg_marquardt(problem, tuple(start))
+    quick = None
+    if model.plain:
+        quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, tuple(start))
+    if quick is None:
+        return _by_reference(model, views, start)
+    solved = quick.ended == 1
+    found = Localization(Pose(quick.rotation, quick.position), *quick[2:5], solved, quick[5])
+    if not solved.all():
+        left = np.flatnonzero(~solved)
+        merge(found, left, _by_reference(model, views.take(left), start.take(left)))
+    return found
+
+
+def merge(found: Localization, rows: Index, other: Localization) -> None:
+    """Replace some of the views by others' results, in place."""
+    for old, new in zip((*found.pose, *found[1:]), (*other.pose, *other[1:]), strict=True):
+        old[rows] = new
+
+
+def _by_reference(model: ForwardModel, views: Views, start: Pose) -> Localization:
+    check_views(views, MIN_POINTS)
+    solved = levenberg_marquardt(_Localization(model, views), tuple(start))
     pose = Pose(*solved.state)
     covariance, fixed = _covariance(solved.normal[0])
     fixed &= solved.converged
@@ -130,9 +150,7 @@ class _Localization:
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
     if model.plain:
-        cost, *normal = engines.pose_equations(
-            model.lens, *pose, views.points, views.uv, views.weight
-        )
+        cost, *normal = engines.pose_equations(model.lens, *pose, views.seen)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)
     return normal_equations(linear.uv, linear.d_pose, views)

@@ -6,13 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
-from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.least_squares import Arrays, Solved, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
 
 _MEAN_ROUNDS = 10
@@ -54,8 +55,7 @@ def calibrate_stereo(
     where no view of a system can be posed in both.
     """
     pose, rig = _starts(left, right, left_views, right_views, systems)
-    problem = _Rigs((left, right), (left_views, right_views), systems)
-    solved = levenberg_marquardt(problem, (*pose, *rig))
+    solved = _solved((left, right), (left_views, right_views), (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
     covariance = arrow_covariance(solved.normal)
     lost = ~solved.converged
@@ -67,6 +67,21 @@ def calibrate_stereo(
         residuals(right, _flat(pose), right_views).reshape(shape),
         solved.cost, solved.converged, solved.iterations,
     )
+
+
+def _solved(
+    models: tuple[ForwardModel, ForwardModel], views: tuple[Views, Views], start: Arrays
+) -> Solved:
+    left, right = models
+    quick = None
+    if left.plain and right.plain:
+        quick = engines.adjust_rigs(
+            (left.lens, right.lens), (views[0].seen, views[1].seen), start
+        )
+    if quick is None:
+        return levenberg_marquardt(_Rigs(models, views, len(start[-1])), start)
+    everyone = np.ones(len(start[-1]), dtype=bool)
+    return Solved(quick.state, quick.cost, everyone, quick.iterations, quick.normal)
 
 
 class _Rigs:

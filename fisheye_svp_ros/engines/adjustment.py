@@ -1,0 +1,227 @@
+"""Levenberg-Marquardt compiled by Numba: `solve.least_squares` and `solve.arrow`, system by system.
+
+A system is V views of a rig of one or two cameras: a pose of the right camera for each view and,
+for two, the rig that they share.  What is not plain sailing (a point near the lens, a singular
+system) is left to the reference.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from fisheye_svp_ros.engines.kernels import (
+    OPTIONS,
+    factor,
+    retract,
+    scaled,
+    substitute,
+    view_equations,
+)
+from fisheye_svp_ros.solve.least_squares import (
+    MAX_ITERATIONS,
+    NOISE,
+    ROUNDING,
+    STEP_TOLERANCE,
+    STUCK,
+)
+
+
+@njit(**OPTIONS)
+def _right_equations(w, seen, pose, normal):
+    """Add the right camera's part; return the cost."""
+    points, uv, weight, lens = seen
+    blocks, _, _, block_gradient, _ = normal
+    total = 0.0
+    for v in range(len(points)):
+        total += view_equations(
+            w, points[v], uv[v], weight[v], lens, pose[0][v], pose[1][v], blocks[v],
+            block_gradient[v])
+        if not np.isfinite(total):
+            break
+    return total
+
+
+@njit(**OPTIONS)
+def _left_equations(w, seen, pose, rig, normal):
+    """Add the left camera's part, by way of its pose, `right.compose(rig)`; return the cost."""
+    points, uv, weight, lens = seen
+    blocks, cross, shared, block_gradient, shared_gradient = normal
+    hessian, gradient, change = np.empty((6, 6)), np.empty(6), np.zeros((6, 12))
+    rotation, position, half = np.empty((3, 3)), np.empty(3), np.empty((6, 12))
+    total = 0.0
+    for v in range(len(points)):
+        _left_pose((pose[0][v], pose[1][v]), rig, rotation, position, change)
+        total += view_equations(
+            w, points[v], uv[v], weight[v], lens, rotation, position, hessian, gradient)
+        if not np.isfinite(total):
+            break
+        half[:] = 0.0
+        for i in range(6):
+            for k in range(6):
+                for j in range(12):
+                    half[i, j] += hessian[i, k] * change[k, j]
+        cross[v] = 0.0
+        for k in range(6):
+            for i in range(6):
+                block_gradient[v, i] += change[k, i] * gradient[k]
+                shared_gradient[i] += change[k, 6 + i] * gradient[k]
+                for j in range(6):
+                    blocks[v, i, j] += change[k, i] * half[k, j]
+                    cross[v, i, j] += change[k, i] * half[k, 6 + j]
+                    shared[i, j] += change[k, 6 + i] * half[k, 6 + j]
+    return total
+
+
+@njit(**OPTIONS)
+def _left_pose(right, rig, rotation, position, change):
+    """Write the left camera's pose, and its change (6, 12) by those of right camera and rig."""
+    for i in range(3):
+        position[i] = 0.0
+        for j in range(3):
+            position[i] += right[0][i, j] * rig[1][j]
+            rotation[i, j] = 0.0
+            for k in range(3):
+                rotation[i, j] += right[0][i, k] * rig[0][k, j]
+            change[i, 6 + j] = change[3 + i, 9 + j] = right[0][i, j]
+    x, y, z = position
+    change[0, 4], change[0, 5], change[1, 5] = z, -y, x
+    change[1, 3], change[2, 3], change[2, 4] = -z, y, -x
+    for i in range(6):
+        change[i, i] = 1.0
+    for i in range(3):
+        position[i] += right[1][i]
+
+
+@njit(**OPTIONS)
+def _equations(w, left, right, cameras, pose, rig, normal):
+    """Write the normal equations; return the cost, inf outside the domain, nan if left."""
+    normal[2][:] = 0.0
+    normal[4][:] = 0.0
+    total = _right_equations(w, right, pose, normal)
+    if cameras == 2 and np.isfinite(total):
+        total += _left_equations(w, left, pose, rig, normal)
+    return total
+
+
+@njit(**OPTIONS)
+def _step(normal, cameras, damping, block_step, shared_step):
+    """Solve (H + damping diag H) d = -g; return |J d|^2, nan for a singular system."""
+    blocks, cross, shared, block_gradient, shared_gradient = normal
+    lower, scale, right = np.empty((6, 6)), np.empty(6), np.empty(6)
+    reduced, other, slope = np.empty((6, 6)), np.empty(6), np.zeros(6)
+    eliminated = np.empty((len(blocks), 7, 6))
+    scaled(shared, damping, other, reduced)
+    for k in range(6):
+        slope[k] = shared_gradient[k] / other[k]
+    for v in range(len(blocks)):
+        scaled(blocks[v], damping, scale, lower)
+        if not factor(lower):
+            return np.nan
+        for k in range(7 if cameras == 2 else 1):
+            for i in range(6):
+                right[i] = (block_gradient[v, i] if k == 0 else cross[v, i, k - 1]) / scale[i]
+            substitute(lower, right)
+            for i in range(6):
+                eliminated[v, k, i] = right[i] / scale[i]
+        if cameras == 2:
+            for j in range(6):
+                for i in range(6):
+                    part = cross[v, i, j] / other[j]
+                    slope[j] -= part * eliminated[v, 0, i]
+                    for k in range(6):
+                        reduced[j, k] -= part * eliminated[v, k + 1, i] / other[k]
+    shared_step[:] = 0.0
+    if cameras == 2:
+        if not factor(reduced):
+            return np.nan
+        substitute(reduced, slope)
+        for k in range(6):
+            shared_step[k] = -slope[k] / other[k]
+    for v in range(len(blocks)):
+        for i in range(6):
+            block_step[v, i] = -eliminated[v, 0, i]
+            for k in range(6 if cameras == 2 else 0):
+                block_step[v, i] -= eliminated[v, k + 1, i] * shared_step[k]
+    return _moved(normal, cameras, block_step, shared_step)
+
+
+@njit(**OPTIONS)
+def _moved(normal, cameras, block_step, shared_step):
+    blocks, cross, shared, _, _ = normal
+    total = 0.0
+    for v in range(len(blocks)):
+        for i in range(6):
+            for k in range(6):
+                total += block_step[v, i] * blocks[v, i, k] * block_step[v, k]
+                if cameras == 2:
+                    total += 2.0 * block_step[v, i] * cross[v, i, k] * shared_step[k]
+    for i in range(6):
+        for k in range(6):
+            total += shared_step[i] * shared[i, k] * shared_step[k]
+    return total
+
+
+@njit(**OPTIONS)
+def _retract(pose, rig, block_step, shared_step, new_pose, new_rig):
+    for v in range(len(block_step)):
+        retract(pose[0][v], pose[1][v], block_step[v], new_pose[0][v], new_pose[1][v])
+    retract(rig[0], rig[1], shared_step, new_rig[0], new_rig[1])
+
+
+@njit(**OPTIONS)
+def _copy_state(source, target):
+    target[0][:], target[1][:] = source
+
+
+@njit(**OPTIONS)
+def _copy_normal(source, target):
+    target[0][:], target[1][:], target[2][:], target[3][:], target[4][:] = source
+
+
+@njit(**OPTIONS)
+def empty_normal(views):
+    """Return the arrays of `solve.arrow.ArrowEquations` for one system."""
+    return (np.zeros((views, 6, 6)), np.zeros((views, 6, 6)), np.zeros((6, 6)),
+            np.zeros((views, 6)), np.zeros(6))
+
+
+@njit(**OPTIONS)
+def minimise(w, left, right, cameras, pose, rig, normal, fresh):
+    """Move pose and rig to the minimum; return cost, iterations and how it ended.
+
+    1: converged; 0: not; -1: left to the reference, wherever it got to.
+    """
+    views = len(pose[0])
+    block_step, shared_step = np.empty((views, 6)), np.empty(6)
+    new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
+    new_rig = (np.empty((3, 3)), np.empty(3))
+    damping, growth = 1e-4, 2.0
+    total = _equations(w, left, right, cameras, pose, rig, normal)
+    if not np.isfinite(total):
+        return total, 0, -1 if np.isnan(total) else 0
+    for iteration in range(1, MAX_ITERATIONS + 1):
+        moved = _step(normal, cameras, damping, block_step, shared_step)
+        if np.isnan(moved):
+            return total, iteration, -1
+        _retract(pose, rig, block_step, shared_step, new_pose, new_rig)
+        if moved <= STEP_TOLERANCE**2 + ROUNDING * total and damping < 1.0:
+            _copy_state(new_pose, pose)
+            _copy_state(new_rig, rig)
+            return max(total - moved, 0.0), iteration, 1
+        cost = _equations(w, left, right, cameras, new_pose, new_rig, fresh)
+        if np.isnan(cost):
+            return total, iteration, -1
+        if cost <= total * (1.0 + ROUNDING) + NOISE * np.sqrt(total):
+            ratio = (total - cost) / moved if moved > 0.0 else 0.0
+            damping = max(damping * min(max(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0), 1e-15)
+            growth = 2.0
+            total = cost
+            _copy_state(new_pose, pose)
+            _copy_state(new_rig, rig)
+            _copy_normal(fresh, normal)
+        else:
+            damping, growth = max(damping, 1e-9) * growth, 2.0 * growth
+            if damping >= STUCK:
+                return total, iteration, 0
+    return total, MAX_ITERATIONS, 0

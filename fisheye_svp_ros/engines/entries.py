@@ -1,0 +1,212 @@
+"""What Python calls of the compiled engine: each compiled once and kept in the cache."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import config, njit, types
+
+from fisheye_svp_ros.engines import cache
+from fisheye_svp_ros.engines.adjustment import empty_normal, minimise
+from fisheye_svp_ros.engines.kernels import (
+    BEHIND,
+    INVALID,
+    LEFT,
+    OPTIONS,
+    ROW,
+    ROWS,
+    SCRATCH,
+    SINGULAR,
+    STATE,
+    VALID,
+    B,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    derivatives,
+    factor,
+    image,
+    load,
+    meet,
+    scaled,
+    substitute,
+)
+
+
+@njit(**OPTIONS)
+def _write(w, n, uv, state):
+    for i in range(n):
+        uv[i, 0] = w[U + i] if w[STATE + i] == VALID else np.nan
+        uv[i, 1] = w[V + i] if w[STATE + i] == VALID else np.nan
+        state[i] = w[STATE + i]
+
+
+@njit(**OPTIONS)
+def _inverse(hessian, out):
+    """Write the inverse of an information (6, 6); return whether it is determined."""
+    scale, lower, column, trace = np.empty(6), np.empty((6, 6)), np.empty(6), 0.0
+    scaled(hessian, SINGULAR, scale, lower)
+    if not factor(lower):
+        return False
+    for k in range(6):
+        column[:] = 0.0
+        column[k] = 1.0
+        substitute(lower, column)
+        trace += column[k]
+        for i in range(6):
+            out[i, k] = column[i] / (scale[i] * scale[k])
+    return trace < 1e12
+
+
+@njit(**OPTIONS)
+def _residual(w, points, uv, row, lens, rotation, position, out):
+    """Write measured minus predicted, nan for padding; return whether all could be done."""
+    for start in range(0, len(points), B):
+        n = min(B, len(points) - start)
+        load(w, n, points, start, rotation, position)
+        meet(w, n, lens, BEHIND)
+        image(w, n, lens)
+        for i in range(n):
+            at = start + i
+            if row[at] >= 0 and w[STATE + i] == LEFT:
+                return False
+            seen = row[at] >= 0 and w[STATE + i] != INVALID
+            out[at, 0] = uv[at, 0] - w[U + i] if seen else np.nan
+            out[at, 1] = uv[at, 1] - w[V + i] if seen else np.nan
+    return True
+
+
+def _in(dimensions: int, kind: Any = types.float64) -> types.Array:
+    return types.Array(kind, dimensions, 'C', readonly=True)
+
+
+def _out(dimensions: int, kind: Any = types.float64) -> types.Array:
+    return types.Array(kind, dimensions, 'C')
+
+
+def _entry(result: Any, *arguments: Any) -> Any:
+    """Compile for these types only, and keep it in the engine's own folder."""
+
+    def compiled(function: Any) -> Any:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(cache.folder())
+        try:
+            return njit(result(*arguments), cache=True, nogil=True, **OPTIONS)(function)
+        finally:
+            config.CACHE_DIR = before
+
+    return compiled
+
+
+_LENS = (_in(1), types.float64)
+
+
+@_entry(types.void, _in(2), *_LENS, _out(2), _out(1))
+def project(points, lens, edge, uv, state):
+    """Write image points (M, 2) and states (M)."""
+    w = np.empty(SCRATCH)
+    for start in range(0, len(points), B):
+        n = min(B, len(points) - start)
+        for i in range(n):
+            w[X + i], w[Y + i], w[Z + i] = (
+                points[start + i, 0], points[start + i, 1], points[start + i, 2])
+        meet(w, n, lens, edge)
+        image(w, n, lens)
+        _write(w, n, uv[start:], state[start:])
+
+
+@_entry(types.void, _in(2), *_LENS, _out(2), _out(1), _out(3), types.int64)
+def linearise(points, lens, edge, uv, state, d_point, first):
+    """Write also derivatives (2, 3, M') by the point, from the column `first` on."""
+    w = np.empty(SCRATCH)
+    for start in range(0, len(points), B):
+        n = min(B, len(points) - start)
+        for i in range(n):
+            w[X + i], w[Y + i], w[Z + i] = (
+                points[start + i, 0], points[start + i, 1], points[start + i, 2])
+        meet(w, n, lens, edge)
+        image(w, n, lens)
+        derivatives(w, n, lens)
+        _write(w, n, uv[start:], state[start:])
+        for row in range(2):
+            for axis in range(3):
+                at = ROW + row * ROWS + axis * B
+                for i in range(n):
+                    d_point[row, axis, first + start + i] = w[at + i]
+
+
+@_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
+def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
+    """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""
+    w = np.empty(SCRATCH)
+    for s in range(len(points)):
+        r = rotation[s]
+        for start in range(0, points.shape[1], B):
+            n = min(B, points.shape[1] - start)
+            load(w, n, points[s], start, r, position[s])
+            meet(w, n, lens, edge)
+            image(w, n, lens)
+            derivatives(w, n, lens)
+            _write(w, n, uv[s, start:], state[s, start:])
+            for row in range(4):
+                # By place and by turn, of u and of v; the camera moves, not the point.
+                at = ROW + (row // 2) * ROWS + (row % 2) * 3 * B
+                sign = 1.0 if row % 2 else -1.0
+                for k in range(3):
+                    a, b, c = sign * r[k, 0], sign * r[k, 1], sign * r[k, 2]
+                    out = d_pose[s, row // 2, 3 * (row % 2) + k]
+                    for i in range(n):
+                        out[start + i] = (
+                            a * w[at + i] + b * w[at + B + i] + c * w[at + 2 * B + i])
+
+
+_SEEN = (_in(3), _in(3), _in(2))
+
+
+@_entry(types.int64, *_SEEN, _in(2, types.int64), _in(1), types.int64, _out(3), _out(2), _out(3),
+        _out(3), _out(1), _out(1, types.int64), _out(1, types.int64))
+def localize(points, uv, weight, row, lens, minimum, rotation, position, covariance, residual,
+             cost, iterations, ended):
+    """Move S poses to their minima; return how many are left to the reference."""
+    w, normal, fresh, left = np.empty(SCRATCH), empty_normal(1), empty_normal(1), 0
+    rig = (np.eye(3), np.zeros(3))
+    for s in range(len(points)):
+        usable = 0
+        for i in range(weight.shape[1]):
+            usable += weight[s, i] > 0.0
+        ended[s] = -1
+        if usable >= minimum:
+            seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
+            pose = (rotation[s:s + 1], position[s:s + 1])
+            cost[s], iterations[s], ended[s] = minimise(
+                w, seen, seen, 1, pose, rig, normal, fresh)
+        if ended[s] == 1 and not (
+            _inverse(normal[0][0], covariance[s])
+            and _residual(w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
+        ):
+            ended[s] = -1
+        if ended[s] < 1:
+            ended[s] = -1
+            left += 1
+    return left
+
+
+@_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(3), _out(3), _out(2), _out(1),
+        _out(1, types.int64), _out(1, types.int64), _out(4), _out(4), _out(3), _out(3), _out(2))
+def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, rotation,
+                position, rig_rotation, rig_position, cost, iterations, ended, blocks, cross,
+                shared, block_gradient, shared_gradient):
+    """Move S rigs of V views to their minima; return how many are left to the reference."""
+    views, left = rotation.shape[1], 0
+    w, fresh = np.empty(SCRATCH), empty_normal(views)
+    for s in range(len(rotation)):
+        mine = slice(s * views, (s + 1) * views)
+        cost[s], iterations[s], ended[s] = minimise(
+            w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
+            (points[mine], uv[mine], weight[mine], lens), 2, (rotation[s], position[s]),
+            (rig_rotation[s], rig_position[s]),
+            (blocks[s], cross[s], shared[s], block_gradient[s], shared_gradient[s]), fresh)
+        left += ended[s] < 1
+    return left

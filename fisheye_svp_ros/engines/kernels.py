@@ -1,0 +1,315 @@
+"""The formulas compiled by Numba, in loops over flat scratch memory that vectorise.
+
+A block of points is a set of rows of `B` numbers in one flat array: separate arrays would make the
+compiler check them for overlap, and calls of libm would end vectorisation.  A lens is one array,
+see `numba_engine.packed`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+
+from fisheye_svp_ros import formulas
+from fisheye_svp_ros.engines.rays import BEHIND, CLEAR, NEWTON_STEPS, SETTLED
+from fisheye_svp_ros.formulas import NOWHERE
+
+# Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
+OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
+HEIGHTS = (formulas.orthographic, formulas.equidistant, formulas.equisolid,
+           formulas.stereographic, formulas.kannala_brandt)
+SHIFTS = (formulas.gennery, formulas.flat_port)
+for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.approach, formulas.point_derivatives):
+    register_jitable(**OPTIONS)(formula)
+
+B = 256  # points in a block
+(X, Y, Z, R, EX, EY, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, HEIGHT, SLOPE,
+ U, V, ROW) = (B * i for i in range(20))
+ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
+SCRATCH = ROW + 2 * ROWS
+VALID, INVALID, LEFT = 1.0, 0.0, -1.0
+SINGULAR = 1e-15  # pivot of a scaled matrix
+
+FX, FY, CX, CY, NEAR, HEIGHT_KIND, SHIFT_KIND, HEIGHT_K, SHIFT_K = 0, 1, 2, 3, 4, 5, 6, 7, 11
+LENS = 15
+
+
+@njit(inline='always', **OPTIONS)
+def _half_angle(r, m):
+    """Return arctan(r / m) for 0 <= r <= m, to 1e-16."""
+    large = r > 0.4142135623730951 * m
+    num, den = (r - m, r + m) if large else (r, m)
+    x = num / den
+    w = x * x
+    p = -0.017803896394812564
+    p = p * w + 0.03796390316111083
+    p = p * w - 0.05035049795312439
+    p = p * w + 0.05846866752275139
+    p = p * w - 0.06662950246036792
+    p = p * w + 0.07692045194561481
+    p = p * w - 0.09090896801472813
+    p = p * w + 0.11111110744657099
+    p = p * w - 0.14285714279244968
+    p = p * w + 0.19999999999940837
+    p = p * w - 0.3333333333333312
+    p = p * w + 1.0
+    return (0.7853981633974483 if large else 0.0) + x * p
+
+
+@njit(inline='always', **OPTIONS)
+def _turned(sin, cos, turn):
+    """Return sine and cosine of an angle turned on by up to 0.3 rad."""
+    w = turn * turn
+    s = turn * (1 + w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (
+        1 / 362880 - w / 39916800)))))
+    c = 1 + w * (-1 / 2 + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320 + w * (
+        -1 / 3628800 + w / 479001600)))))
+    return sin * c + cos * s, cos * c - sin * s
+
+
+@njit(**OPTIONS)
+def meet(w, n, lens, edge):
+    """Solve the ray equation of n points in the rows X, Y, Z; STATE says how it went."""
+    for i in range(n):
+        x, y, z = w[X + i] + NOWHERE, w[Y + i], w[Z + i]
+        r2 = x * x + y * y
+        r, d = np.sqrt(r2), np.sqrt(r2 + z * z)
+        half = 2.0 * _half_angle(r, d + abs(z))
+        w[THETA0 + i] = w[THETA + i] = half if z >= 0.0 else np.pi - half
+        scale, inverse = 1.0 / d, 1.0 / r
+        w[SIN0 + i] = w[SIN + i] = r * scale
+        w[COS0 + i] = w[COS + i] = z * scale
+        w[R + i], w[CLEARANCE + i] = r, d
+        w[EX + i], w[EY + i] = x * inverse, y * inverse
+    if lens[SHIFT_KIND] >= 0:
+        _past_shift(w, n, lens)
+    for i in range(n):
+        seen = (w[CLEARANCE + i] > CLEAR) & (w[THETA + i] <= edge)
+        w[STATE + i] = VALID if seen else INVALID
+    if lens[SHIFT_KIND] >= 0:
+        for i in range(n):
+            far = w[R + i] * w[R + i] + w[Z + i] * w[Z + i] >= lens[NEAR] * lens[NEAR]
+            settled = (w[TURN + i] <= 0.3) & (w[TURN + i] >= -0.3) & (w[THETA + i] > 0.0)
+            w[STATE + i] = w[STATE + i] if far & settled else LEFT
+
+
+@njit(**OPTIONS)
+def _past_shift(w, n, lens):
+    k = lens[SHIFT_K:]
+    for i in range(n):
+        w[TURN + i] = 0.0
+    for count in range(NEWTON_STEPS):
+        if lens[SHIFT_KIND] == 0:
+            for i in range(n):
+                shift, rise = formulas.gennery(
+                    w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
+                w[U + i], w[V + i] = shift, rise
+        else:
+            for i in range(n):
+                shift, rise = formulas.flat_port(
+                    w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1])
+                w[U + i], w[V + i] = shift, rise
+        moving = 0
+        for i in range(n):
+            step, clearance = formulas.approach(
+                w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i])
+            turn = w[TURN + i] + step
+            w[TURN + i], w[CLEARANCE + i] = turn, clearance
+            w[THETA + i] = w[THETA0 + i] + turn
+            w[SIN + i], w[COS + i] = _turned(w[SIN0 + i], w[COS0 + i], turn)
+            w[STATE + i] = abs(step)
+            moving += w[STATE + i] > SETTLED
+        if count >= 2 and moving == 0:
+            return
+    for i in range(n):
+        if not w[STATE + i] < SETTLED:
+            w[TURN + i] = np.nan
+
+
+@njit(**OPTIONS)
+def image(w, n, lens):
+    """Write image heights, their slopes and image points."""
+    k, kind = lens[HEIGHT_K:], lens[HEIGHT_KIND]
+    if kind == 0:
+        for i in range(n):
+            w[HEIGHT + i], w[SLOPE + i] = formulas.orthographic(
+                w[THETA + i], w[SIN + i], w[COS + i])
+    elif kind == 1:
+        for i in range(n):
+            w[HEIGHT + i], w[SLOPE + i] = formulas.equidistant(
+                w[THETA + i], w[SIN + i], w[COS + i])
+    elif kind == 2:
+        for i in range(n):
+            w[HEIGHT + i], w[SLOPE + i] = formulas.equisolid(
+                w[THETA + i], w[SIN + i], w[COS + i])
+    elif kind == 3:
+        for i in range(n):
+            w[HEIGHT + i], w[SLOPE + i] = formulas.stereographic(
+                w[THETA + i], w[SIN + i], w[COS + i])
+    else:
+        for i in range(n):
+            w[HEIGHT + i], w[SLOPE + i] = formulas.kannala_brandt(
+                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
+    fx, fy, cx, cy = lens[FX], lens[FY], lens[CX], lens[CY]
+    for i in range(n):
+        w[U + i] = cx + fx * w[HEIGHT + i] * w[EX + i]
+        w[V + i] = cy + fy * w[HEIGHT + i] * w[EY + i]
+
+
+@njit(**OPTIONS)
+def derivatives(w, n, lens):
+    """Write derivatives by place and by turn in the camera frame, as `numpy_engine` does."""
+    fx, fy = lens[FX], lens[FY]
+    for i in range(n):
+        across, along, axial = formulas.point_derivatives(
+            w[HEIGHT + i], w[SLOPE + i], w[SIN + i], w[COS + i], w[R + i], w[CLEARANCE + i])
+        ex, ey, r, z = w[EX + i], w[EY + i], w[R + i], w[Z + i]
+        level, tilted = across * z, along * z - axial * r
+        eu, ev = fx * ex, fy * ey
+        steep, lean = along * eu, tilted * eu
+        w[ROW + i] = steep * ex + fx * across
+        w[ROW + B + i] = steep * ey
+        w[ROW + 2 * B + i] = axial * eu
+        w[ROW + 3 * B + i] = lean * ey
+        w[ROW + 4 * B + i] = -lean * ex - fx * level
+        steep, lean = along * ev, tilted * ev
+        w[ROW + 7 * B + i] = steep * ex
+        w[ROW + 8 * B + i] = steep * ey + fy * across
+        w[ROW + 9 * B + i] = axial * ev
+        w[ROW + 10 * B + i] = lean * ey + fy * level
+        w[ROW + 11 * B + i] = -lean * ex
+        w[ROW + 5 * B + i] = fx * w[HEIGHT + i] * ey
+        w[ROW + 12 * B + i] = -fy * w[HEIGHT + i] * ex
+
+
+@njit(**OPTIONS)
+def load(w, n, points, start, rotation, position):
+    """Bring points from `start` on from the world into the camera frame."""
+    r, p = rotation, position
+    for i in range(n):
+        x, y, z = (points[start + i, 0] - p[0], points[start + i, 1] - p[1],
+                   points[start + i, 2] - p[2])
+        w[X + i] = r[0, 0] * x + r[1, 0] * y + r[2, 0] * z
+        w[Y + i] = r[0, 1] * x + r[1, 1] * y + r[2, 1] * z
+        w[Z + i] = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
+
+
+@njit(**OPTIONS)
+def add_view(w, points, uv, weight, lens, rotation, position, gram):
+    """Add the products of a view's rows to gram (7, 7), camera frame; return how it went."""
+    worst = VALID
+    for start in range(0, len(points), B):
+        n = min(B, len(points) - start)
+        load(w, n, points, start, rotation, position)
+        for i in range(n):
+            if weight[start + i] == 0.0:
+                w[X + i], w[Y + i], w[Z + i] = 0.0, 0.0, 1.0
+        meet(w, n, lens, BEHIND)
+        image(w, n, lens)
+        derivatives(w, n, lens)
+        for i in range(n):
+            w[STATE + i] = VALID if weight[start + i] == 0.0 else w[STATE + i]
+            worst = min(worst, w[STATE + i])
+        if worst < VALID:
+            return worst
+        for i in range(n):
+            w[ROW + 6 * B + i] = w[U + i] - uv[start + i, 0]
+            w[ROW + 13 * B + i] = w[V + i] - uv[start + i, 1]
+            w[STATE + i] = weight[start + i] * weight[start + i]
+        for a in range(7):
+            for b in range(a, 7):
+                total = 0.0
+                for i in range(n):
+                    total += w[STATE + i] * (
+                        w[ROW + a * B + i] * w[ROW + b * B + i]
+                        + w[ROW + ROWS + a * B + i] * w[ROW + ROWS + b * B + i])
+                gram[a, b] += total
+    return worst
+
+
+@njit(**OPTIONS)
+def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gradient):
+    """Write H (6, 6) and g (6) of one pose; return its cost, inf outside, nan if left."""
+    gram = np.zeros((7, 7))
+    state = add_view(w, points, uv, weight, lens, rotation, position, gram)
+    if state < VALID:
+        return np.nan if state == LEFT else np.inf
+    half = np.zeros((6, 7))  # turn @ gram; the camera moves, not the point
+    for a in range(3):
+        for b in range(7):
+            for k in range(3):
+                half[a, b] -= rotation[a, k] * (gram[k, b] if k <= b else gram[b, k])
+                half[3 + a, b] += rotation[a, k] * (
+                    gram[3 + k, b] if 3 + k <= b else gram[b, 3 + k])
+    for a in range(6):
+        gradient[a] = half[a, 6]
+        for b in range(3):
+            place, turn = 0.0, 0.0
+            for k in range(3):
+                place -= half[a, k] * rotation[b, k]
+                turn += half[a, 3 + k] * rotation[b, k]
+            hessian[a, b], hessian[a, 3 + b] = place, turn
+    return gram[6, 6]
+
+
+@njit(**OPTIONS)
+def factor(matrix):
+    """Replace a symmetric matrix by its Cholesky factor; return whether it has one."""
+    for j in range(len(matrix)):
+        for i in range(j, len(matrix)):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i > j:
+                matrix[i, j] = total / matrix[j, j]
+            elif total > SINGULAR:
+                matrix[j, j] = np.sqrt(total)
+            else:
+                return False
+    return True
+
+
+@njit(**OPTIONS)
+def substitute(lower, x):
+    """Solve L L^T x = x in place, x a vector."""
+    for i in range(len(x)):
+        for k in range(i):
+            x[i] -= lower[i, k] * x[k]
+        x[i] /= lower[i, i]
+    for i in range(len(x) - 1, -1, -1):
+        for k in range(i + 1, len(x)):
+            x[i] -= lower[k, i] * x[k]
+        x[i] /= lower[i, i]
+
+
+@njit(**OPTIONS)
+def scaled(hessian, damping, scale, out):
+    """Scale to a unit diagonal and damp it."""
+    for a in range(len(scale)):
+        scale[a] = np.sqrt(hessian[a, a]) if hessian[a, a] > 0 else 1.0
+    for a in range(len(scale)):
+        for b in range(len(scale)):
+            out[a, b] = hessian[a, b] / (scale[a] * scale[b])
+        out[a, a] = 1.0 + damping
+
+
+@njit(**OPTIONS)
+def retract(rotation, position, change, new_rotation, new_position):
+    """Apply a small change (6): `pose.Pose.retract`."""
+    x, y, z = change[3], change[4], change[5]
+    angle2 = x * x + y * y + z * z
+    a, b = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
+    if angle2 >= 1e-12:
+        angle = np.sqrt(angle2)
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
+    turn = np.array([
+        [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+        [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+        [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+    ])
+    for i in range(3):
+        new_position[i] = position[i] + change[i]
+        for j in range(3):
+            new_rotation[i, j] = (turn[i, 0] * rotation[0, j] + turn[i, 1] * rotation[1, j]
+                                  + turn[i, 2] * rotation[2, j])

@@ -1,0 +1,201 @@
+"""The fast engine: the same formulas, compiled by Numba (extra `fast`).
+
+What it leaves aside (a point near the lens, a lens with a curve that is not in `formulas`, a
+singular system) goes to the reference, `numpy_engine`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.engines import entries, kernels, numpy_engine
+from fisheye_svp_ros.engines.answers import Poses, Rigs, Seen
+from fisheye_svp_ros.engines.rays import caustic_range, edge, search_limit
+from fisheye_svp_ros.lens import Lens
+
+_SHARE = 20_000  # points below which a thread of their own does not pay
+_KEPT = 64  # lenses
+
+_lenses: dict[int, tuple[Lens, Array | None]] = {}
+
+
+def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
+    """Do as `engines.project` says."""
+    numbers = packed(lens)
+    if numbers is None:
+        return numpy_engine.project(lens, points, limited)
+    points, limit = np.ascontiguousarray(points, dtype=float), edge(lens, limited)
+    uv, state = np.empty((len(points), 2)), np.empty(len(points))
+
+    def run(part: slice) -> None:
+        entries.project(points[part], numbers, limit, uv[part], state[part])
+
+    _spread(run, len(points), len(points))
+    left = _left(state, numbers)
+    if left is not None:
+        uv[left], state[left] = numpy_engine.project(lens, points[left], limited)
+    return uv, state > 0
+
+
+def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
+    """Do as `engines.linearise` says."""
+    numbers = packed(lens)
+    if numbers is None:
+        return numpy_engine.linearise(lens, points, limited)
+    points, limit = np.ascontiguousarray(points, dtype=float), edge(lens, limited)
+    count = len(points)
+    uv, state, d_point = np.empty((count, 2)), np.empty(count), np.empty((2, 3, count))
+
+    def run(part: slice) -> None:
+        entries.linearise(
+            points[part], numbers, limit, uv[part], state[part], d_point, part.start
+        )
+
+    _spread(run, count, count)
+    by_point = np.moveaxis(d_point, -1, 0)
+    left = _left(state, numbers)
+    if left is not None:
+        uv[left], state[left], by_point[left] = numpy_engine.linearise(lens, points[left], limited)
+    return uv, state > 0, by_point
+
+
+def linearise_views(
+    lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
+) -> tuple[Array, Mask, Array]:
+    """Do as `engines.linearise_views` says."""
+    numbers = packed(lens)
+    if numbers is None:
+        return numpy_engine.linearise_views(lens, rotation, position, points, limited)
+    systems, count = points.shape[:2]
+    rotation, position, points = map(np.ascontiguousarray, (rotation, position, points))
+    uv, state = np.empty((systems, count, 2)), np.empty((systems, count))
+    d_pose, limit = np.empty((systems, 2, 6, count)), edge(lens, limited)
+
+    def run(part: slice) -> None:
+        entries.linearise_views(
+            rotation[part], position[part], points[part], numbers, limit, uv[part], state[part],
+            d_pose[part],
+        )
+
+    _spread(run, systems, systems * count)
+    by_pose = np.moveaxis(d_pose, -1, 1)
+    left = _left(state, numbers)
+    if left is not None:
+        rows, _ = left
+        uv[left], state[left], by_pose[left] = (part[:, 0] for part in numpy_engine.linearise_views(
+            lens, rotation[rows], position[rows], points[left][:, None], limited
+        ))
+    return uv, state > 0, by_pose
+
+
+def localize(
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, Array]
+) -> Poses | None:
+    """Do as `engines.localize` says."""
+    numbers = packed(lens)
+    if numbers is None:
+        return None
+    seen, row = _contiguous(seen), np.ascontiguousarray(row)
+    systems, count = row.shape
+    found = Poses(
+        start[0].copy(), start[1].copy(), np.empty((systems, 6, 6)),
+        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.int64),
+        np.empty(systems, dtype=np.int64),
+    )
+
+    def run(part: slice) -> None:
+        entries.localize(
+            *(array[part] for array in seen), row[part], numbers, minimum,
+            *(array[part] for array in found)
+        )
+
+    _spread(run, systems, 4 * systems * count)
+    return found
+
+
+def adjust_rigs(
+    lenses: tuple[Lens, Lens], seen: tuple[Seen, Seen], state: tuple[Array, ...]
+) -> Rigs | None:
+    """Do as `engines.adjust_rigs` says."""
+    left, right = map(packed, lenses)
+    if left is None or right is None:
+        return None
+    state = tuple(array.copy() for array in state)
+    systems, views = state[0].shape[:2]
+    whole, square = np.empty(systems), (6, 6)
+    ended, iterations = np.empty((2, systems), dtype=np.int64)
+    normal = tuple(np.zeros((systems, *shape)) for shape in (
+        (views, *square), (views, *square), square, (views, 6), (6,)
+    ))
+    lost = entries.adjust_rigs(
+        *_contiguous(seen[0]), left, *_contiguous(seen[1]), right, *state, whole, iterations,
+        ended, *normal
+    )
+    return None if lost else Rigs(state, whole, iterations, normal)
+
+
+def packed(lens: Lens) -> Array | None:
+    """Return a lens as the kernels know it, None where it has a curve that they do not."""
+    kept = _lenses.get(id(lens))
+    if kept is None:
+        if len(_lenses) >= _KEPT:
+            _lenses.clear()
+        # A lens that is kept keeps its id to itself.
+        kept = _lenses[id(lens)] = lens, _pack(lens)
+    return kept[1]
+
+
+def _pack(lens: Lens) -> Array | None:
+    height, shift = lens.image_height, lens.viewpoint_shift
+    numbers = np.zeros(kernels.LENS)
+    numbers[kernels.FX:kernels.CY + 1] = lens.fx, lens.fy, lens.cx, lens.cy
+    numbers[kernels.SHIFT_KIND] = -1
+    curves = [(height, kernels.HEIGHTS, kernels.HEIGHT_KIND, kernels.HEIGHT_K)]
+    if shift is not None:
+        curves.append((shift, kernels.SHIFTS, kernels.SHIFT_KIND, kernels.SHIFT_K))
+        numbers[kernels.NEAR] = caustic_range(shift, search_limit(shift, lens.max_incidence))
+    for curve, known, kind, first in curves:
+        formula = getattr(curve, 'formula', None)
+        if formula not in known:
+            return None
+        numbers[kind] = known.index(formula)
+        numbers[first:first + len(curve.coefficients)] = curve.coefficients
+    return numbers
+
+
+def _contiguous(arrays: Seen) -> Seen:
+    points, uv, weight = map(np.ascontiguousarray, arrays)
+    return points, uv, weight
+
+
+def _left(state: Array, numbers: Array) -> tuple[Index, ...] | None:
+    if numbers[kernels.SHIFT_KIND] < 0:
+        return None
+    left = np.nonzero(state == kernels.LEFT)
+    return left if left[0].size else None
+
+
+def _spread(run: Callable[[slice], None], count: int, points: int) -> None:
+    """Run over `count` rows, on as many threads as there are and as `points` make worth while."""
+    threads = min(_threads(), count, points // _SHARE)
+    if threads < 2:
+        run(slice(0, count))
+        return
+    edges = np.linspace(0, count, threads + 1).astype(int).tolist()
+    with ThreadPoolExecutor(threads) as pool:
+        for done in [pool.submit(run, slice(*pair)) for pair in itertools.pairwise(edges)]:
+            done.result()
+
+
+@cache
+def _threads() -> int:
+    """Return how many threads to use: OMP_NUM_THREADS, as everywhere, or one a core."""
+    told = os.environ.get('OMP_NUM_THREADS', '')
+    return int(told) if told.isdigit() else len(os.sched_getaffinity(0))
