@@ -10,7 +10,15 @@ from pathlib import Path
 for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
 
-from benchmark.speed import commands, cores, growth, localization, nodes, projection, stereo  # noqa: E402
+from benchmark.speed import (  # noqa: E402
+    commands,
+    growth,
+    localization,
+    nodes,
+    projection,
+    stereo,
+    variants,
+)
 from benchmark.speed.report import document  # noqa: E402
 from benchmark.speed.scenes import NOISE_PX  # noqa: E402
 from fisheye_svp_ros.files import write_text  # noqa: E402
@@ -20,7 +28,7 @@ _PARTS = {
     'projection': projection.rows,
     'localization': localization.rows,
     'stereo': stereo.rows,
-    'cores': cores.rows,
+    'variants': variants.rows,
     'growth': growth.tables,
     'nodes': nodes.tables,
     'commands': commands.tables,

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmark.speed.report import Table, number
+from fisheye_svp_ros.engines import VARIABLE
 
+ONE_CORE = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _OV_PLANE = Path(__file__).parents[3] / 'shared' / 'data' / 'ov_plane'
 _TEXT = (
     'Each once, as a process of its own with all cores; nodes run standalone; the observations '
@@ -40,8 +42,8 @@ def tables() -> list[Table]:
 
 
 def all_cores() -> dict[str, str]:
-    """Return the environment without the limit to one core, and without a ROS 2."""
-    left_out = ('PYTHONPATH', 'OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
+    """Return the environment without the limit to one core, an engine and a ROS 2."""
+    left_out = ('PYTHONPATH', VARIABLE, *ONE_CORE)
     return {k: v for k, v in os.environ.items() if k not in left_out}
 
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 from benchmark.speed.harness import OURS, Side
+from fisheye_svp_ros.engines import use as use
 
 
 def engines() -> list[str]:
     """Return the names of the engines that can run here."""
-    return ['numpy']
+    return ['numpy'] if find_spec('numba') is None else ['numpy', 'numba']
 
 
 def name_of(engine: str) -> str:
@@ -25,4 +27,11 @@ def sides(run: Callable[[], Any], **keywords: Any) -> dict[str, Callable[[], Sid
 
 
 def _side(engine: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side:
-    return Side(name_of(engine), run, **keywords)
+    def with_engine() -> Any:
+        use(engine)
+        try:
+            return run()
+        finally:
+            use('numpy')  # what the sides are compared with comes from the reference
+
+    return Side(name_of(engine), with_engine, **keywords)

@@ -8,7 +8,9 @@ import subprocess
 import sys
 from typing import Any
 
+from benchmark.speed.engines import engines
 from benchmark.speed.report import Table, number
+from fisheye_svp_ros.engines import VARIABLE
 
 _GOAL = 1e-3  # s that a localizer may add
 _TEXT = """From `image_points` in to `~/pose` out, through a localizer (33 landmarks, ShiftVP) and
@@ -22,13 +24,16 @@ _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 def tables(count: int = 500) -> list[Table]:
     """Return the table: a line a transport."""
     rows, notes = [], []
-    bare = {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}
-    worlds = {'standalone': bare}
+    worlds = {'standalone': {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}}
     if _has_rclpy():
         worlds['ROS 2'] = dict(os.environ)
     else:
         notes.append('ROS 2: rclpy is not importable; source an installation first.')
-    for name, environment in worlds.items():
+    setups = {
+        f'{world}, {engine}': {**environment, VARIABLE: engine}
+        for world, environment in worlds.items() for engine in engines()
+    }
+    for name, environment in setups.items():
         run = subprocess.run(
             [*_RUN, str(count)], env=environment, stdout=subprocess.PIPE, text=True, check=False
         )
