@@ -148,3 +148,13 @@ def test_back_projection_undoes_image_effects():
     off = np.linalg.norm(np.cross(arm, rays.direction), axis=-1)
     assert image.valid.mean() > 0.9
     assert np.nanmax(off) < 1e-6
+
+
+def test_a_profile_that_turns_back_past_its_data_is_used_up_to_there():
+    effect = CATALOGUE['radial_profile'](4, 1.54)
+    model = ForwardModel(lens(), ((effect, np.array([-1.3, -2.3, 1.4, -0.3]) * 2),))
+    curve = model.lens.image_height
+    assert np.radians(100) < curve.limit < np.radians(140)
+    theta = np.linspace(0.0, curve.limit, 200)[:-1]
+    np.testing.assert_allclose(curve.angle(curve.value_and_slope(theta)[0]), theta, atol=1e-9)
+    assert model.lens.max_incidence <= curve.limit

@@ -183,5 +183,6 @@ def _extended(lens: Lens, terms: Sequence[Term]) -> Lens:
         lens = replace(lens, viewpoint_shift=SumOfShifts(lens.viewpoint_shift, shifts))
     if heights:
         curve = SumOfHeights(lens.image_height, _focal(lens), heights)
-        lens = replace(lens, image_height=curve)
+        limit = min(lens.max_incidence, curve.limit)
+        lens = replace(lens, image_height=curve, max_incidence=limit)
     return lens

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.curves import ImageHeight, ViewpointShift, invert_height
+
+_GRID = 4097  # angles at which a sum of curves is looked at for where it turns back
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,12 @@ class SumOfHeights:
     def coefficients(self) -> tuple[float, ...]:
         return self.base.coefficients
 
-    @property
+    @cached_property
     def limit(self) -> float:
-        return self.base.limit
+        """The incidence angle, rad, up to which the sum grows: changes may turn it back early."""
+        theta = np.linspace(0.0, self.base.limit, _GRID)
+        falls = self.value_and_slope(theta)[1][:-1] <= 0
+        return float(theta[max(int(np.argmax(falls)) - 1, 0)]) if falls.any() else self.base.limit
 
     def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
         height, slope = self.base.value_and_slope(theta)
