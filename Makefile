@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint blind bench test-oldest clean
+.PHONY: demo test lint paper paper-search blind bench test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -15,6 +15,14 @@ test: $(VENV)/ready lint
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+
+# The paper's tables and figures beside ours; then the search for what the paper does not print
+# (some minutes), which overwrites what it found before in config/.
+paper: $(VENV)/ready
+	$(BIN)/fisheye-svp paper -o $(OUT)/paper
+
+paper-search: $(VENV)/ready
+	$(BIN)/fisheye-svp paper --search -o config
 
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready

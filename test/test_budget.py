@@ -161,6 +161,7 @@ def test_the_command_says_yes_and_no(tmp_path, capsys):
     (['--lens', 'none.yaml'], 'none.yaml: cannot be read'),
     (['--lens', 'fish180', '--style', 'crossed'], "style 'crossed' is unknown"),
     (['--lens', 'fish180', '--baseline', '0'], 'baseline is 0.0 m; it must be above 0'),
+    (['--lens', 'fish180', '--baseline', '1e9'], 'baseline is 1e+09 m; a budget covers 0.001 to'),
     (['--lens', 'fish180', '--noise', 'much'], 'invalid float value'),
 ])
 def test_bad_input_is_one_line(arguments, reason, capsys):

@@ -31,6 +31,7 @@ _LANDMARKS = 48
 _SMALLEST_SPREAD = np.radians(15.0)
 _EDGE = np.radians(1.0)  # how far inside the field of view the widest spread ends
 _NEAREST, _FARTHEST = 0.05, 20.0  # m
+_BASELINES = (1e-3, _FARTHEST)  # m
 _CLEAR = 1.5  # unique ranges of the lens that the nearest range keeps
 
 
@@ -85,13 +86,18 @@ def nearest_range(lens: Lens) -> float:
 def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     """Tabulate errors and noise over spreads and ranges.
 
-    Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise.
+    Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise and
+    for a baseline with which nothing could be measured.
     """
     lens = setup.lens
     if lens.viewpoint_shift is None:
         raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it')
     if not (np.isfinite(setup.noise) and setup.noise > 0):
         raise ParameterError(f'noise is {setup.noise} px; it must be above 0')
+    baseline = float(np.linalg.norm(setup.rig.position))
+    if not _BASELINES[0] <= baseline <= _BASELINES[1]:
+        raise ParameterError(f'baseline is {baseline:.4g} m; a budget covers {_BASELINES[0]:g} to '
+                             f'{_BASELINES[1]:g} m')
     angle = np.linspace(_SMALLEST_SPREAD, widest_spread(lens), spreads)
     distance = np.geomspace(nearest_range(lens), _FARTHEST, ranges)
     points = distance[:, None, None] * _caps(angle)[:, None]

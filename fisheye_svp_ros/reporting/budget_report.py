@@ -8,13 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.evaluation.budget import QUANTITIES, UNITS, Budget, Point
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
 
-HEADER = ('error', 'SVP causes', 'noise causes', 'limit', 'unit', 'kept', 'SVP keeps it from',
-          'and up to')
+HEADER = ('error', 'SVP causes', 'noise causes', 'limit', 'unit', 'kept', 'nearest range',
+          'largest spread')
+_SHORT = 30.0  # times, from the least to the largest error
 _PEOPLE = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
 _WORDS = {
     'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
@@ -106,7 +108,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
                 budget.ranges, np.degrees(budget.spreads), error, shading='nearest',
                 norm=LogNorm(), cmap='Blues',
             )
-            figure.colorbar(mesh, ax=axis, label=unit)
+            _label(figure.colorbar(mesh, ax=axis, label=unit), error)
             _draw_limit(axis, budget, point, point.quantity in asked.given)
             axis.plot(asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED,
                       markersize=11)
@@ -117,6 +119,14 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
             axis.xaxis.set_major_formatter('{x:g}')
             axis.grid(visible=False)
         _explain(axes.flat[len(points)])
+
+
+def _label(bar: Any, error: Array) -> None:
+    """Write plain numbers beside a logarithmic colour bar; 1, 2, 5 where it is short."""
+    short = error.max() < _SHORT * error.min()
+    bar.ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
+    bar.ax.yaxis.set_major_formatter('{x:g}')
+    bar.ax.yaxis.set_minor_formatter('{x:g}' if short else NullFormatter())
 
 
 def _draw_limit(axis: Any, budget: Budget, point: Point, given: bool) -> None:
@@ -138,5 +148,5 @@ def _explain(axis: Any) -> None:
         'Line: the limit is just met.\nStar: where you work.\n'
         'Limits that you do not state are what noise causes.\n\n'
         'Spread: largest incidence angle of the\nlandmarks, which fill a cap about the axis.',
-        va='top', transform=axis.transAxes, linespacing=1.5,
+        va='top', transform=axis.transAxes, linespacing=1.5, in_layout=False,
     )
