@@ -11,6 +11,7 @@ from fisheye_svp_ros.messages import Segments
 from fisheye_svp_ros.pose import Pose
 
 _CAMERA_SIZE = 0.1  # m, of the viewing axis that is drawn
+_HALF_BASE = 0.4 * _CAMERA_SIZE
 
 
 def landmarks_shape(points: Array) -> Segments:
@@ -21,9 +22,8 @@ def landmarks_shape(points: Array) -> Segments:
 
 def camera_shape(pose: Pose, name: str, alpha: float) -> Segments:
     """Return a pyramid for a camera, its tip at the pose, opening along the viewing axis."""
-    half = 0.4 * _CAMERA_SIZE
     corners = np.array([[x, y, _CAMERA_SIZE] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
-    corners[:, :2] *= half
+    corners[:, :2] *= _HALF_BASE
     edges = [
         edge for i in range(4)
         for edge in (np.zeros(3), corners[i], corners[i], corners[(i + 1) % 4])
@@ -42,3 +42,22 @@ def rays_shape(lens: Lens, pose: Pose, points: Array, name: str) -> Segments:
     start = viewpoint @ pose.rotation.T + pose.position
     both = np.stack([start, points], axis=1)[rays.valid].reshape(-1, 3)
     return Segments(f'rays {name}'.strip(), both, (0.9, 0.5, 0.1, 0.5), 0.001)
+
+
+def epipolar_shapes(lens: Lens, pose: Pose, curves: Array, uv: Array) -> list[Segments]:
+    """Return epipolar curves (N, K, 2) and image points (N, 2), px, on the base of the camera.
+
+    The longer side of the image is the side of the base; curves are cut where they are NaN.
+    """
+    def place(pixels: Array) -> Array:
+        size = np.array([lens.width, lens.height])
+        sideways = (pixels - (size - 1) / 2) * 2 * _HALF_BASE / size.max()
+        ahead = np.full((*sideways.shape[:-1], 1), _CAMERA_SIZE)
+        return np.concatenate([sideways, ahead], axis=-1) @ pose.rotation.T + pose.position
+
+    steps = np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 2)
+    known = steps[np.isfinite(steps).all(axis=(1, 2))].reshape(-1, 2)
+    return [
+        Segments('epipolar curves', place(known), (0.8, 0.2, 0.2, 0.8), 0.0003),
+        Segments('image points', place(uv), (0.1, 0.1, 0.1, 1.0), 0.001, lines=False),
+    ]

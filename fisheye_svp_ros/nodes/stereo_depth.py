@@ -5,13 +5,16 @@ from __future__ import annotations
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.clouds import LANDMARKS, structured
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.evaluation.errors import NO_PAIR, STEREO_DEPTH_METRICS, stereo_depth_metrics
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, run
+from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
+from fisheye_svp_ros.nodes.shapes import camera_shape, epipolar_shapes
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
@@ -19,9 +22,10 @@ from fisheye_svp_ros.nodes.solver import (
     true_rig,
 )
 from fisheye_svp_ros.observations import STEREO
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.settings import StereoDepthSettings
 from fisheye_svp_ros.solve.stereo_depth import (
+    epipolar_curves,
     epipolar_offset,
     triangulate,
     triangulate_optimally,
@@ -40,6 +44,7 @@ class StereoDepth(SolverNode):
     def __init__(self) -> None:
         super().__init__()
         self._points = self.announce(PointCloud2, '~/points')
+        self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._latest: Pose | None = None
         self.listen(TransformStamped, 'rig', messages.read_transform, self._hear, LATCHED_INPUT)
         self.start()
@@ -66,6 +71,11 @@ class StereoDepth(SolverNode):
             offset.distance[None], offset.vertical[None], solved.points[None],
             _true_points(known_points(landmarks, right)[in_right], items),
         ))
+        if self._markers.get_subscription_count():
+            pose: Pose | None = items.get('left/true_pose')
+            frame = left.frame if pose is None else landmarks.frame
+            shapes = _shapes(model, rig, pose or identity(), *uv)
+            self._markers.publish(messages.markers_message(shapes, stamp, frame))
 
     def _rig(self, items: Items) -> Pose:
         known = true_rig(items) if self.settings.rig == 'true' else self._latest
@@ -80,6 +90,14 @@ def _true_points(points: Array, items: Items) -> Array | None:
     """Return landmarks (N, 3) in the frame of the right camera where its pose is known."""
     pose: Pose | None = items.get('right/true_pose')
     return None if pose is None else pose.into_body(points)[None]
+
+
+def _shapes(
+    model: ForwardModel, rig: Pose, left: Pose, uv_left: Array, uv_right: Array
+) -> list[messages.Segments]:
+    curves = epipolar_curves(model, model, rig, uv_right)
+    return [camera_shape(left, 'left', alpha=0.6),
+            *epipolar_shapes(model.lens, left, curves, uv_left)]
 
 
 def main(args: list[str] | None = None) -> int:
