@@ -10,10 +10,10 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.criticism.correlation import Correlation, judge_correlation
 from fisheye_svp_ros.criticism.held_out import held_out_gain
-from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, survey_of
+from fisheye_svp_ros.criticism.model import Data, Linearised, State, fit, is_shared, survey_of
 from fisheye_svp_ros.criticism.projection import Nuisance, score
 from fisheye_svp_ros.criticism.screening import Candidate, merit, screen, transferred
-from fisheye_svp_ros.criticism.structure import Structure, remaining_structure
+from fisheye_svp_ros.criticism.structure import Structure, mean_fields, remaining_structure
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
@@ -25,6 +25,9 @@ SIGNIFICANCE = 0.01
 CLASS_SIGNIFICANCE = 0.002
 # So many landmarks are not single ones any more, nor so many steps single events.
 MANY = 0.12
+# A cause less than so many times stronger than what stays unexplained must be more than a field
+# over the image.
+_DOUBT = 3.0
 MAX_STEPS = 20
 _GAPS = 4
 
@@ -187,7 +190,10 @@ def withdraw(
         unexplained = max((s.weighty * s.share for s in left), default=0.0) * misfit
         weak = [
             name for name, candidate in selection.evidence.items()
-            if candidate.score.statistic < unexplained
+            if candidate.score.statistic < unexplained or (
+                candidate.score.statistic < _DOUBT * unexplained
+                and _any_field_does(data, selection.state, name, free)
+            )
         ]
         if left and not weak:
             weak = _scattered(selection.state, data)
@@ -198,6 +204,16 @@ def withdraw(
         selection.evidence.pop(name)
         selection.trace.append(_gone(name, 'explains little beside what stays unexplained'))
         selection = replace(selection, state=state)
+
+
+def _any_field_does(data: Data, state: State, name: str, free: Sequence[str]) -> bool:
+    """Whether an effect is no longer needed once any smooth field over the image is allowed."""
+    effect, _ = next(term for term in state.terms if term[0].name == name)
+    if not is_shared(effect):
+        return False
+    linear = Linearised(data, fit(data, without_effect(state, name), free), free)
+    nuisance = Nuisance(linear, mean_fields(linear)['image'])
+    return score(nuisance, linear.effect_columns(effect)).p_value > CLASS_SIGNIFICANCE
 
 
 def _scattered(state: State, data: Data) -> list[str]:

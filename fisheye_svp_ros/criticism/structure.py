@@ -44,8 +44,10 @@ class Structure(NamedTuple):
         """How much of its share a cause must explain beside it.
 
         Half of a pattern in time: fields of their own in every frame hold a lot of any remainder.
+        What neighbours have in common is no noise either.
         """
-        return 1.0 * (self.variable in (*_PLACES, 'landmark')) + 0.5 * (self.variable in _TIMES)
+        whole = (*_PLACES, 'landmark', 'neighbour_correlation')
+        return 1.0 * (self.variable in whole) + 0.5 * (self.variable in _TIMES)
 
 
 _PLACES = ('image', 'theta', 'range', 'pixel_phase')
