@@ -41,13 +41,15 @@ def main() -> None:
     parser.add_argument('--only', nargs='+', choices=_PARTS, default=list(_PARTS))
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/benchmarks.md'))
     args = parser.parse_args()
+    chosen = '' if args.only == list(_PARTS) else f' --only {" ".join(args.only)}'
     sections = []
     with progress('measuring', len(args.only)) as advance:
         for part in args.only:
             sections += _PARTS[part]()
+            # After every part, so that Ctrl-C keeps what is measured.
+            text = document(f'python -m benchmark.speed{chosen}', NOISE_PX, sections)
+            write_text(args.output, text)
             advance()
-    chosen = '' if args.only == list(_PARTS) else f' --only {" ".join(args.only)}'
-    write_text(args.output, document(f'python -m benchmark.speed{chosen}', NOISE_PX, sections))
     print(args.output)
 
 

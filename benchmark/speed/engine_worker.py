@@ -12,6 +12,8 @@ from benchmark.speed.variants import work_of
 engines.use('numba')
 job = work_of(sys.argv[1], int(sys.argv[2]))
 for _ in sys.stdin:
-    start = time.perf_counter()
+    wall, processor = time.perf_counter(), time.process_time()
     job()
-    print(json.dumps({'seconds': time.perf_counter() - start}), flush=True)
+    print(json.dumps({
+        'wall': time.perf_counter() - wall, 'processor': time.process_time() - processor,
+    }), flush=True)

@@ -28,7 +28,7 @@ _NOTES = {
 _ANY_LENS = ('GTSAM', 'SciPy')
 
 
-def rows(many: int = 10_000, looped: int = 100, repeats: int = 9) -> list[Row]:
+def rows(many: int = 10_000, looped: int = 100, repeats: int = 7) -> list[Row]:
     """Return the rows about one view and about `many`; the peers loop over `looped` of them."""
     svp, shift = svp_lens(), shift_lens()
     return [

@@ -16,12 +16,12 @@ _GOAL = 1e-3  # s that a localizer may add
 _TEXT = """From `image_points` in to `~/pose` out, through a localizer (33 landmarks, ShiftVP) and
 through a node that answers each set at once with a pose it has not looked for: separate processes
 on loopback, the same messages, in turns. "Adds" is the difference of the medians. Throughput: the
-highest rate at which every set of two seconds was answered; then the first at which not, and how
+highest rate at which every set of one second was answered; then the first at which not, and how
 many were. All topics are reliable with a depth of 100."""
 _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 
 
-def tables(count: int = 500) -> list[Table]:
+def tables(count: int = 300) -> list[Table]:
     """Return the table: a line a transport."""
     rows, notes = [], []
     worlds = {'standalone': {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}}

@@ -30,8 +30,8 @@ from fisheye_svp_ros.share import lens_path
 _LENS = 'fish214'
 _VIEWS = 50
 _PATIENCE = 30.0  # s
-_LASTING = 2.0  # s of sets at one rate
-_RATES = (50, 100, 200, 400, 800, 1600, 3200)
+_LASTING = 1.0  # s of sets at one rate
+_RATES = (100, 200, 400, 800, 1600, 3200)
 _ECHO = Path(__file__).with_name('echo_node.py')
 
 

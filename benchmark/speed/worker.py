@@ -13,7 +13,7 @@ from typing import Any
 def worker(
     command: Sequence[str], environment: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Yield a function that has the process work once and returns its answer, with `seconds`."""
+    """Yield a function that has the process work once and returns its answer, with its times."""
     with subprocess.Popen(
         command, env=environment, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
