@@ -102,8 +102,9 @@ def goals(rows: Sequence[Row]) -> Table:
 def of_row(row: Row) -> Table:
     """Return the table of one row: a line a side."""
     ours = [timing.name for timing in row.timings if timing.name.startswith(OURS)]
+    compared = any(timing.error is not None for timing in row.timings)
     header = (
-        'who', row.unit, 'quartiles', f'off, {row.error_unit}',
+        'who', row.unit, 'quartiles', *([f'off, {row.error_unit}'] if compared else ()),
         *(f'{name.removeprefix(OURS + ", ")} is faster by' for name in ours), 'notes',
     )
     lines = []
@@ -113,8 +114,8 @@ def of_row(row: Row) -> Table:
             '' if name == timing.name else f'{number(row.ratio(name, timing.name))} ×'
             for name in ours
         )
-        off = '' if timing.error is None else f'{timing.error:.1e}'
-        lines.append((timing.name, middle, f'{low} to {high}', off, *ratios, timing.note))
+        off = ['' if timing.error is None else f'{timing.error:.1e}'] if compared else ()
+        lines.append((timing.name, middle, f'{low} to {high}', *off, *ratios, timing.note))
     notes = [f'{name} did not take part: {why}.' for name, why in row.left_out.items()]
     return Table(row.title, header, lines, row.text, notes)
 

@@ -56,7 +56,7 @@ def _row(
             for name, environment in variants.items()
         })
         timings = measure(sides, repeats)
-    return Row(title, *unit, timings, '-', left_out, goals, text)
+    return Row(title, *unit, timings, left_out=left_out, goals=goals, text=text)
 
 
 def _side(
