@@ -45,6 +45,7 @@ setup(
     ],
     extras_require={
         'standalone': ['cyclonedds>=11.0.1'],
+        'fast': ['numba>=0.59'],
         'dask': ['distributed>=2023.7'],
         'test': ['pytest>=7.4', 'mpmath>=1.3', 'opencv-python-headless>=4.6'],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],

@@ -29,6 +29,7 @@ COMMANDS = {
     'table': 'a recording to a table, one row an input stamp',
     'watch': 'the results of running nodes, live, in the terminal',
 }
+_SOLVING = ('budget', 'calibrate', 'demo', 'diagnose', 'localize', 'paper', 'sweep')
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 _BROKEN_PIPE = 141  # 128 + SIGPIPE
@@ -58,7 +59,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             module = import_module(f'fisheye_svp_ros.commands.{named}')
             module.add_arguments(commands.choices[named])
             commands.choices[named].set_defaults(run=module.run)
+        if named in _SOLVING:
+            _add_engine(commands.choices[named])
         parsed = parser.parse_args(arguments)
+        if named in _SOLVING and parsed.engine:
+            import_module('fisheye_svp_ros.engines').use(parsed.engine)
         parsed.run(parsed)
         sys.stdout.flush()
     except FisheyeSvpError as error:
@@ -77,6 +82,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     return 0
+
+
+def _add_engine(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        '--engine', choices=('auto', 'numpy', 'numba'),
+        help='what projects and solves: numpy, or numba (extra `fast`), which is faster on long '
+        'work; auto, unless FISHEYE_SVP_ENGINE says otherwise, changes over once that pays',
+    )
 
 
 if __name__ == '__main__':

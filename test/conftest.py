@@ -21,6 +21,8 @@ from typing import Any
 
 import pytest
 
+from fisheye_svp_ros import engines
+
 # Asked before any test installs the standalone client, which answers to the name of rclpy.
 GENUINE = find_spec('rclpy') is not None
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,6 +39,19 @@ def _is_free(domain: int) -> bool:
         except OSError:
             return False
     return True
+
+
+@pytest.fixture(params=['numpy', 'numba'])
+def engine(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Run a test on each engine."""
+    if request.param == 'numba':
+        pytest.importorskip('numba', reason='the engine numba comes with the extra `fast`')
+    before = os.environ.get(engines.VARIABLE)
+    engines.use(request.param)
+    yield request.param
+    engines.use(before or 'auto')
+    if before is None:
+        del os.environ[engines.VARIABLE]
 
 
 @pytest.fixture

@@ -27,6 +27,8 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.lens import Lens, load_lens
 from fisheye_svp_ros.share import lens_path
 
+pytestmark = pytest.mark.usefixtures('engine')
+
 KITA = [load_lens(lens_path(name)) for name in ('fish180', 'fish214')]
 HEIGHTS = {
     'orthographic': (Orthographic(), 90.0),

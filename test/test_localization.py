@@ -15,6 +15,8 @@ from fisheye_svp_ros.rig import paper_pose
 from fisheye_svp_ros.share import lens_path
 from fisheye_svp_ros.solve.localization import localize
 
+pytestmark = pytest.mark.usefixtures('engine')
+
 LENSES = {name: load_lens(lens_path(name)) for name in ('fish180', 'fish214')}
 # Kita, tables 1 and 2: z error in mm, residual in px; by radius for whole, inner, outer.
 PUBLISHED = {

@@ -16,6 +16,8 @@ from fisheye_svp_ros.share import lens_path
 from fisheye_svp_ros.simulation import simulate, simulate_stereo
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
+pytestmark = pytest.mark.usefixtures('engine')
+
 MODELS = {name: ForwardModel(load_lens(lens_path(name))) for name in ('fish180', 'fish214')}
 SVP = {name: ForwardModel(model.lens.svp()) for name, model in MODELS.items()}
 # Kita, tables 3 and 4: mean residual, px, by radius; parallel, vergent, divergent.

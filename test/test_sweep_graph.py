@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -53,7 +55,17 @@ def test_every_scenario_once_and_with_the_offline_numbers(
     few.write_text(FEW)
     path = tmp_path / 'file.yaml'
     path.write_text(text.replace('FEW', str(few)))
-    assert main(['record', '--sweep', str(path), '-o', str(tmp_path / 'bag')]) == 0
+    bars: list[int] = []
+
+    @contextmanager
+    def progress(_: str, total: int) -> Iterator[Callable[[int], None]]:
+        assert total == scenarios
+        yield bars.append
+
+    with monkeypatch.context() as patched:
+        patched.setattr('fisheye_svp_ros.reporting.progress.progress', progress)
+        assert main(['record', '--sweep', str(path), '-o', str(tmp_path / 'bag')]) == 0
+    assert bars and min(bars) > 0 and sum(bars) <= scenarios
     assert main(['sweep', str(path), '-o', str(tmp_path / 'out')]) == 0
     recorded = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
     offline = read_columns(tmp_path / 'out' / 'sweep.parquet')

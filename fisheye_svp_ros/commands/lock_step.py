@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -37,15 +38,27 @@ def start_in_step(
     ])
 
 
-def record_sweep(path: Path, solvers: Sequence[str], bag: Path, logs: Path) -> None:
+def record_sweep(
+    path: Path, solvers: Sequence[str], bag: Path, logs: Path, advance: Callable[[int], None]
+) -> None:
     """Run the node graph through a sweep file into a new recording.
 
+    advance: told how many more scenarios the camera has reached.
     Raises StandaloneError where a process does not end well.
     """
+    reached = 0
+
+    def look() -> None:
+        nonlocal reached
+        told = re.findall(r'scenario (\d+) of', processes.latest('camera'))
+        if told and int(told[-1]) > reached:
+            advance(int(told[-1]) - reached)
+            reached = int(told[-1])
+
     with Processes(logs) as processes:
         processes.start('recorder', ['record', '-o', str(bag)])
         start_in_step(processes, 'camera', solvers, ['--params-file', str(path)])
-        processes.wait(['camera'], math.inf)
+        processes.wait(['camera'], math.inf, look)
         processes.stop('recorder')
         for node in solvers:
             processes.stop(node)

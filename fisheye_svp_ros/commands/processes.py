@@ -9,13 +9,14 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 
 from fisheye_svp_ros.errors import StandaloneError
 
 _POLL = 0.05  # s
+_END = 4000  # bytes
 _GRACE = 10.0  # s to end after a signal
 
 
@@ -53,8 +54,13 @@ class Processes:
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
             )
 
-    def wait(self, names: Sequence[str], patience: float) -> None:
-        """Wait until some have ended well; raise StandaloneError where one does not in time."""
+    def wait(
+        self, names: Sequence[str], patience: float, look: Callable[[], None] = lambda: None
+    ) -> None:
+        """Wait until some have ended well; `look` is called now and then meanwhile.
+
+        Raises StandaloneError where one does not end in time.
+        """
         end = time.monotonic() + patience
         waiting = set(names)
         while waiting:
@@ -69,6 +75,7 @@ class Processes:
             if time.monotonic() > end:
                 raise StandaloneError(f'{", ".join(sorted(waiting))} took more than '
                                       f'{patience:g} s: {self._last(min(waiting))}')
+            look()
             time.sleep(_POLL)
 
     def stop(self, name: str) -> None:
@@ -76,11 +83,17 @@ class Processes:
         self._running[name].send_signal(signal.SIGINT)
         self.wait([name], _GRACE * 6)
 
+    def latest(self, name: str) -> str:
+        """Return the end of what one has said."""
+        with self._log(name).open('rb') as log:
+            log.seek(max(0, log.seek(0, os.SEEK_END) - _END))
+            return log.read().decode('utf-8', 'replace')
+
     def _log(self, name: str) -> Path:
         return self._logs / f'{name}.log'
 
     def _last(self, name: str) -> str:
-        lines = self._log(name).read_text(encoding='utf-8', errors='replace').splitlines()
+        lines = self.latest(name).splitlines()
         return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
 
 

@@ -48,8 +48,9 @@ def _sweep(name: str, bag: Path) -> None:
     plan = read_sweep(path)
     if bag.exists():
         raise BagError(f'{bag}: it exists; a recording needs a new folder')
-    with progress(f'{len(plan.sweep)} scenarios'):
-        record_sweep(path, tuple(plan.solvers), bag, bag.with_name(f'{bag.name}_logs'))
+    logs = bag.with_name(f'{bag.name}_logs')
+    with progress('sweeping', len(plan.sweep)) as advance:
+        record_sweep(path, tuple(plan.solvers), bag, logs, advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
     say(f'{count} sets of {len(plan.sweep)} scenarios are in {bag}')
 

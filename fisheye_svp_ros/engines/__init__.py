@@ -99,7 +99,7 @@ def pose_equations(
 
 
 def localize(
-    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, Array]
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, ...]
 ) -> Poses | None:
     """Solve single poses from starts (S, 3, 3), (S, 3), if the engine can do so by itself.
 

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt compiled by Numba: `solve.least_squares` and `solve.arrow`, system by system.
+"""Levenberg-Marquardt compiled: `solve.least_squares` and `solve.arrow`, system by system.
 
 A system is V views of a rig of one or two cameras: a pose of the right camera for each view and,
 for two, the rig that they share.  What is not plain sailing (a point near the lens, a singular
@@ -14,7 +14,6 @@ from fisheye_svp_ros.engines.kernels import (
     OPTIONS,
     factor,
     retract,
-    scaled,
     substitute,
     view_equations,
 )
@@ -105,43 +104,38 @@ def _equations(w, left, right, cameras, pose, rig, normal):
 
 
 @njit(**OPTIONS)
-def _step(normal, cameras, damping, block_step, shared_step):
+def _step(normal, cameras, damping, work, block_step, shared_step):
     """Solve (H + damping diag H) d = -g; return |J d|^2, nan for a singular system."""
     blocks, cross, shared, block_gradient, shared_gradient = normal
-    lower, scale, right = np.empty((6, 6)), np.empty(6), np.empty(6)
-    reduced, other, slope = np.empty((6, 6)), np.empty(6), np.zeros(6)
-    eliminated = np.empty((len(blocks), 7, 6))
-    scaled(shared, damping, other, reduced)
-    for k in range(6):
-        slope[k] = shared_gradient[k] / other[k]
-    for v in range(len(blocks)):
-        scaled(blocks[v], damping, scale, lower)
-        if not factor(lower):
-            return np.nan
-        for k in range(7 if cameras == 2 else 1):
-            for i in range(6):
-                right[i] = (block_gradient[v, i] if k == 0 else cross[v, i, k - 1]) / scale[i]
-            substitute(lower, right)
-            for i in range(6):
-                eliminated[v, k, i] = right[i] / scale[i]
-        if cameras == 2:
-            for j in range(6):
-                for i in range(6):
-                    part = cross[v, i, j] / other[j]
-                    slope[j] -= part * eliminated[v, 0, i]
-                    for k in range(6):
-                        reduced[j, k] -= part * eliminated[v, k + 1, i] / other[k]
-    shared_step[:] = 0.0
+    lower, scale, reduced, eliminated = work
+    columns = 7 if cameras == 2 else 1
     if cameras == 2:
-        if not factor(reduced):
-            return np.nan
-        substitute(reduced, slope)
+        reduced[:] = shared
         for k in range(6):
-            shared_step[k] = -slope[k] / other[k]
+            reduced[k, k] *= 1.0 + damping
+            shared_step[k] = -shared_gradient[k]
+    for v in range(len(blocks)):
+        if not factor(blocks[v], damping, scale, lower):
+            return np.nan
+        for i in range(6):
+            eliminated[v, 0, i] = block_gradient[v, i]
+            for k in range(1, columns):
+                eliminated[v, k, i] = cross[v, i, k - 1]
+        for k in range(columns):
+            substitute(lower, scale, eliminated[v, k])
+        for k in range(columns - 1):
+            for i in range(6):
+                shared_step[k] += cross[v, i, k] * eliminated[v, 0, i]
+                for j in range(6):
+                    reduced[j, k] -= cross[v, i, j] * eliminated[v, k + 1, i]
+    if cameras == 2:
+        if not factor(reduced, 0.0, scale, lower):
+            return np.nan
+        substitute(lower, scale, shared_step)
     for v in range(len(blocks)):
         for i in range(6):
             block_step[v, i] = -eliminated[v, 0, i]
-            for k in range(6 if cameras == 2 else 0):
+            for k in range(columns - 1):
                 block_step[v, i] -= eliminated[v, k + 1, i] * shared_step[k]
     return _moved(normal, cameras, block_step, shared_step)
 
@@ -156,9 +150,10 @@ def _moved(normal, cameras, block_step, shared_step):
                 total += block_step[v, i] * blocks[v, i, k] * block_step[v, k]
                 if cameras == 2:
                     total += 2.0 * block_step[v, i] * cross[v, i, k] * shared_step[k]
-    for i in range(6):
-        for k in range(6):
-            total += shared_step[i] * shared[i, k] * shared_step[k]
+    if cameras == 2:
+        for i in range(6):
+            for k in range(6):
+                total += shared_step[i] * shared[i, k] * shared_step[k]
     return total
 
 
@@ -193,7 +188,8 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
     1: converged; 0: not; -1: left to the reference, wherever it got to.
     """
     views = len(pose[0])
-    block_step, shared_step = np.empty((views, 6)), np.empty(6)
+    block_step, shared_step = np.empty((views, 6)), np.zeros(6)
+    work = (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6)))
     new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
     new_rig = (np.empty((3, 3)), np.empty(3))
     damping, growth = 1e-4, 2.0
@@ -201,7 +197,7 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0
     for iteration in range(1, MAX_ITERATIONS + 1):
-        moved = _step(normal, cameras, damping, block_step, shared_step)
+        moved = _step(normal, cameras, damping, work, block_step, shared_step)
         if np.isnan(moved):
             return total, iteration, -1
         _retract(pose, rig, block_step, shared_step, new_pose, new_rig)

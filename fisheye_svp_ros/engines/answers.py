@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 
 # Points (S, N, 3), m; image points (S, N, 2), px; weights (S, N), 1/px
 Seen = tuple[Array, Array, Array]
@@ -13,7 +13,7 @@ Seen = tuple[Array, Array, Array]
 class Poses(NamedTuple):
     """S poses at their minima, the fields of `solve.localization.Localization`.
 
-    ended (S,): 1 where solved; the rest is left to the solver.
+    solved (S,): whether it was; what was not, `left` of them, is left to the solver.
     """
 
     rotation: Array
@@ -21,8 +21,9 @@ class Poses(NamedTuple):
     covariance: Array
     residual: Array
     cost: Array
+    solved: Mask
     iterations: Index
-    ended: Index
+    left: int
 
 
 class Rigs(NamedTuple):

@@ -31,6 +31,7 @@ def filled() -> bool:
     return (folder() / 'complete').exists()
 
 
+@cache
 def mark_filled() -> None:
     """Remember that all of it has been compiled, where that can be kept."""
     with suppress(OSError):

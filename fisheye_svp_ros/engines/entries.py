@@ -31,9 +31,10 @@ from fisheye_svp_ros.engines.kernels import (
     image,
     load,
     meet,
-    scaled,
     substitute,
 )
+
+_DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the reference
 
 
 @njit(**OPTIONS)
@@ -47,18 +48,15 @@ def _write(w, n, uv, state):
 @njit(**OPTIONS)
 def _inverse(hessian, out):
     """Write the inverse of an information (6, 6); return whether it is determined."""
-    scale, lower, column, trace = np.empty(6), np.empty((6, 6)), np.empty(6), 0.0
-    scaled(hessian, SINGULAR, scale, lower)
-    if not factor(lower):
+    scale, lower, trace = np.empty(6), np.empty((6, 6)), 0.0
+    if not factor(hessian, SINGULAR, scale, lower):
         return False
+    out[:] = 0.0
     for k in range(6):
-        column[:] = 0.0
-        column[k] = 1.0
-        substitute(lower, column)
-        trace += column[k]
-        for i in range(6):
-            out[i, k] = column[i] / (scale[i] * scale[k])
-    return trace < 1e12
+        out[k, k] = 1.0
+        substitute(lower, scale, out[k])
+        trace += out[k, k] / (scale[k] * scale[k])
+    return trace < _DETERMINED
 
 
 @njit(**OPTIONS)
@@ -133,8 +131,7 @@ def linearise(points, lens, edge, uv, state, d_point, first):
         for row in range(2):
             for axis in range(3):
                 at = ROW + row * ROWS + axis * B
-                for i in range(n):
-                    d_point[row, axis, first + start + i] = w[at + i]
+                d_point[row, axis, first + start:first + start + n] = w[at:at + n]
 
 
 @_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
@@ -153,43 +150,40 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
             for row in range(4):
                 # By place and by turn, of u and of v; the camera moves, not the point.
                 at = ROW + (row // 2) * ROWS + (row % 2) * 3 * B
+                x, y, z = w[at:at + B], w[at + B:at + 2 * B], w[at + 2 * B:at + 3 * B]
                 sign = 1.0 if row % 2 else -1.0
                 for k in range(3):
                     a, b, c = sign * r[k, 0], sign * r[k, 1], sign * r[k, 2]
                     out = d_pose[s, row // 2, 3 * (row % 2) + k]
                     for i in range(n):
-                        out[start + i] = (
-                            a * w[at + i] + b * w[at + B + i] + c * w[at + 2 * B + i])
+                        out[start + i] = a * x[i] + b * y[i] + c * z[i]
 
 
 _SEEN = (_in(3), _in(3), _in(2))
 
 
 @_entry(types.int64, *_SEEN, _in(2, types.int64), _in(1), types.int64, _out(3), _out(2), _out(3),
-        _out(3), _out(1), _out(1, types.int64), _out(1, types.int64))
+        _out(3), _out(1), _out(1, types.boolean), _out(1, types.int64))
 def localize(points, uv, weight, row, lens, minimum, rotation, position, covariance, residual,
-             cost, iterations, ended):
+             cost, solved, iterations):
     """Move S poses to their minima; return how many are left to the reference."""
     w, normal, fresh, left = np.empty(SCRATCH), empty_normal(1), empty_normal(1), 0
     rig = (np.eye(3), np.zeros(3))
     for s in range(len(points)):
-        usable = 0
+        usable, solved[s] = 0, False
         for i in range(weight.shape[1]):
             usable += weight[s, i] > 0.0
-        ended[s] = -1
         if usable >= minimum:
             seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
             pose = (rotation[s:s + 1], position[s:s + 1])
-            cost[s], iterations[s], ended[s] = minimise(
-                w, seen, seen, 1, pose, rig, normal, fresh)
-        if ended[s] == 1 and not (
-            _inverse(normal[0][0], covariance[s])
-            and _residual(w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
-        ):
-            ended[s] = -1
-        if ended[s] < 1:
-            ended[s] = -1
-            left += 1
+            cost[s], iterations[s], ended = minimise(w, seen, seen, 1, pose, rig, normal, fresh)
+            solved[s] = (
+                ended == 1
+                and _inverse(normal[0][0], covariance[s])
+                and _residual(
+                    w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
+            )
+        left += not solved[s]
     return left
 
 

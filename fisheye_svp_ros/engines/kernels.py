@@ -12,7 +12,7 @@ from numba import njit
 from numba.extending import register_jitable
 
 from fisheye_svp_ros import formulas
-from fisheye_svp_ros.engines.rays import BEHIND, CLEAR, NEWTON_STEPS, SETTLED
+from fisheye_svp_ros.engines.rays import BEHIND, CLEAR, MORE_STEPS, NEWTON_STEPS, SETTLED
 from fisheye_svp_ros.formulas import NOWHERE
 
 # Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
@@ -27,7 +27,8 @@ B = 256  # points in a block
 (X, Y, Z, R, EX, EY, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, HEIGHT, SLOPE,
  U, V, ROW) = (B * i for i in range(20))
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
-SCRATCH = ROW + 2 * ROWS
+GRAM = ROW + 2 * ROWS
+SCRATCH = GRAM + 49 + 42
 VALID, INVALID, LEFT = 1.0, 0.0, -1.0
 SINGULAR = 1e-15  # pivot of a scaled matrix
 
@@ -96,35 +97,43 @@ def meet(w, n, lens, edge):
 
 @njit(**OPTIONS)
 def _past_shift(w, n, lens):
-    k = lens[SHIFT_K:]
     for i in range(n):
         w[TURN + i] = 0.0
-    for count in range(NEWTON_STEPS):
-        if lens[SHIFT_KIND] == 0:
-            for i in range(n):
-                shift, rise = formulas.gennery(
-                    w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
-                w[U + i], w[V + i] = shift, rise
-        else:
-            for i in range(n):
-                shift, rise = formulas.flat_port(
-                    w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1])
-                w[U + i], w[V + i] = shift, rise
-        moving = 0
+    late = 0
+    for _ in range(NEWTON_STEPS):
+        late = _approach(w, 0, n, lens)
+    if late:
         for i in range(n):
-            step, clearance = formulas.approach(
-                w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i])
-            turn = w[TURN + i] + step
-            w[TURN + i], w[CLEARANCE + i] = turn, clearance
-            w[THETA + i] = w[THETA0 + i] + turn
-            w[SIN + i], w[COS + i] = _turned(w[SIN0 + i], w[COS0 + i], turn)
-            w[STATE + i] = abs(step)
-            moving += w[STATE + i] > SETTLED
-        if count >= 2 and moving == 0:
-            return
-    for i in range(n):
-        if not w[STATE + i] < SETTLED:
-            w[TURN + i] = np.nan
+            for _ in range(MORE_STEPS):
+                if not w[STATE + i] < SETTLED:
+                    _approach(w, i, i + 1, lens)
+            if not w[STATE + i] < SETTLED:
+                w[TURN + i] = np.nan
+
+
+@njit(**OPTIONS)
+def _approach(w, first, last, lens):
+    """Take one Newton step with some points; return how many have not settled."""
+    k = lens[SHIFT_K:]
+    if lens[SHIFT_KIND] == 0:
+        for i in range(first, last):
+            w[U + i], w[V + i] = formulas.gennery(
+                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
+    else:
+        for i in range(first, last):
+            w[U + i], w[V + i] = formulas.flat_port(
+                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1])
+    late = 0
+    for i in range(first, last):
+        step, clearance = formulas.approach(
+            w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i])
+        turn = w[TURN + i] + step
+        w[TURN + i], w[CLEARANCE + i] = turn, clearance
+        w[THETA + i] = w[THETA0 + i] + turn
+        w[SIN + i], w[COS + i] = _turned(w[SIN0 + i], w[COS0 + i], turn)
+        w[STATE + i] = abs(step)
+        late += not w[STATE + i] < SETTLED
+    return late
 
 
 @njit(**OPTIONS)
@@ -197,7 +206,7 @@ def load(w, n, points, start, rotation, position):
 
 @njit(**OPTIONS)
 def add_view(w, points, uv, weight, lens, rotation, position, gram):
-    """Add the products of a view's rows to gram (7, 7), camera frame; return how it went."""
+    """Add the products of a view's rows to gram (49), camera frame; return how it went."""
     worst = VALID
     for start in range(0, len(points), B):
         n = min(B, len(points) - start)
@@ -217,81 +226,92 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
             w[ROW + 6 * B + i] = w[U + i] - uv[start + i, 0]
             w[ROW + 13 * B + i] = w[V + i] - uv[start + i, 1]
             w[STATE + i] = weight[start + i] * weight[start + i]
-        for a in range(7):
-            for b in range(a, 7):
-                total = 0.0
-                for i in range(n):
-                    total += w[STATE + i] * (
-                        w[ROW + a * B + i] * w[ROW + b * B + i]
-                        + w[ROW + ROWS + a * B + i] * w[ROW + ROWS + b * B + i])
-                gram[a, b] += total
+        _add_products(w[STATE:STATE + n], w[ROW:], w[ROW + ROWS:], gram)
     return worst
+
+
+@njit(**OPTIONS)
+def _add_products(weight, u, v, gram):
+    """Add to the upper triangle of gram (49) what the rows of u and v give."""
+    for a in range(7):
+        ua, va = u[a * B:(a + 1) * B], v[a * B:(a + 1) * B]
+        for b in range(a, 7):
+            ub, vb = u[b * B:(b + 1) * B], v[b * B:(b + 1) * B]
+            total = 0.0
+            for i in range(len(weight)):
+                total += weight[i] * (ua[i] * ub[i] + va[i] * vb[i])
+            gram[7 * a + b] += total
 
 
 @njit(**OPTIONS)
 def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gradient):
     """Write H (6, 6) and g (6) of one pose; return its cost, inf outside, nan if left."""
-    gram = np.zeros((7, 7))
+    gram, half = w[GRAM:GRAM + 49], w[GRAM + 49:SCRATCH]
+    gram[:] = 0.0
     state = add_view(w, points, uv, weight, lens, rotation, position, gram)
     if state < VALID:
         return np.nan if state == LEFT else np.inf
-    half = np.zeros((6, 7))  # turn @ gram; the camera moves, not the point
-    for a in range(3):
-        for b in range(7):
-            for k in range(3):
-                half[a, b] -= rotation[a, k] * (gram[k, b] if k <= b else gram[b, k])
-                half[3 + a, b] += rotation[a, k] * (
-                    gram[3 + k, b] if 3 + k <= b else gram[b, 3 + k])
+    for a in range(7):
+        for b in range(a):
+            gram[7 * a + b] = gram[7 * b + a]
+    for part in range(2):
+        for a in range(3):
+            for b in range(7):
+                total = 0.0
+                for k in range(3):
+                    total += rotation[a, k] * gram[7 * (3 * part + k) + b]
+                # By place, the camera moves, not the point.
+                half[7 * (3 * part + a) + b] = total if part else -total
     for a in range(6):
-        gradient[a] = half[a, 6]
+        gradient[a] = half[7 * a + 6]
         for b in range(3):
             place, turn = 0.0, 0.0
             for k in range(3):
-                place -= half[a, k] * rotation[b, k]
-                turn += half[a, 3 + k] * rotation[b, k]
+                place -= half[7 * a + k] * rotation[b, k]
+                turn += half[7 * a + 3 + k] * rotation[b, k]
             hessian[a, b], hessian[a, 3 + b] = place, turn
-    return gram[6, 6]
+    return gram[48]
 
 
 @njit(**OPTIONS)
-def factor(matrix):
-    """Replace a symmetric matrix by its Cholesky factor; return whether it has one."""
-    for j in range(len(matrix)):
-        for i in range(j, len(matrix)):
-            total = matrix[i, j]
+def factor(hessian, damping, scale, lower):
+    """Factor a matrix scaled to a unit diagonal and damped; return whether that can be done.
+
+    scale: what rows and columns are multiplied by; lower: Cholesky's factor, with the reciprocals
+    of its diagonal.
+    """
+    size = len(scale)
+    for j in range(size):
+        scale[j] = 1.0 / np.sqrt(hessian[j, j]) if hessian[j, j] > 0.0 else 1.0
+    for j in range(size):
+        for i in range(j, size):
+            total = 1.0 + damping if i == j else hessian[i, j] * scale[i] * scale[j]
             for k in range(j):
-                total -= matrix[i, k] * matrix[j, k]
+                total -= lower[i, k] * lower[j, k]
             if i > j:
-                matrix[i, j] = total / matrix[j, j]
+                lower[i, j] = total * lower[j, j]
             elif total > SINGULAR:
-                matrix[j, j] = np.sqrt(total)
+                lower[j, j] = 1.0 / np.sqrt(total)
             else:
                 return False
     return True
 
 
 @njit(**OPTIONS)
-def substitute(lower, x):
-    """Solve L L^T x = x in place, x a vector."""
-    for i in range(len(x)):
+def substitute(lower, scale, x):
+    """Solve for the matrix that was factored, x in place."""
+    size = len(scale)
+    for i in range(size):
+        x[i] *= scale[i]
         for k in range(i):
             x[i] -= lower[i, k] * x[k]
-        x[i] /= lower[i, i]
-    for i in range(len(x) - 1, -1, -1):
-        for k in range(i + 1, len(x)):
+        x[i] *= lower[i, i]
+    for i in range(size - 1, -1, -1):
+        for k in range(i + 1, size):
             x[i] -= lower[k, i] * x[k]
-        x[i] /= lower[i, i]
-
-
-@njit(**OPTIONS)
-def scaled(hessian, damping, scale, out):
-    """Scale to a unit diagonal and damp it."""
-    for a in range(len(scale)):
-        scale[a] = np.sqrt(hessian[a, a]) if hessian[a, a] > 0 else 1.0
-    for a in range(len(scale)):
-        for b in range(len(scale)):
-            out[a, b] = hessian[a, b] / (scale[a] * scale[b])
-        out[a, a] = 1.0 + damping
+        x[i] *= lower[i, i]
+    for i in range(size):
+        x[i] *= scale[i]
 
 
 @njit(**OPTIONS)
@@ -303,13 +323,12 @@ def retract(rotation, position, change, new_rotation, new_position):
     if angle2 >= 1e-12:
         angle = np.sqrt(angle2)
         a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / angle2
-    turn = np.array([
-        [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-        [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-        [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
-    ])
+    t00, t01, t02 = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    t10, t11, t12 = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    t20, t21, t22 = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
     for i in range(3):
         new_position[i] = position[i] + change[i]
-        for j in range(3):
-            new_rotation[i, j] = (turn[i, 0] * rotation[0, j] + turn[i, 1] * rotation[1, j]
-                                  + turn[i, 2] * rotation[2, j])
+        r0, r1, r2 = rotation[0, i], rotation[1, i], rotation[2, i]
+        new_rotation[0, i] = t00 * r0 + t01 * r1 + t02 * r2
+        new_rotation[1, i] = t10 * r0 + t11 * r1 + t12 * r2
+        new_rotation[2, i] = t20 * r0 + t21 * r1 + t22 * r2

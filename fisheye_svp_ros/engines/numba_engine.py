@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from fisheye_svp_ros.engines import entries, kernels, numpy_engine
 from fisheye_svp_ros.engines.answers import Poses, Rigs, Seen
 from fisheye_svp_ros.engines.rays import caustic_range, edge, search_limit
 from fisheye_svp_ros.lens import Lens
+
+T = TypeVar('T')
 
 _SHARE = 20_000  # points below which a thread of their own does not pay
 _KEPT = 64  # lenses
@@ -89,14 +92,15 @@ def linearise_views(
     left = _left(state, numbers)
     if left is not None:
         rows, _ = left
-        uv[left], state[left], by_pose[left] = (part[:, 0] for part in numpy_engine.linearise_views(
+        again = numpy_engine.linearise_views(
             lens, rotation[rows], position[rows], points[left][:, None], limited
-        ))
+        )
+        uv[left], state[left], by_pose[left] = (part[:, 0] for part in again)
     return uv, state > 0, by_pose
 
 
 def localize(
-    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, Array]
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, ...]
 ) -> Poses | None:
     """Do as `engines.localize` says."""
     numbers = packed(lens)
@@ -104,20 +108,22 @@ def localize(
         return None
     seen, row = _contiguous(seen), np.ascontiguousarray(row)
     systems, count = row.shape
-    found = Poses(
+    found = (
         start[0].copy(), start[1].copy(), np.empty((systems, 6, 6)),
-        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.int64),
+        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=bool),
         np.empty(systems, dtype=np.int64),
     )
 
-    def run(part: slice) -> None:
-        entries.localize(
+    def run(part: slice) -> int:
+        left: int = entries.localize(
             *(array[part] for array in seen), row[part], numbers, minimum,
             *(array[part] for array in found)
         )
+        return left
 
-    _spread(run, systems, 4 * systems * count)
-    return found
+    if systems > 1:
+        return Poses(*found, sum(_spread(run, systems, 4 * systems * count)))
+    return Poses(*found, entries.localize(*seen, row, numbers, minimum, *found))
 
 
 def adjust_rigs(
@@ -157,7 +163,9 @@ def _pack(lens: Lens) -> Array | None:
     numbers = np.zeros(kernels.LENS)
     numbers[kernels.FX:kernels.CY + 1] = lens.fx, lens.fy, lens.cx, lens.cy
     numbers[kernels.SHIFT_KIND] = -1
-    curves = [(height, kernels.HEIGHTS, kernels.HEIGHT_KIND, kernels.HEIGHT_K)]
+    curves: list[tuple[Any, Any, int, int]] = [
+        (height, kernels.HEIGHTS, kernels.HEIGHT_KIND, kernels.HEIGHT_K)
+    ]
     if shift is not None:
         curves.append((shift, kernels.SHIFTS, kernels.SHIFT_KIND, kernels.SHIFT_K))
         numbers[kernels.NEAR] = caustic_range(shift, search_limit(shift, lens.max_incidence))
@@ -182,16 +190,14 @@ def _left(state: Array, numbers: Array) -> tuple[Index, ...] | None:
     return left if left[0].size else None
 
 
-def _spread(run: Callable[[slice], None], count: int, points: int) -> None:
+def _spread(run: Callable[[slice], T], count: int, points: int) -> list[T]:
     """Run over `count` rows, on as many threads as there are and as `points` make worth while."""
     threads = min(_threads(), count, points // _SHARE)
     if threads < 2:
-        run(slice(0, count))
-        return
+        return [run(slice(0, count))]
     edges = np.linspace(0, count, threads + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads) as pool:
-        for done in [pool.submit(run, slice(*pair)) for pair in itertools.pairwise(edges)]:
-            done.result()
+        return list(pool.map(run, (slice(*pair) for pair in itertools.pairwise(edges))))
 
 
 @cache

@@ -16,7 +16,7 @@ from fisheye_svp_ros.curves import ViewpointShift, shift_at
 from fisheye_svp_ros.formulas import approach
 from fisheye_svp_ros.lens import Lens
 
-NEWTON_STEPS = 6
+NEWTON_STEPS, MORE_STEPS = 3, 3  # for all points, and for those that need them
 SETTLED = 1e-7  # a last Newton step this small leaves an error of its square
 CLEAR = 1e-20  # m; a clearance of 0 but for rounding
 _HALVINGS = 48
@@ -89,7 +89,7 @@ def _past_shift(
     assert shift is not None
     theta, sin, cos, clearance, settled = _newton(shift, r, z, *start)
     limit = search_limit(shift, lens.max_incidence)
-    apart = ~settled | (distance < caustic_range(shift, limit))
+    apart = ~settled | (theta <= 0) | (distance < caustic_range(shift, limit))
     if apart.any():
         found = _scan(shift, limit, r[apart], z[apart])
         theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
@@ -99,23 +99,32 @@ def _past_shift(
 
 
 def _newton(
-    shift: ViewpointShift, r: Array, z: Array, theta: Array, sin: Array, cos: Array
+    shift: ViewpointShift, r: Array, z: Array, theta: Array, sin: Array, cos: Array,
+    steps: int = NEWTON_STEPS, more: int = MORE_STEPS,
 ) -> tuple[Array, Array, Array, Array, Mask]:
-    for count in range(1, NEWTON_STEPS + 1):
+    """Take Newton steps, and up to so many more with the points that have not settled."""
+    for count in range(steps):
+        if count:
+            sin, cos = _sine_and_cosine(theta)
         step, clearance = approach(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
         theta = theta + step
-        size = np.abs(step)
-        if count == NEWTON_STEPS or (count > 2 and not (size > SETTLED).any()):
-            break
-        half_tan = np.tan(0.5 * theta)
-        scale = half_tan * half_tan
-        cos = 1.0 - scale
-        scale += 1.0
-        scale = 1.0 / scale
-        cos *= scale
-        sin = 2.0 * half_tan * scale
     # The last step is so small that sine and cosine follow it in a straight line.
-    return theta, sin + step * cos, cos - step * sin, clearance, (size < SETTLED) & (theta > 0)
+    found = (theta, sin + step * cos, cos - step * sin, clearance, np.abs(step) < SETTLED)
+    late = ~found[-1]
+    if more and late.any():
+        start = theta[late], *_sine_and_cosine(theta[late])
+        again = _newton(shift, r[late], z[late], *start, 1, more - 1)
+        for field, values in zip(found, again, strict=True):
+            field[late] = values
+    return found
+
+
+def _sine_and_cosine(theta: Array) -> tuple[Array, Array]:
+    """Return both by way of tan(theta / 2), which NumPy has faster."""
+    half_tan = np.tan(0.5 * theta)
+    square = half_tan * half_tan
+    scale = 1.0 / (1.0 + square)
+    return 2.0 * half_tan * scale, (1.0 - square) * scale
 
 
 def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:

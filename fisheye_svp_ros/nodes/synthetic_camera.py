@@ -28,6 +28,8 @@ from fisheye_svp_ros.scenario import (
 )
 from fisheye_svp_ros.settings import SyntheticCameraSettings
 
+_SAY_EVERY = 1.0  # s, how far the sweep is
+
 
 class Step(NamedTuple):
     """One set (`frame`) of scenario `number`.
@@ -73,6 +75,9 @@ class SyntheticCamera(CameraNode):
 
     def publish_set(self, step: Step, stamp: int) -> None:
         """Publish a set."""
+        if self._sweep.lists:
+            self.get_logger().info(f'scenario {step.number + 1} of {len(self._sweep)}',
+                                   throttle_duration_sec=_SAY_EVERY)
         simulation = step.simulation
         place = {'scenario': step.number, 'scenarios': len(self._sweep),
                  'set': step.frame, 'sets': len(simulation.poses[0].position)}

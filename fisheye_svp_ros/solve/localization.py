@@ -51,10 +51,9 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
         quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, tuple(start))
     if quick is None:
         return _by_reference(model, views, start)
-    solved = quick.ended == 1
-    found = Localization(Pose(quick.rotation, quick.position), *quick[2:5], solved, quick[5])
-    if not solved.all():
-        left = np.flatnonzero(~solved)
+    found = Localization(Pose(*quick[:2]), *quick[2:7])
+    if quick.left:
+        left = np.flatnonzero(~quick.solved)
         merge(found, left, _by_reference(model, views.take(left), start.take(left)))
     return found
 
