@@ -10,7 +10,7 @@ demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
 
 test: $(VENV)/ready lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
@@ -43,13 +43,13 @@ bench: .venv-bench/ready
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
 	$(PYTHON) -m venv .venv-oldest
-	.venv-oldest/bin/pip install --quiet -e '.[standalone,test]' -c test/oldest.txt
-	.venv-oldest/bin/python -m pytest
+	.venv-oldest/bin/pip install --quiet -e '.[standalone,fast,test]' -c test/oldest.txt
+	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
 
 $(VENV)/ready: setup.py
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -e '.[standalone,test,lint]'
+	$(BIN)/pip install --quiet -e '.[standalone,fast,test,lint]'
 	touch $@
 
 clean:

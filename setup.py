@@ -47,7 +47,9 @@ setup(
         'standalone': ['cyclonedds>=11.0.1'],
         'fast': ['numba>=0.59'],
         'dask': ['distributed>=2023.7'],
-        'test': ['pytest>=7.4', 'mpmath>=1.3', 'opencv-python-headless>=4.6'],
+        'test': [
+            'pytest>=7.4', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'opencv-python-headless>=4.6',
+        ],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],
     },
     zip_safe=True,

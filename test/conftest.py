@@ -41,6 +41,13 @@ def _is_free(domain: int) -> bool:
     return True
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep what needs the compiled engine in one process, so that it is compiled once."""
+    for item in items:
+        if {'engine', 'compiled'} & set(getattr(item, 'fixturenames', ())):
+            item.add_marker(pytest.mark.xdist_group('engines'))
+
+
 @pytest.fixture(params=['numpy', 'numba'])
 def engine(request: pytest.FixtureRequest) -> Iterator[str]:
     """Run a test on each engine."""
