@@ -9,6 +9,8 @@ OUT ?= out
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
 
+# One thread each for NumPy, since the tests are spread over all cores.
+test test-oldest: export OMP_NUM_THREADS := 1
 test: $(VENV)/ready lint
 	$(BIN)/python -m pytest -n auto --dist loadgroup
 

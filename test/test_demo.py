@@ -21,6 +21,8 @@ from fisheye_svp_ros.errors import BagError, StandaloneError
 from fisheye_svp_ros.evaluation.demonstration import shown
 from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
 
+pytestmark = pytest.mark.xdist_group('demo')  # run once
+
 
 @pytest.fixture(scope='module')
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Any:

@@ -27,6 +27,7 @@ from fisheye_svp_ros.landmarks import RADII, SPREADS
 from fisheye_svp_ros.lens import load_lens
 from fisheye_svp_ros.share import config_path, lens_path
 
+pytestmark = pytest.mark.xdist_group('paper')  # made once
 HELD = Path(__file__).with_name('paper_cells.csv')
 Z, RESIDUAL = QUANTITIES.index('z'), QUANTITIES.index('residual')
 
