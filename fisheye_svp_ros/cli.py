@@ -87,8 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--engine', choices=('auto', 'numpy', 'numba'),
-        help='what projects and solves: numpy, or numba (extra `fast`), which is faster on long '
-        'work; auto, unless FISHEYE_SVP_ENGINE says otherwise, changes over once that pays',
+        help='what projects and solves: numpy, or numba (extra `fast`), which is compiled at its '
+        'first use on a machine (a minute); default: FISHEYE_SVP_ENGINE, or auto: numba for work '
+        'that is long enough, numpy otherwise',
     )
 
 

@@ -177,15 +177,40 @@ def test_many_lenses_in_turn_are_not_mixed_up(compiled):
         assert uv[0, 0] == pytest.approx(f * np.arctan2(0.3, 0.4), rel=1e-14)
 
 
-def test_the_compiled_engine_comes_once_it_pays(compiled, monkeypatch):
-    monkeypatch.delenv(engines.VARIABLE, raising=False)
-    monkeypatch.setattr(engines, '_LOADING', 1000)
-    monkeypatch.setattr(engines.cache, 'filled', lambda: True)
-    choice = engines._Choice('auto')
-    assert choice.engine(600) is numpy_engine
-    assert choice.engine(400) is numpy_engine
-    assert choice.engine(1) is compiled
-    assert choice.engine(1) is compiled
+@pytest.fixture
+def unsettled(monkeypatch):
+    """Leave the choice to the package, whatever is chosen for the tests."""
+    monkeypatch.setattr(engines, '_engine', numpy_engine)
+    monkeypatch.setenv(engines.VARIABLE, 'auto')
+
+
+@pytest.mark.parametrize(('filled', 'points', 'chosen'), [
+    (True, engines.LOADING - 1, 'numpy'), (True, engines.LOADING, 'numba'),
+    (False, engines.LOADING, 'numpy'), (False, 1e10, 'numba'),
+])
+def test_the_compiled_engine_comes_where_it_pays(
+    compiled, unsettled, monkeypatch, filled, points, chosen
+):
+    monkeypatch.setattr(engines.cache, 'filled', lambda: filled)
+    assert engines.settle(points) == chosen
+    assert engines.settle(1) == chosen
+
+
+def test_what_was_asked_for_stays(compiled, unsettled):
+    engines.use('numpy')
+    assert engines.settle(1e10) == 'numpy'
+
+
+@pytest.mark.parametrize('name', ['auto', 'numba'])
+def test_a_numba_that_does_not_go_with_this_numpy(unsettled, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.engines.numba_engine', None)
+    monkeypatch.delattr(engines, 'numba_engine', raising=False)
+    monkeypatch.setattr(engines, 'find_spec', lambda _: 'there')
+    if name == 'auto':
+        assert engines.settle(1e10) == 'numpy'
+    else:
+        with pytest.raises(ParameterError, match='the engine numba cannot be loaded'):
+            engines.use(name)
 
 
 def test_small_work_never_loads_numba():
@@ -206,7 +231,7 @@ def test_a_wrong_or_missing_engine_is_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.engines.numba_engine', None)
     monkeypatch.delattr(engines, 'numba_engine', raising=False)
     assert cli.main(['localize', 'none.csv', '--lens', 'none', '--engine', 'numba']) == 2
-    assert 'the engine numba needs' in capsys.readouterr().err
+    assert 'the engine numba cannot be loaded' in capsys.readouterr().err
 
 
 def test_the_engine_changes_no_answer_of_the_camera(engine):

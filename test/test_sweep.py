@@ -128,7 +128,7 @@ def test_every_set_of_a_rig_is_a_row() -> None:
         },
         'stereo_calibrator': {'svp': False, 'views': 4}, 'stereo_depth': {'svp': False},
     })
-    (numbers, columns), = solve_sweep(plan, tasks(plan), InProcess(), 1)
+    (numbers, columns), = solve_sweep(plan, tasks(plan), 'numpy', InProcess(), 1)
     assert numbers == range(4)
     assert columns['scenario'] == [n for n in range(4) for _ in range(10)]
     assert columns['set'] == list(range(10)) * 4
@@ -257,6 +257,20 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     monkeypatch.undo()
     sweep(path, '-o', out, '--resume')
     assert 'holds this sweep already' in capsys.readouterr().err
+
+
+@pytest.mark.xdist_group('engines')
+def test_it_goes_on_with_the_engine_that_it_was_begun_with(
+    write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
+) -> None:
+    pytest.importorskip('numba')
+    path, out = write(LONG), tmp_path / 'out'
+    process = start(path, '-o', out, '--engine', 'numpy')
+    until(lambda: parts_in(out) >= 1)
+    process.kill()
+    process.communicate()
+    sweep(path, '-o', out, '--resume', '--engine', 'numba')
+    assert files_of(out) == files_of(undisturbed)
 
 
 def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import ParameterError
-    from fisheye_svp_ros.evaluation.sweep import column_types, fingerprint
+    from fisheye_svp_ros.evaluation.sweep import column_types, fingerprint, work
     from fisheye_svp_ros.reporting.columns import Parts
     from fisheye_svp_ros.share import sweep_path
 
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> None:
     if args.resume and _finished(args.output, mine):
         say(f'{args.output} holds this sweep already')
     else:
-        _claim(parts, mine, args.resume)
-        _solve(args, plan, parts)
+        engine = _claim(parts, mine, args.resume, work(plan))
+        _solve(args, plan, parts, engine)
         parts.join(args.output / 'sweep')
         _report(path, args.output, plan, mine)
     shutil.rmtree(parts.folder, ignore_errors=True)
@@ -68,23 +68,31 @@ def _finished(folder: Path, mine: str) -> bool:
     return summary.exists() and json.loads(summary.read_text()).get('fingerprint') == mine
 
 
-def _claim(parts: Parts, mine: str, resume: bool) -> None:
-    """Make the folder of the parts this sweep's own; refuse that of another sweep."""
+def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
+    """Make the folder of the parts this sweep's own; refuse that of another sweep.
+
+    Return the engine for all of the sweep: the one that it was begun with.
+    """
+    from fisheye_svp_ros import engines
     from fisheye_svp_ros.errors import OutputError
     from fisheye_svp_ros.files import write_text
 
     mark = parts.folder / _MARK
     if not mark.exists():
-        write_text(mark, mine)
-    elif not resume:
+        engine = engines.settle(points)
+        write_text(mark, f'{mine} {engine}')
+        return engine
+    if not resume:
         raise OutputError(f'{parts.folder}: an interrupted sweep is there; --resume goes on with '
                           'it, or remove that folder')
-    elif mark.read_text(encoding='utf-8') != mine:
+    theirs, _, engine = mark.read_text(encoding='utf-8').partition(' ')
+    if theirs != mine:
         raise OutputError(f'{parts.folder}: another sweep was interrupted there; choose another '
                           '-o, or remove that folder')
+    return engine
 
 
-def _solve(args: argparse.Namespace, plan: Plan, parts: Parts) -> None:
+def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> None:
     from fisheye_svp_ros.commands.executors import dask, local
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.evaluation.sweep import solve_sweep, tasks
@@ -99,7 +107,7 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts) -> None:
         dask(args.dask) if args.dask else local(args.workers) as workers,
         progress('sweeping', left) as advance,
     ):
-        for numbers, columns in solve_sweep(plan, remaining, *workers):
+        for numbers, columns in solve_sweep(plan, remaining, engine, *workers):
             parts.write(numbers.start, columns)
             advance(len(numbers))
 

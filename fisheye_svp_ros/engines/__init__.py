@@ -1,13 +1,15 @@
 """The engines that the projection and its solvers run on, and which of them does.
 
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
-compile: the reference works until it has worked about as long as that takes.  FISHEYE_SVP_ENGINE
-or `use` settle it; nothing outside this package asks which one runs.
+compile, which only long work pays back: what begins such work says so (`settle`).  Anything else
+runs on NumPy, and gives the same to the last digit whatever was compiled before.
+FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
 
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from importlib.util import find_spec
 from types import ModuleType
 
@@ -20,30 +22,8 @@ from fisheye_svp_ros.lens import Lens
 
 ENGINES = ('auto', 'numpy', 'numba')
 VARIABLE = 'FISHEYE_SVP_ENGINE'
-_LOADING = 4_000_000  # points that the reference projects while Numba loads what it has compiled
+LOADING = 4_000_000  # points that the reference projects while Numba loads what it has compiled
 _COMPILING = 400_000_000  # while it compiles
-
-
-class _Choice:
-    """The engine in use, and how many points may still go to the reference before Numba comes."""
-
-    def __init__(self, name: str) -> None:
-        if name not in ENGINES:
-            raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
-        self._engine: ModuleType = numpy_engine
-        self._patience: float = float('inf')
-        if name == 'numba':
-            self._engine = _numba()
-        elif name == 'auto' and find_spec('numba') is not None:
-            self._patience = _LOADING if cache.filled() else _COMPILING
-
-    def engine(self, points: int) -> ModuleType:
-        """Return the engine for a call about so many points."""
-        self._patience -= points
-        if self._patience < 0:
-            self._patience = float('inf')
-            self._engine = _numba()
-        return self._engine
 
 
 def use(name: str) -> None:
@@ -51,9 +31,21 @@ def use(name: str) -> None:
 
     Raises ParameterError for another name, or for one that is not installed.
     """
-    global _choice
-    _choice = _Choice(name)
+    global _engine
+    _engine = _named(name)
     os.environ[VARIABLE] = name
+
+
+def settle(points: float) -> str:
+    """Take Numba for work about so many points if that pays; return the engine in use.
+
+    Does nothing where the engine is settled already, or where Numba cannot be had.
+    """
+    if os.environ.get(VARIABLE, 'auto') == 'auto' and find_spec('numba') is not None:
+        with suppress(ParameterError):
+            if points >= (LOADING if cache.filled() else _COMPILING):
+                use('numba')
+    return 'numpy' if _engine is numpy_engine else 'numba'
 
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
@@ -63,13 +55,13 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
-    uv, valid = _choice.engine(len(points)).project(lens, points, limited)
+    uv, valid = _engine.project(lens, points, limited)
     return uv, valid
 
 
 def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
     """Return what `project` does, and the derivatives (M, 2, 3) by the point, px/m."""
-    uv, valid, d_point = _choice.engine(len(points)).linearise(lens, points, limited)
+    uv, valid, d_point = _engine.linearise(lens, points, limited)
     return uv, valid, d_point
 
 
@@ -81,9 +73,7 @@ def linearise_views(
     rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
     by the small changes of `pose.Pose.retract`, px/m and px/rad.
     """
-    uv, valid, d_pose = _choice.engine(points.size // 3).linearise_views(
-        lens, rotation, position, points, limited
-    )
+    uv, valid, d_pose = _engine.linearise_views(lens, rotation, position, points, limited)
     return uv, valid, d_pose
 
 
@@ -105,7 +95,7 @@ def localize(
 
     row (S, N): below 0 for padding; minimum: usable points that a view must have.
     """
-    poses: Poses | None = _choice.engine(seen[2].size).localize(lens, seen, row, minimum, start)
+    poses: Poses | None = _engine.localize(lens, seen, row, minimum, start)
     return poses
 
 
@@ -117,20 +107,23 @@ def adjust_rigs(
     lenses, seen: of the left and right cameras, S * V views; state: rotation (S, V, 3, 3) and
     position (S, V, 3) of the right camera, (S, 3, 3) and (S, 3) of the left one in the right one.
     """
-    rigs: Rigs | None = _choice.engine(seen[0][2].size).adjust_rigs(lenses, seen, state)
+    rigs: Rigs | None = _engine.adjust_rigs(lenses, seen, state)
     return rigs
 
 
-def _numba() -> ModuleType:
+def _named(name: str) -> ModuleType:
+    if name not in ENGINES:
+        raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
+    if name != 'numba':
+        return numpy_engine
     try:
         from fisheye_svp_ros.engines import numba_engine
-    except ModuleNotFoundError as cause:
+    except ImportError as cause:  # also where Numba does not go with this NumPy
         raise ParameterError(
-            f'the engine numba needs the Python package {cause.name}: '
-            'pip install fisheye_svp_ros[fast]'
+            f'the engine numba cannot be loaded: {cause}; pip install -U fisheye_svp_ros[fast]'
         ) from cause
     cache.mark_filled()
     return numba_engine
 
 
-_choice = _Choice(os.environ.get(VARIABLE, 'auto'))
+_engine = _named(os.environ.get(VARIABLE, 'auto'))

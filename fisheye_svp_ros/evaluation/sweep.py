@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros import __version__
+from fisheye_svp_ros import __version__, engines
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.evaluation.recording import Columns
 from fisheye_svp_ros.evaluation.sweep_solvers import SOLVERS, Outcome
@@ -34,6 +34,7 @@ TABLES: Mapping[str, type[Any]] = {
     CAMERA: SyntheticCameraSettings, **{name: s.settings for name, s in SOLVERS.items()}
 }
 PLACE = ('scenario', 'scenarios', 'set', 'sets')
+_EVALUATIONS = 10  # of all points, to solve a set
 _TOGETHER = 512  # sets a task: enough to solve them fast together, few enough to lose
 
 
@@ -94,6 +95,13 @@ def tasks(plan: Plan) -> list[range]:
     return [range(start, min(start + step, count)) for start in range(0, count, step)]
 
 
+def work(plan: Plan) -> int:
+    """Return about how many points a sweep will project, for `engines.settle`."""
+    scenario = _scenario(plan, 0)
+    sets, cameras = len(scenario_poses(scenario).position), len(plan.solvers)
+    return len(plan.sweep) * sets * cameras * len(scenario_landmarks(scenario).ids) * _EVALUATIONS
+
+
 def sweep_rows(plan: Plan, numbers: range) -> Columns:
     """Return the rows of some scenarios, one a set, in their order; None where nothing is known.
 
@@ -110,9 +118,12 @@ def sweep_rows(plan: Plan, numbers: range) -> Columns:
 
 
 def solve_sweep(
-    plan: Plan, remaining: Iterable[range], executor: Executor, ahead: int
+    plan: Plan, remaining: Iterable[range], engine: str, executor: Executor, ahead: int
 ) -> Iterator[tuple[range, Columns]]:
-    """Yield tasks and their rows as they are done; no more than `ahead` are under way at once."""
+    """Yield tasks and their rows as they are done; no more than `ahead` are under way at once.
+
+    engine: the one that all rows come from, whoever works on them.
+    """
     under_way: dict[Future[Columns], range] = {}
 
     def finished() -> Iterator[tuple[range, Columns]]:
@@ -120,11 +131,16 @@ def solve_sweep(
             yield under_way.pop(future), future.result()
 
     for numbers in remaining:
-        under_way[executor.submit(sweep_rows, plan, numbers)] = numbers
+        under_way[executor.submit(_rows_of, engine, plan, numbers)] = numbers
         if len(under_way) >= ahead:
             yield from finished()
     while under_way:
         yield from finished()
+
+
+def _rows_of(engine: str, plan: Plan, numbers: range) -> Columns:
+    engines.use(engine)
+    return sweep_rows(plan, numbers)
 
 
 class InProcess(Executor):

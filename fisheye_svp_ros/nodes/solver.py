@@ -13,7 +13,7 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
-from fisheye_svp_ros import messages
+from fisheye_svp_ros import engines, messages
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
@@ -42,6 +42,7 @@ class SolverNode(BaseNode):
 
     def __init__(self) -> None:
         super().__init__()
+        engines.settle(engines.LOADING)  # a node runs for long, but its start must not
         self._metrics = {
             name: self.announce(Float64, f'~/metrics/{name}') for name in self.METRICS
         }
