@@ -236,14 +236,15 @@ def shift_at(
 
 def invert_height(curve: ImageHeight, height: Array) -> Array:
     """Return theta of heights h/f by Newton's method from a table of the monotone range."""
-    grid = np.linspace(0.0, curve.limit, 1025)
+    limit = curve.limit  # not always a constant
+    grid = np.linspace(0.0, limit, 1025)
     heights, _ = curve.value_and_slope(grid)
     theta = np.interp(height, heights, grid)
     for _ in range(4):
         value, slope = curve.value_and_slope(theta)
         # The slope vanishes at the limit, where the table is already the answer.
         step = np.where(slope > 1e-9, (height - value) / np.maximum(slope, 1e-9), 0.0)
-        theta = np.clip(theta + step, 0.0, curve.limit)
+        theta = np.clip(theta + step, 0.0, limit)
     return theta
 
 

@@ -72,8 +72,9 @@ def halved(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Sine and cosine of theta / 2; the larger comes first, as rounding wants it."""
     larger = np.sqrt(0.5 + 0.5 * np.abs(cos))
     smaller = 0.5 * sin / larger
-    ahead = cos >= 0.0
-    return np.where(ahead, smaller, larger), np.where(ahead, larger, smaller)
+    ahead = 1.0 * (cos >= 0.0)  # a factor: numpy.where makes arrays of single numbers
+    behind = 1.0 - ahead
+    return ahead * smaller + behind * larger, ahead * larger + behind * smaller
 
 
 def approach(

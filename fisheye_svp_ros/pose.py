@@ -63,14 +63,11 @@ def identity(*shape: int) -> Pose:
 
 def rotation_from_vector(vector: Array) -> Array:
     """Exponential map: rotation vectors (..., 3), rad, to matrices (..., 3, 3)."""
-    angle2 = np.sum(vector * vector, axis=-1)[..., None, None]
-    angle = np.sqrt(angle2)
-    small = angle2 < 1e-12
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1 - angle2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - angle2 / 24, (1 - np.cos(safe)) / (safe * safe))
+    half = 0.5 * np.sqrt(np.sum(vector * vector, axis=-1))[..., None, None]
+    half = np.maximum(half, 1e-100)  # sin(x) / x is 1 there
+    ratio = np.sin(half) / half
     k = cross_matrix(vector)
-    rotation: Array = np.eye(3) + a * k + b * (k @ k)
+    rotation: Array = np.eye(3) + ratio * (np.cos(half) * k + (0.5 * ratio) * (k @ k))
     return rotation
 
 
@@ -86,10 +83,10 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 def cross_matrix(vector: Array) -> Array:
     """Return [v]x (..., 3, 3) of vectors (..., 3)."""
-    x, y, z = np.moveaxis(vector, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [np.stack(row, axis=-1) for row in ([zero, -z, y], [z, zero, -x], [-y, x, zero])]
-    return np.stack(rows, axis=-2)
+    cross = np.zeros((*vector.shape, 3))
+    cross[..., (2, 0, 1), (1, 2, 0)] = vector
+    cross[..., (1, 2, 0), (2, 0, 1)] = -vector
+    return cross
 
 
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:

@@ -145,4 +145,4 @@ def test_the_report_is_markdown_with_versions_goals_and_reasons():
     text = report.document('python -m benchmark.speed', 0.3, [row])
     assert '| fisheye-svp, numpy | 1 | 1 to 1 | 2.0e-12 |' in text
     assert '- peer did not take part: not installed.' in text
-    assert '| work: fisheye-svp, numpy against peer | 2 × | not measured | - |' in text
+    assert '| work | numpy | peer | 2 × | not measured | - |' in text

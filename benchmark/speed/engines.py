@@ -21,12 +21,16 @@ def name_of(engine: str) -> str:
     return f'{OURS}, {engine}'
 
 
-def sides(run: Callable[[], Any], **keywords: Any) -> dict[str, Callable[[], Side]]:
-    """Return makers of one side an engine."""
-    return {name_of(engine): partial(_side, engine, run, keywords) for engine in engines()}
+def sides(
+    run: Callable[[], Any], way: str = '', **keywords: Any
+) -> dict[str, Callable[[], Side]]:
+    """Return makers of one side an engine; way: what sets the sides apart from other ones."""
+    return {
+        name_of(engine) + way: partial(_side, engine, way, run, keywords) for engine in engines()
+    }
 
 
-def _side(engine: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side:
+def _side(engine: str, way: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side:
     def with_engine() -> Any:
         use(engine)
         try:
@@ -34,4 +38,4 @@ def _side(engine: str, run: Callable[[], Any], keywords: dict[str, Any]) -> Side
         finally:
             use('numpy')  # what the sides are compared with comes from the reference
 
-    return Side(name_of(engine), with_engine, **keywords)
+    return Side(name_of(engine) + way, with_engine, **keywords)

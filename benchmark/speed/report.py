@@ -14,7 +14,8 @@ from benchmark.speed.harness import OURS, NotHereError, Row
 _PACKAGES = ('numpy', 'scipy', 'numba', 'opencv-python-headless', 'poselib', 'pycolmap', 'gtsam',
              'cyclonedds')
 # Columns of words; all others hold numbers.
-_WORDS = ('what', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met')
+_WORDS = ('what', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met',
+          'engine', 'against')
 _HEAD = """# Benchmarks
 
 Written by `make bench`, which runs `{command}` in an environment of its own
@@ -93,10 +94,10 @@ def goals(rows: Sequence[Row]) -> Table:
             reached = row.ratio(goal.ours, goal.peer)
             met = '-' if reached is None else 'yes' if reached >= goal.ratio else 'no'
             lines.append((
-                f'{row.title}: {goal.ours} against {goal.peer}', f'{goal.ratio:.3g} ×',
+                row.title, goal.ours.removeprefix(OURS + ', '), goal.peer, f'{goal.ratio:.3g} ×',
                 'not measured' if reached is None else f'{number(reached)} ×', met,
             ))
-    return Table('Goals', ('what', 'goal', 'reached', 'met'), lines)
+    return Table('Goals', ('work', 'engine', 'against', 'goal', 'reached', 'met'), lines)
 
 
 def of_row(row: Row) -> Table:

@@ -36,7 +36,7 @@ def rows(views: int = 10, repeats: int = 15) -> list[Row]:
 def _kannala_brandt(views: int, repeats: int) -> Row:
     scene = stereo(svp_lens(), views)
     off = _off(scene)
-    makers = engines.sides(_ours(scene), error=off, note='finds its own start')
+    makers = _ours(scene, off)
     makers |= {
         name: partial(_peer, name, *peer, scene, off) for name, peer in _PEERS.items()
     }
@@ -57,7 +57,7 @@ def _stereographic(views: int, repeats: int) -> Row:
                 'in a process of its own that reports its own time',
             )
 
-        makers = engines.sides(_ours(scene), error=off, note='finds its own start')
+        makers = _ours(scene, off)
         goals = [Goal(engines.name_of('numba'), 'mrcal', 3.0)]
         return _row(
             scene, 'SVP stereographic', makers | {'mrcal': mrcal}, repeats, goals
@@ -72,9 +72,18 @@ def _peer(
     return Side(name, lambda: solve(scene), error=off, note=note)
 
 
-def _ours(scene: StereoScene) -> Callable[[], Pose]:
+def _ours(scene: StereoScene, off: Callable[[Pose], float]) -> dict[str, Callable[[], Side]]:
+    """Return sides that begin where the peers begin, and sides that find their own start."""
     model = ForwardModel(scene.lens)
-    return lambda: calibrate_stereo(model, model, scene.left, scene.right).rig.take(0)
+    given = scene.pose.take(None), scene.rig.take(None)
+
+    def run(start: tuple[Pose, Pose] | None) -> Pose:
+        return calibrate_stereo(model, model, scene.left, scene.right, start=start).rig.take(0)
+
+    return {
+        **engines.sides(partial(run, given), error=off),
+        **engines.sides(partial(run, None), ', own start', error=off),
+    }
 
 
 def _off(scene: StereoScene) -> Callable[[Pose], float]:

@@ -110,7 +110,7 @@ def _step(normal, cameras, damping, work, block_step, shared_step):
     lower, scale, reduced, eliminated = work
     columns = 7 if cameras == 2 else 1
     if cameras == 2:
-        reduced[:] = shared
+        _copy(shared, reduced)
         for k in range(6):
             reduced[k, k] *= 1.0 + damping
             shared_step[k] = -shared_gradient[k]
@@ -165,13 +165,28 @@ def _retract(pose, rig, block_step, shared_step, new_pose, new_rig):
 
 
 @njit(**OPTIONS)
-def _copy_state(source, target):
-    target[0][:], target[1][:] = source
+def _copy(source, target):
+    # Assigning whole arrays takes Numba longer to compile than all the rest.
+    source, target = source.reshape(-1), target.reshape(-1)
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@njit(**OPTIONS)
+def _accept(new_pose, new_rig, pose, rig):
+    _copy(new_pose[0], pose[0])
+    _copy(new_pose[1], pose[1])
+    _copy(new_rig[0], rig[0])
+    _copy(new_rig[1], rig[1])
 
 
 @njit(**OPTIONS)
 def _copy_normal(source, target):
-    target[0][:], target[1][:], target[2][:], target[3][:], target[4][:] = source
+    _copy(source[0], target[0])
+    _copy(source[1], target[1])
+    _copy(source[2], target[2])
+    _copy(source[3], target[3])
+    _copy(source[4], target[4])
 
 
 @njit(**OPTIONS)
@@ -202,8 +217,7 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
             return total, iteration, -1
         _retract(pose, rig, block_step, shared_step, new_pose, new_rig)
         if moved <= STEP_TOLERANCE**2 + ROUNDING * total and damping < 1.0:
-            _copy_state(new_pose, pose)
-            _copy_state(new_rig, rig)
+            _accept(new_pose, new_rig, pose, rig)
             return max(total - moved, 0.0), iteration, 1
         cost = _equations(w, left, right, cameras, new_pose, new_rig, fresh)
         if np.isnan(cost):
@@ -213,8 +227,7 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
             damping = max(damping * min(max(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0), 1e-15)
             growth = 2.0
             total = cost
-            _copy_state(new_pose, pose)
-            _copy_state(new_rig, rig)
+            _accept(new_pose, new_rig, pose, rig)
             _copy_normal(fresh, normal)
         else:
             damping, growth = max(damping, 1e-9) * growth, 2.0 * growth

@@ -130,8 +130,9 @@ def linearise(points, lens, edge, uv, state, d_point, first):
         _write(w, n, uv[start:], state[start:])
         for row in range(2):
             for axis in range(3):
-                at = ROW + row * ROWS + axis * B
-                d_point[row, axis, first + start:first + start + n] = w[at:at + n]
+                at, to = ROW + row * ROWS + axis * B, first + start
+                for i in range(n):
+                    d_point[row, axis, to + i] = w[at + i]
 
 
 @_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))

@@ -20,30 +20,32 @@ _BLOCK = 8192  # points; larger ones make malloc ask the system for every array
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Do as `engines.incidence` says."""
-    parts = [_meet(lens, points[part], limited) for part in _blocks(len(points))]
+    parts = [_meet(lens, _rows(points[part]), limited) for part in _blocks(len(points))]
     return Incidence(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Do as `engines.project` says."""
-    uv, valid = np.empty((len(points), 2)), np.empty(len(points), dtype=bool)
+    uv, valid = np.empty((2, len(points))), np.empty(len(points), dtype=bool)
     for part in _blocks(len(points)):
-        rays = _meet(lens, points[part], limited)
+        rays = _meet(lens, _rows(points[part]), limited)
         height, _ = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
-        uv[part], valid[part] = _image(lens, rays, height).T, rays.valid
-    return uv, valid
+        valid[part] = rays.valid
+        _image(lens, rays, height, uv[:, part])
+    return uv.T, valid
 
 
 def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise` says."""
     count = len(points)
-    uv, valid, d_point = np.empty((count, 2)), np.empty(count, dtype=bool), np.empty((2, 3, count))
+    uv, valid, d_point = np.empty((2, count)), np.empty(count, dtype=bool), np.empty((2, 3, count))
     for part in _blocks(count):
-        rays = _meet(lens, points[part], limited)
+        rays = _meet(lens, _rows(points[part]), limited)
         height, parts = _derivatives(lens, rays)
-        uv[part], valid[part] = _image(lens, rays, height).T, rays.valid
+        valid[part] = rays.valid
+        _image(lens, rays, height, uv[:, part])
         _by_place(rays, parts, (lens.fx, lens.fy), d_point[..., part])
-    return uv, valid, np.moveaxis(d_point, -1, 0)
+    return uv.T, valid, np.moveaxis(d_point, -1, 0)
 
 
 def linearise_views(
@@ -51,18 +53,21 @@ def linearise_views(
 ) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise_views` says."""
     shape = points.shape[:2]
-    uv, valid = np.empty((*shape, 2)), np.empty(shape, dtype=bool)
-    d_pose = np.empty((shape[0], 2, 2, 3, shape[1]))
+    uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
+    d_pose = np.empty((2, shape[0], 6, shape[1]))
     for part in _tiles(*shape):
-        rays, z = _seen(lens, rotation, position, points, part, limited)
+        arm, local = _seen(rotation, position, points, part)
+        rays = _meet(lens, local, limited)
         height, parts = _derivatives(lens, rays)
-        uv[part], valid[part] = np.moveaxis(_image(lens, rays, height), 0, -1), rays.valid
-        own = np.empty((2, 2, 3, *z.shape))
-        _by_place(rays, parts, (-lens.fx, -lens.fy), own[:, 0])
-        _by_turn(rays, parts, z, (lens.fx, lens.fy), own[:, 1])
-        own = np.moveaxis(own, 3, 0)
-        np.matmul(rotation[part[0], None, None], own, out=d_pose[part[0], ..., part[1]])
-    return uv, valid, np.moveaxis(d_pose.reshape(shape[0], 2, 6, shape[1]), -1, 1)
+        valid[part] = rays.valid
+        _image(lens, rays, height, uv[:, *part])
+        by_place = np.empty((2, 3, *rays.theta.shape))
+        _by_place(rays, parts, (-lens.fx, -lens.fy), by_place)  # the camera moves, not the point
+        in_world = rotation[part[0]] @ np.swapaxes(by_place, 1, 2)
+        for own, out in zip(in_world, d_pose[:, part[0], :, part[1]], strict=True):
+            out[:, :3] = own
+            _cross(arm, np.swapaxes(own, 0, 1), np.swapaxes(out[:, 3:], 0, 1))
+    return np.moveaxis(uv, 0, -1), valid, d_pose.transpose(1, 3, 0, 2)
 
 
 def pose_equations(
@@ -73,17 +78,21 @@ def pose_equations(
     systems, count = weight.shape
     gram = np.zeros((systems, 7, 7))
     for part in _tiles(systems, count):
+        _, local = _seen(rotation, position, points, part)
         unused = weight[part] == 0
-        rays, z = _seen(lens, rotation, position, points, part, False, unused)
+        if unused.any():
+            local[:, unused] = np.array([[0.0], [0.0], [1.0]])
+        rays = _meet(lens, local, False)
         height, parts = _derivatives(lens, rays)
-        scale = lens.fx * weight[part], lens.fy * weight[part]
-        rows = np.empty((len(z), 7, 2, z.shape[1]))
+        rows = np.empty((len(unused), 7, 2, unused.shape[1]))
         out = np.moveaxis(rows, (1, 2), (1, 0))
-        _by_place(rays, parts, scale, out[:, :3])
-        _by_turn(rays, parts, z, scale, out[:, 3:6])
-        off = _image(lens, rays, height) - np.moveaxis(uv[part], -1, 0)
-        np.multiply(off, weight[part], out=out[:, 6])
-        flat = rows.reshape(len(z), 7, -1)
+        _by_place(rays, parts, (lens.fx * weight[part], lens.fy * weight[part]), out[:, :3])
+        for own in out:
+            _cross(own[:3], local, own[3:6])
+        _image(lens, rays, height, out[:, 6])
+        out[:, 6] -= np.moveaxis(uv[part], -1, 0)
+        out[:, 6] *= weight[part]
+        flat = rows.reshape(len(rows), 7, -1)
         gram[part[0]] += flat @ np.swapaxes(flat, -1, -2)
     return _in_world(gram, rotation)
 
@@ -109,21 +118,30 @@ def _tiles(systems: int, count: int) -> Iterator[tuple[slice, slice]]:
             yield slice(first, first + many), part
 
 
-def _meet(lens: Lens, points: Array, limited: bool) -> Incidence:
-    x, y, z = (points[..., i] for i in range(3))
+def _rows(points: Array) -> Array:
+    """Return points (M, 3) as rows (3, M), in which NumPy is faster."""
+    return np.ascontiguousarray(points.T)
+
+
+def _meet(lens: Lens, local: Array, limited: bool) -> Incidence:
+    """Return where points (3, ...) in the camera frame meet the lens."""
+    x, y, z = local
     with np.errstate(divide='ignore', invalid='ignore'):
-        return meet(lens, x + NOWHERE, np.ascontiguousarray(y), np.ascontiguousarray(z), limited)
+        return meet(lens, x + NOWHERE, y, z, limited)
 
 
 def _seen(
-    lens: Lens, rotation: Array, position: Array, points: Array, part: tuple[slice, slice],
-    limited: bool, unused: Mask | None = None,
-) -> tuple[Incidence, Array]:
-    """Return where a tile's points meet the lens, and their z in the camera frame."""
-    local = (points[part] - position[part[0], None]) @ rotation[part[0]]
-    if unused is not None and unused.any():
-        local[unused] = 0.0, 0.0, 1.0
-    return _meet(lens, local, limited), np.ascontiguousarray(local[..., 2])
+    rotation: Array, position: Array, points: Array, part: tuple[slice, slice]
+) -> tuple[Array, Array]:
+    """Return a tile's points from their cameras, along the axes of the world and of the camera.
+
+    Both (3, S, N).
+    """
+    arm = np.subtract(np.moveaxis(points[part], -1, 0), position[part[0]].T[..., None], order='C')
+    local = np.empty_like(arm)
+    turned = np.swapaxes(rotation[part[0]], -1, -2)
+    np.matmul(turned, np.swapaxes(arm, 0, 1), out=np.swapaxes(local, 0, 1))
+    return arm, local
 
 
 def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, tuple[Array, Array, Array]]:
@@ -136,18 +154,16 @@ def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, tuple[Array, Array
     return height, parts
 
 
-def _image(lens: Lens, rays: Incidence, height: Array) -> Array:
-    """Return image points (2, ...), px, NaN where there is none."""
-    uv = np.empty((2, *height.shape))
-    for out, focal, unit, centre in (
-        (uv[0], lens.fx, rays.ex, lens.cx), (uv[1], lens.fy, rays.ey, lens.cy)
-    ):
-        np.multiply(height, unit, out=out)
-        out *= focal
-        out += centre
+def _image(lens: Lens, rays: Incidence, height: Array, out: Array) -> None:
+    """Write image points (2, ...), px, NaN where there is none."""
+    for i, (focal, unit, centre) in enumerate((
+        (lens.fx, rays.ex, lens.cx), (lens.fy, rays.ey, lens.cy)
+    )):
+        np.multiply(height, unit, out=out[i])
+        out[i] *= focal
+        out[i] += centre
     if not rays.valid.all():
-        uv[:, ~rays.valid] = np.nan
-    return uv
+        out[:, ~rays.valid] = np.nan
 
 
 def _by_place(
@@ -165,22 +181,13 @@ def _by_place(
         np.multiply(axial, e, out=out[i, 2])
 
 
-def _by_turn(
-    rays: Incidence, parts: tuple[Array, Array, Array], z: Array, scale: tuple[Scale, Scale],
-    out: Array,
-) -> None:
-    """Write the derivatives (2, 3, ...) of `scale` h/f by turns of the camera about its axes."""
-    across, along, axial = parts
-    ex, ey = rays.ex, rays.ey
-    level, tilted = across * z, along * z - axial * rays.radius
-    height = across * rays.radius
-    for i, (e, sideways) in enumerate(((ex, ey), (ey, -ex))):
-        swung = tilted * (e * scale[i])
-        np.multiply(swung, ey, out=out[i, 0])
-        np.multiply(swung, -ex, out=out[i, 1])
-        np.multiply(height, sideways * scale[i], out=out[i, 2])
-    out[0, 1] -= level * scale[0]
-    out[1, 0] += level * scale[1]
+def _cross(a: Array, b: Array, out: Array) -> None:
+    """Write cross products of vectors (3, ...).
+
+    Of an arm with derivatives by place they are those by turn.
+    """
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.subtract(a[j] * b[k], a[k] * b[j], out=out[i])
 
 
 def _in_world(gram: Array, rotation: Array) -> tuple[Array, Array, Array]:

@@ -70,7 +70,7 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     right = scaled.shared_gradient - np.einsum(
         'svbk,svb->sk', eliminated[..., :-1], scaled.block_gradient
     )
-    shared_step = -(np.linalg.pinv(reduced, _SINGULAR, hermitian=True) @ right[..., None])[..., 0]
+    shared_step = -(_inverse(reduced) @ right[..., None])[..., 0]
     block_step = -eliminated[..., -1] - (
         eliminated[..., :-1] @ shared_step[:, None, :, None]
     )[..., 0]
@@ -95,10 +95,9 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     equations = ArrowEquations(*normal)
     scaled, block_scale, shared_scale = _scaled(equations, np.zeros(len(equations.shared)))
     eliminated, reduced = _eliminate(scaled)
-    shared = np.linalg.pinv(reduced, _SINGULAR, hermitian=True)
+    shared = _inverse(reduced)
     leverage = eliminated[..., :-1]
-    blocks = np.linalg.pinv(scaled.blocks, _SINGULAR, hermitian=True)
-    blocks = blocks + leverage @ shared[:, None] @ np.swapaxes(leverage, -1, -2)
+    blocks = _inverse(scaled.blocks) + leverage @ shared[:, None] @ np.swapaxes(leverage, -1, -2)
     return ArrowCovariance(
         blocks / (block_scale[..., :, None] * block_scale[..., None, :]),
         shared / (shared_scale[:, :, None] * shared_scale[:, None, :]),
@@ -135,6 +134,16 @@ def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
     known = np.einsum('svbk,svbl->skl', scaled.cross, eliminated[..., :-1])
     reduced = scaled.shared - known
     return eliminated, (reduced + np.swapaxes(reduced, -1, -2)) / 2
+
+
+def _inverse(matrix: Array) -> Array:
+    """Return the inverse of symmetric matrices (..., K, K) without their singular directions."""
+    values, vectors = np.linalg.eigh(matrix)
+    kept = values > _SINGULAR * values[..., -1:]
+    with np.errstate(divide='ignore'):
+        scale = np.where(kept, 1 / values, 0.0)
+    inverse: Array = (vectors * scale[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse
 
 
 def _moved(equations: ArrowEquations, block_step: Array, shared_step: Array) -> Array:

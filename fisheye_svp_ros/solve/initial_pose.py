@@ -1,86 +1,136 @@
-"""Poses from rays and landmarks without a start value, for rays in any direction."""
+"""Poses from rays and landmarks without a start value, for rays in any direction.
+
+Landmarks' squared distances from their rays are, once the translation is eliminated, a quadratic
+form in the nine numbers of R (Lu, Hager, Mjolsness, PAMI 2000): the points are summed up once, and
+any number of turns is then polished without them.
+"""
 
 from __future__ import annotations
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_vector
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.pose import Pose, cross_matrix, nearest_rotation, rotation_from_vector
 
-_TURNS = 4  # alternations that polish each candidate
+_STEPS, _MORE_STEPS = 4, 10  # Gauss-Newton, of an algebraic turn and of any turn
+_LONGEST = 0.7  # rad, a step
 _DOUBTFUL = 1e-3  # mean squared sine (about 2 degrees) above which evenly spread starts are tried
+_FLOOR = 1e-12  # relative; keeps rays that are all parallel invertible
+
+
+class _Misfit(NamedTuple):
+    """Squared distances of S sets of landmarks from their rays: r^T form r, r = columns of R.
+
+    form (S, 9, 9); pull (S, 3, 9): the best translation is pull r.
+    """
+
+    form: Array
+    pull: Array
 
 
 def initial_poses(points: Array, direction: Array, weight: Array) -> Pose:
     """Return poses (S,) of the camera in the world from landmarks and viewing directions.
 
     points (S, N, 3), m; direction (S, N, 3), unit, camera frame; weight (S, N), 0 = ignore.
-    Minimises the landmarks' distances from their rays, linear in [R | t] (Lu, Hager, Mjolsness,
-    PAMI 2000); candidates for R come from the smallest eigenvectors and, where those fail, from
+    Candidates for R come from the smallest eigenvectors of the misfit and, where those fail, from
     evenly spread turns.
     """
     seen = (weight > 0) & np.isfinite(direction).all(axis=-1)
-    w = seen.astype(float)
+    count = np.maximum(seen.sum(1), 1)
     d = np.where(seen[..., None], direction, 0.0)
-    centre = (w[..., None] * points).sum(1) / np.maximum(w.sum(1), 1)[:, None]
+    centre = np.where(seen[..., None], points, 0.0).sum(1) / count[:, None]
     local = np.where(seen[..., None], points - centre[:, None], 0.0)
-    scale = np.sqrt((local**2).sum((1, 2)) / np.maximum(w.sum(1), 1))
-    local /= np.maximum(scale, 1e-12)[:, None, None]
-    across = (np.eye(3) - d[..., :, None] * d[..., None, :]) * w[..., None, None]
-    rotation, translation, error = _best(_algebraic_rotations(local, across), local, d, across, w)
-    doubtful = np.flatnonzero(error > _DOUBTFUL)
-    if doubtful.size:
-        rows = doubtful
+    # In their own principal axes: a flat target then lacks the third one exactly.
+    axes = nearest_rotation(
+        np.swapaxes(np.linalg.eigh(np.swapaxes(local, -1, -2) @ local)[1], -1, -2)[:, ::-1]
+    )
+    scale = np.maximum(np.sqrt((local**2).sum((1, 2)) / count), 1e-12)
+    local = local @ np.swapaxes(axes, -1, -2) / scale[:, None, None]
+    misfit = _misfit(local, d, seen)
+    rotation, translation, error = _best(
+        _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
+    rows = np.flatnonzero(error > _DOUBTFUL)
+    if rows.size:
         spread = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
-        other = _best(spread, local[rows], d[rows], across[rows], w[rows])
+        own = _Misfit(misfit.form[rows], misfit.pull[rows])
+        other = _best(spread, own, local[rows], d[rows], _MORE_STEPS)
         better = other[2] < error[rows]
         rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
-    camera = Pose(rotation, translation * scale[:, None]).inverse()
+    camera = Pose(rotation @ axes, translation * scale[:, None]).inverse()
     return Pose(camera.rotation, camera.position + centre)
 
 
+def _misfit(local: Array, d: Array, seen: Mask) -> _Misfit:
+    """Sum the points up."""
+    systems, count = local.shape[:2]
+    across = (np.eye(3) - d[..., :, None] * d[..., None, :]) * seen[..., None, None]
+    flat = across.reshape(systems, count, 9)
+    # Sums over the points of X (x) across and of X X^T (x) across; across is a projection, its
+    # own square.
+    mixed = (np.swapaxes(local, -1, -2) @ flat).reshape(systems, 9, 3)
+    squares = (local[..., :, None] * local[..., None, :]).reshape(systems, count, 9)
+    form = (np.swapaxes(squares, -1, -2) @ flat).reshape(systems, 3, 3, 3, 3)
+    form = form.transpose(0, 1, 3, 2, 4).reshape(systems, 9, 9)
+    rays = across.sum(axis=1)
+    rays[:, range(3), range(3)] += _FLOOR * count
+    pull = -np.linalg.solve(rays, np.swapaxes(mixed, -1, -2))
+    return _Misfit(form + mixed @ pull, pull)
+
+
 def _best(
-    rotations: Array, local: Array, d: Array, across: Array, w: Array
+    candidates: Array, misfit: _Misfit, local: Array, d: Array, steps: int
 ) -> tuple[Array, Array, Array]:
-    """Polish candidates (S, C, 3, 3) and return the best turn, its translation and its misfit."""
-    rotation, translation = _polish(rotations, local, d, across, w)
-    error = _ray_error(rotation, translation, local, d, across, w)
+    """Polish candidates (S, C, 3, 3) and return the best turn, its translation and its error.
+
+    error (S,): mean squared sine between rays and landmarks; 1 for a landmark behind its ray.
+    """
+    rotation = _polish(candidates, misfit.form[:, None], steps)
+    translation = (misfit.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
+    placed = local[:, None] @ np.swapaxes(rotation, -1, -2) + translation[:, :, None]
+    along = (placed * d[:, None]).sum(-1)
+    cos2 = np.where(along > 0, along**2 / np.maximum((placed**2).sum(-1), 1e-18), 0.0)
+    seen = np.any(d, axis=-1).sum(-1)[:, None]
+    error = 1.0 - cos2.sum(-1) / np.maximum(seen, 1)
     best, rows = np.argmin(error, axis=1), np.arange(len(local))
     return rotation[rows, best], translation[rows, best], error[rows, best]
 
 
-def _algebraic_rotations(local: Array, across: Array) -> Array:
-    """Rotations (S, C, 3, 3) from the eigenvectors of the smallest misfit, one sign each way."""
-    # Landmarks in their own principal axes: a flat target then lacks the third one exactly.
-    spread = np.linalg.eigh(np.swapaxes(local, -1, -2) @ local)[1]
-    axes = nearest_rotation(np.swapaxes(spread, -1, -2)[:, ::-1])
-    own = local @ np.swapaxes(axes, -1, -2)
-    flat = (np.abs(own[..., 2]).max(axis=1) < 1e-6)[:, None, None]
-    # Misfit |across (R X + t)|^2 in the columns of R; across is a projection, its own square.
-    # Sums over the points of X (x) across and of X X^T (x) across, then t eliminated.
-    systems, count = own.shape[:2]
-    flat_across = across.reshape(systems, count, 9)
-    mixed = (np.swapaxes(own, -1, -2) @ flat_across).reshape(systems, 9, 3)
-    squares = (own[..., :, None] * own[..., None, :]).reshape(systems, count, 9)
-    omega = (np.swapaxes(squares, -1, -2) @ flat_across).reshape(systems, 3, 3, 3, 3)
-    omega = omega.transpose(0, 1, 3, 2, 4).reshape(systems, 9, 9)
-    omega -= mixed @ np.linalg.pinv(across.sum(axis=1)) @ np.swapaxes(mixed, -1, -2)
-    omega_flat = omega.copy()
-    omega_flat[:, 6:, :] = 0
-    omega_flat[:, :, 6:] = 0
-    omega_flat[:, range(6, 9), range(6, 9)] = 1e9
-    vectors = np.linalg.eigh(np.where(flat, omega_flat, omega))[1]
+def _polish(rotation: Array, form: Array, steps: int) -> Array:
+    """Reduce the misfit of turns (S, C, 3, 3) by Gauss-Newton steps."""
+    for _ in range(steps):
+        slope = -cross_matrix(np.swapaxes(rotation, -1, -2))
+        slope = slope.reshape(*slope.shape[:-3], 9, 3)
+        image = np.swapaxes(form @ slope, -1, -2)
+        hessian = image @ slope
+        damping = 1e-6 * np.trace(hessian, axis1=-2, axis2=-1) + 1e-300
+        hessian[..., range(3), range(3)] += damping[..., None]
+        step = -np.linalg.solve(hessian, image @ _columns(rotation)[..., None])[..., 0]
+        size = np.linalg.norm(step, axis=-1, keepdims=True)
+        rotation = rotation_from_vector(step * (_LONGEST / np.maximum(size, _LONGEST))) @ rotation
+    return rotation
+
+
+def _columns(rotation: Array) -> Array:
+    return np.swapaxes(rotation, -1, -2).reshape(*rotation.shape[:-2], 9)
+
+
+def _algebraic_rotations(local: Array, misfit: _Misfit) -> Array:
+    """Rotations (S, 2, 3, 3) from the eigenvector of the smallest misfit, one sign each way."""
+    flat = (np.abs(local[..., 2]).max(axis=1) < 1e-6)[:, None, None]
+    form = misfit.form.copy()
+    form[:, 6:, :] = 0
+    form[:, :, 6:] = 0
+    form[:, range(6, 9), range(6, 9)] = 1e9
+    vectors = np.linalg.eigh(np.where(flat, form, misfit.form))[1]
     columns = np.swapaxes(vectors[..., 0].reshape(-1, 3, 3), -1, -2)
     columns = columns / np.linalg.norm(columns[..., 0], axis=-1)[:, None, None]
-    candidates = []
-    for sign in (1.0, -1.0):
-        m = sign * columns
-        third = np.cross(m[..., 0], m[..., 1])
-        m = np.where(flat, np.stack([m[..., 0], m[..., 1], third], axis=-1), m)
-        candidates.append(nearest_rotation(m) @ axes)
-    return np.stack(candidates, axis=1)
+    m = np.stack([columns, -columns], axis=1)
+    third = np.cross(m[..., 0], m[..., 1])
+    return nearest_rotation(
+        np.where(flat[:, None], np.stack([m[..., 0], m[..., 1], third], axis=-1), m))
 
 
 @cache
@@ -94,39 +144,3 @@ def _cube_turns() -> Array:
             if not any(np.allclose(new, old) for old in group):
                 group.append(new)
     return np.stack(group)
-
-
-def _polish(
-    rotation: Array, local: Array, d: Array, across: Array, w: Array
-) -> tuple[Array, Array]:
-    """Alternate between the points on the rays and the best turn (orthogonal iteration)."""
-    inverse = np.linalg.pinv(across.sum(1))
-    count = np.maximum(w.sum(1), 1)[:, None, None]
-    for _ in range(_TURNS):
-        translation = _translation(rotation, local, across, inverse)
-        placed = local[:, None] @ np.swapaxes(rotation, -1, -2) + translation[:, :, None]
-        depth = np.maximum(np.einsum('scnk,snk->scn', placed, d), 0.0)
-        target = depth[..., None] * d[:, None]
-        target = target - (w[:, None, :, None] * target).sum(2, keepdims=True) / count[..., None]
-        rotation = nearest_rotation(np.einsum('scni,snj->scij', target, w[..., None] * local))
-    return rotation, _translation(rotation, local, across, inverse)
-
-
-def _translation(rotation: Array, local: Array, across: Array, inverse: Array) -> Array:
-    turned = local[:, None] @ np.swapaxes(rotation, -1, -2)
-    pull = np.einsum('snij,scnj->sci', across, turned)
-    translation: Array = -np.einsum('sij,scj->sci', inverse, pull)
-    return translation
-
-
-def _ray_error(
-    rotation: Array, translation: Array, local: Array, d: Array, across: Array, w: Array
-) -> Array:
-    """Mean squared sine between rays and landmarks, (S, C); 1 for a landmark behind its ray."""
-    placed = local[:, None] @ np.swapaxes(rotation, -1, -2) + translation[:, :, None]
-    distance2 = np.maximum((placed**2).sum(-1), 1e-18)
-    off = np.einsum('snij,scnj->scni', across, placed)
-    ahead = np.einsum('scnk,snk->scn', placed, d) > 0
-    sine2 = np.where(ahead, (off**2).sum(-1) / distance2, 1.0)
-    error: Array = (w[:, None] * sine2).sum(-1) / np.maximum(w.sum(1), 1)[:, None]
-    return error

@@ -16,7 +16,7 @@ from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_
 from fisheye_svp_ros.solve.least_squares import Arrays, Solved, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
 
-_MEAN_ROUNDS = 10
+_MEAN_ROUNDS = 6
 
 
 class StereoCalibration(NamedTuple):
@@ -45,16 +45,19 @@ def calibrate_stereo(
     left_views: Views,
     right_views: Views,
     systems: int = 1,
+    start: tuple[Pose, Pose] | None = None,
 ) -> StereoCalibration:
     """Return the maximum-likelihood rig; no start value is needed.
 
     left_views, right_views: S * V views, system by system, of the same frames in the same order
-    (`observations.stereo_views`); points may be missing in either camera.  Kita, section 4, after
-    OpenCV's stereoCalibrate: the rig is shared, each view has a pose of its own.
+    (`observations.stereo_views`); points may be missing in either camera.  start: poses (S, V) of
+    the right camera and rigs (S,) that are nearly right, where they are known, to save the search.
+    Kita, section 4, after OpenCV's stereoCalibrate: the rig is shared, each view has a pose of its
+    own.
     Raises GeometryError, naming the frame, where a view has too few points in both cameras, and
     where no view of a system can be posed in both.
     """
-    pose, rig = _starts(left, right, left_views, right_views, systems)
+    pose, rig = start or _starts(left, right, left_views, right_views, systems)
     solved = _solved((left, right), (left_views, right_views), (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
     covariance = arrow_covariance(solved.normal)
