@@ -143,3 +143,32 @@ rclpy.spin(node)
 """, 'listener')  # fmt: skip
     assert listener.wait_for('connected(.*)')[1] == ' end'
     assert talker.process.poll() is None
+
+
+def test_subscribers_are_counted_while_they_come_and_go(
+    run_node: Callable[..., NodeProcess]
+) -> None:
+    guests = run_node(_HEAD + """
+print('ready', flush=True)
+for _ in range(300):
+    both = [node.create_subscription(String, 'chatter', print, 10) for _ in range(2)]
+    for subscription in both:
+        node.destroy_subscription(subscription)
+print('gone', flush=True)
+rclpy.spin(node)
+""", 'guests')  # fmt: skip
+    counter = run_node(_HEAD + """
+publisher = node.create_publisher(String, 'chatter', 10)
+node.create_subscription(String, 'end', lambda _: print('counted', flush=True), latched)
+def count():
+    for _ in range(10_000):
+        assert publisher.get_subscription_count() >= 0
+node.create_timer(0.01, count)
+rclpy.spin(node)
+""", 'counter')  # fmt: skip
+    guests.wait_for('gone')
+    run_node(_HEAD + """
+node.create_publisher(String, 'end', latched).publish(String())
+rclpy.spin(node)
+""", 'end')  # fmt: skip
+    counter.wait_for('counted')

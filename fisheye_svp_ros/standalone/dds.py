@@ -6,6 +6,7 @@ this client find each other and exchange messages.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import struct
@@ -223,11 +224,18 @@ class Writer:
         data = messages.serialize(message)
         self._write(data[:4] + _HEADER.pack(header.client, header.sequence) + data[4:])
 
+    def matched(self) -> list[int]:
+        """Return the handles of the readers that are connected."""
+        while True:
+            # It counts the readers, then lists them: one that comes in between is too many for it.
+            with contextlib.suppress(IndexError):
+                return self.entity.get_matched_subscriptions()  # type: ignore[no-any-return]
+
     def wait_for_client(self, user_data: bytes, timeout: float) -> None:
         """Wait until the reader of a client is connected: what is sent earlier would be lost."""
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
-            for handle in self.entity.get_matched_subscriptions():
+            for handle in self.matched():
                 endpoint = self.entity.get_matched_subscription_data(handle)
                 if endpoint and _client_id(endpoint.qos) == user_data:
                     return

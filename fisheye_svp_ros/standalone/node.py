@@ -46,7 +46,7 @@ class Publisher:
 
     def get_subscription_count(self) -> int:
         """Return how many subscribers are connected."""
-        return len(self._alive().entity.get_matched_subscriptions())
+        return len(self._alive().matched())
 
     def destroy(self) -> None:
         """Leave the topic."""
