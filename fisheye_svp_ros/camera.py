@@ -58,7 +58,7 @@ class LinearImage:
     def d_height(self) -> Array:
         """Derivatives (..., 2) by the image height, px for unit h/f."""
         rays = self.incidence
-        return np.stack([self.lens.fx * rays.ex, self.lens.fy * rays.ey], axis=-1)
+        return np.stack([self.lens.fx * rays.unit[0], self.lens.fy * rays.unit[1]], axis=-1)
 
     @property
     def d_shift(self) -> Array:
@@ -82,7 +82,8 @@ def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     Source: Kita, section 2 and figure 2.
     """
     fields = engines.incidence(lens, points.reshape(-1, 3), limited)
-    return Incidence._make(field.reshape(points.shape[:-1]) for field in fields)
+    shape = points.shape[:-1]
+    return Incidence._make(field.reshape((*field.shape[:-1], *shape)) for field in fields)
 
 
 def project(lens: Lens, points: Array, limited: bool = True) -> Image:

@@ -13,15 +13,13 @@ from fisheye_svp_ros.engines.rays import Incidence, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
 
-Scale = Array | float
-
 _BLOCK = 8192  # points; larger ones make malloc ask the system for every array
 
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Do as `engines.incidence` says."""
     parts = [_meet(lens, _rows(points[part]), limited) for part in _blocks(len(points))]
-    return Incidence(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+    return Incidence(*(np.concatenate(field, axis=-1) for field in zip(*parts, strict=True)))
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
@@ -44,7 +42,7 @@ def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Ar
         height, parts = _derivatives(lens, rays)
         valid[part] = rays.valid
         _image(lens, rays, height, uv[:, part])
-        _by_place(rays, parts, (lens.fx, lens.fy), d_point[..., part])
+        _by_place(rays, parts, _pair(lens.fx, lens.fy, uv), d_point[..., part])
     return uv.T, valid, np.moveaxis(d_point, -1, 0)
 
 
@@ -61,12 +59,12 @@ def linearise_views(
         height, parts = _derivatives(lens, rays)
         valid[part] = rays.valid
         _image(lens, rays, height, uv[:, *part])
-        by_place = np.empty((2, 3, *rays.theta.shape))
-        _by_place(rays, parts, (-lens.fx, -lens.fy), by_place)  # the camera moves, not the point
-        in_world = rotation[part[0]] @ np.swapaxes(by_place, 1, 2)
-        for own, out in zip(in_world, d_pose[:, part[0], :, part[1]], strict=True):
-            out[:, :3] = own
-            _cross(arm, np.swapaxes(own, 0, 1), np.swapaxes(out[:, 3:], 0, 1))
+        own = np.empty((2, 3, *rays.theta.shape))
+        _by_place(rays, parts, _pair(-lens.fx, -lens.fy, uv), own)  # the camera moves
+        own = np.swapaxes(rotation[part[0]] @ np.swapaxes(own, 1, 2), 1, 2)
+        out = np.swapaxes(d_pose[:, part[0], :, part[1]], 1, 2)
+        out[:, :3] = own
+        _cross(arm, own, out[:, 3:])
     return np.moveaxis(uv, 0, -1), valid, d_pose.transpose(1, 3, 0, 2)
 
 
@@ -86,9 +84,8 @@ def pose_equations(
         height, parts = _derivatives(lens, rays)
         rows = np.empty((len(unused), 7, 2, unused.shape[1]))
         out = np.moveaxis(rows, (1, 2), (1, 0))
-        _by_place(rays, parts, (lens.fx * weight[part], lens.fy * weight[part]), out[:, :3])
-        for own in out:
-            _cross(own[:3], local, own[3:6])
+        _by_place(rays, parts, _pair(lens.fx, lens.fy, out[:, 0]) * weight[part], out[:, :3])
+        _cross(out[:, :3], local, out[:, 3:6])
         _image(lens, rays, height, out[:, 6])
         out[:, 6] -= np.moveaxis(uv[part], -1, 0)
         out[:, 6] *= weight[part]
@@ -119,15 +116,15 @@ def _tiles(systems: int, count: int) -> Iterator[tuple[slice, slice]]:
 
 
 def _rows(points: Array) -> Array:
-    """Return points (M, 3) as rows (3, M), in which NumPy is faster."""
-    return np.ascontiguousarray(points.T)
+    """Return a copy of points (M, 3) as rows (3, M), in which NumPy is faster."""
+    return np.array(points.T, order='C')
 
 
 def _meet(lens: Lens, local: Array, limited: bool) -> Incidence:
-    """Return where points (3, ...) in the camera frame meet the lens."""
-    x, y, z = local
+    """Return where points (3, ...) in the camera frame meet the lens; moves those on its axis."""
+    local[0] += NOWHERE
     with np.errstate(divide='ignore', invalid='ignore'):
-        return meet(lens, x + NOWHERE, y, z, limited)
+        return meet(lens, local, limited)
 
 
 def _seen(
@@ -156,38 +153,42 @@ def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, tuple[Array, Array
 
 def _image(lens: Lens, rays: Incidence, height: Array, out: Array) -> None:
     """Write image points (2, ...), px, NaN where there is none."""
-    for i, (focal, unit, centre) in enumerate((
-        (lens.fx, rays.ex, lens.cx), (lens.fy, rays.ey, lens.cy)
-    )):
-        np.multiply(height, unit, out=out[i])
-        out[i] *= focal
-        out[i] += centre
+    np.multiply(height, rays.unit, out=out)
+    out *= _pair(lens.fx, lens.fy, out)
+    out += _pair(lens.cx, lens.cy, out)
     if not rays.valid.all():
         out[:, ~rays.valid] = np.nan
 
 
 def _by_place(
-    rays: Incidence, parts: tuple[Array, Array, Array], scale: tuple[Scale, Scale], out: Array
+    rays: Incidence, parts: tuple[Array, Array, Array], scale: Array, out: Array
 ) -> None:
-    """Write the derivatives (2, 3, ...) of `scale` h/f by a point's place in the camera frame."""
+    """Write the derivatives (2, 3, ...) of `scale` h/f by a point's place in the camera frame.
+
+    scale (2, ...): of u and of v.
+    """
     across, along, axial = parts
-    unit = rays.ex, rays.ey
-    for i in range(2):
-        e = unit[i] * scale[i]
-        steep = along * e
-        np.multiply(steep, rays.ex, out=out[i, 0])
-        np.multiply(steep, rays.ey, out=out[i, 1])
-        out[i, i] += across * scale[i]
-        np.multiply(axial, e, out=out[i, 2])
+    height = rays.unit * scale
+    np.multiply((along * height)[:, None], rays.unit, out=out[:, :2])
+    out[0, 0] += across * scale[0]
+    out[1, 1] += across * scale[1]
+    np.multiply(axial, height, out=out[:, 2])
 
 
 def _cross(a: Array, b: Array, out: Array) -> None:
-    """Write cross products of vectors (3, ...).
+    """Write cross products (..., 3, S, N) of vectors.
 
     Of an arm with derivatives by place they are those by turn.
     """
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        np.subtract(a[j] * b[k], a[k] * b[j], out=out[i])
+    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -3, 0), np.moveaxis(b, -3, 0)
+    np.subtract(a1 * b2, a2 * b1, out=out[..., 0, :, :])
+    np.subtract(a2 * b0, a0 * b2, out=out[..., 1, :, :])
+    np.subtract(a0 * b1, a1 * b0, out=out[..., 2, :, :])
+
+
+def _pair(u: float, v: float, like: Array) -> Array:
+    """Return two numbers to be applied to rows (2, ...)."""
+    return np.array([u, v]).reshape(2, *(1,) * (like.ndim - 1))
 
 
 def _in_world(gram: Array, rotation: Array) -> tuple[Array, Array, Array]:

@@ -27,27 +27,27 @@ BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axi
 
 
 class Incidence(NamedTuple):
-    """Where points meet the lens; every field (...).
+    """Where points meet the lens; every field (...), but unit (2, ...).
 
-    theta: rad; sin, cos: of theta; ex, ey: unit vector of the image height; radius: distance from
-    the axis, m; clearance: derivative of the ray equation, m, positive where theta is unique.
+    theta: rad; sin, cos: of theta; unit: direction of the image height; radius: distance from the
+    axis, m; clearance: derivative of the ray equation, m, positive where theta is unique.
     """
 
     theta: Array
     sin: Array
     cos: Array
-    ex: Array
-    ey: Array
+    unit: Array
     radius: Array
     clearance: Array
     valid: Mask
 
 
-def meet(lens: Lens, x: Array, y: Array, z: Array, limited: bool) -> Incidence:
-    """Return where points (...) in the camera frame meet the lens; no x is exactly 0 where y is.
+def meet(lens: Lens, local: Array, limited: bool) -> Incidence:
+    """Return where points (3, ...) in the camera frame meet the lens, none exactly on its axis.
 
     limited: see `edge`.
     """
+    x, y, z = local
     r2 = x * x + y * y
     r, distance = np.sqrt(r2), np.sqrt(r2 + z * z)
     scale = 1.0 / distance
@@ -56,8 +56,7 @@ def meet(lens: Lens, x: Array, y: Array, z: Array, limited: bool) -> Incidence:
     if lens.viewpoint_shift is not None:
         theta, sin, cos, clearance = _past_shift(lens, r, z, distance, (theta, sin, cos))
     valid = (clearance > CLEAR) & (theta <= edge(lens, limited))
-    inverse_r = 1.0 / r
-    return Incidence(theta, sin, cos, x * inverse_r, y * inverse_r, r, clearance, valid)
+    return Incidence(theta, sin, cos, local[:2] * (1.0 / r), r, clearance, valid)
 
 
 def edge(lens: Lens, limited: bool) -> float:
