@@ -101,21 +101,30 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Matrices (..., 3, 3) to unit quaternions (..., 4), x, y, z, w with w >= 0."""
-    m = rotation
-    trace = np.trace(m, axis1=-2, axis2=-1)
-    diagonal = np.diagonal(m, axis1=-2, axis2=-1)
-    # The four candidates of Shepperd (1978); the largest diagonal term conditions best.
-    q = np.empty((*m.shape[:-2], 4, 4))
+    flat = rotation.reshape(*rotation.shape[:-2], 9)
+    # 4 q qT, which is linear in the rotation; its row of the largest diagonal term, one of the
+    # four candidates of Shepperd (1978), is the best conditioned multiple of q.
+    outer = (flat @ _OUTER).reshape(*flat.shape[:-1], 4, 4) + np.eye(4)
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    chosen = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    unit: Array = chosen / np.sqrt((chosen * chosen).sum(axis=-1, keepdims=True))
+    return np.where(unit[..., 3:] < 0, -unit, unit)
+
+
+def _outer() -> Array:
+    """Return the matrix (9, 16) of 4 q qT - I by the terms of a rotation matrix."""
+    outer = np.zeros((3, 3, 4, 4))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        q[..., i, i] = 1 + 2 * diagonal[..., i] - trace
-        q[..., i, j] = q[..., j, i] = m[..., i, j] + m[..., j, i]
-        q[..., i, 3] = q[..., 3, i] = m[..., k, j] - m[..., j, k]
-    q[..., 3, 3] = 1 + trace
-    best = np.argmax(np.diagonal(q, axis1=-2, axis2=-1), axis=-1)
-    chosen = np.take_along_axis(q, best[..., None, None], axis=-2)[..., 0, :]
-    unit: Array = chosen / np.linalg.norm(chosen, axis=-1, keepdims=True)
-    return np.where(unit[..., 3:] < 0, -unit, unit)
+        outer[i, i, range(4), range(4)] = -1.0
+        outer[i, i, i, i] = outer[i, i, 3, 3] = 1.0
+        outer[i, j, i, j] = outer[i, j, j, i] = outer[j, i, i, j] = outer[j, i, j, i] = 1.0
+        outer[k, j, i, 3] = outer[k, j, 3, i] = 1.0
+        outer[j, k, i, 3] = outer[j, k, 3, i] = -1.0
+    return outer.reshape(9, 16)
+
+
+_OUTER = _outer()
 
 
 def nearest_rotation(matrix: Array) -> Array:

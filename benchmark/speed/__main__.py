@@ -17,6 +17,7 @@ from benchmark.speed import (  # noqa: E402
     nodes,
     projection,
     stereo,
+    sweeps,
     variants,
 )
 from benchmark.speed.report import document  # noqa: E402
@@ -32,6 +33,7 @@ _PARTS = {
     'growth': growth.tables,
     'nodes': nodes.tables,
     'commands': commands.tables,
+    'sweeps': sweeps.tables,
 }
 
 

@@ -109,7 +109,7 @@ class ModelCritic(SolverNode):
     def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
         seen = seen_in(stamp, landmarks, items, self.cameras)
-        lens, scenario = true_lens(*self._lens(items)), scenario_of(items)
+        lens, scenario = true_lens(*self.lens(items)), scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._judged = scenario, {}, False
             self._running = self._verdict = None

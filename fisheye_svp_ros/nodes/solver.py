@@ -51,6 +51,7 @@ class SolverNode(BaseNode):
         self._join = StampJoin(points, [*poses, 'landmarks', 'scenario'])
         self._standing: LandmarkSet | None = None
         self._in_series = False
+        self._model: ForwardModel | None = None  # that of the parameter lens
         self.listen(
             PointCloud2, 'landmarks', messages.read_landmarks, self._hear_landmarks, LATCHED_INPUT
         )
@@ -80,7 +81,8 @@ class SolverNode(BaseNode):
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
-        """Do not wait for a scenario that nobody needs."""
+        """Load the lens; do not wait for a scenario that nobody needs."""
+        self._model = model_of(settings.lens, 1.0, settings.svp) if settings.lens else None
         if settings.lens and not self.BY_SCENARIO:
             self._join.expect_no_more('scenario')
 
@@ -90,7 +92,18 @@ class SolverNode(BaseNode):
 
     def model(self, items: Items) -> ForwardModel:
         """Return the lens to solve with; raise ParameterError where nobody names one."""
-        return model_of(*self._lens(items), self.settings.svp)
+        if self._model is not None:
+            return self._model
+        return model_of(*self.lens(items), self.settings.svp)
+
+    def lens(self, items: Items) -> tuple[str, float]:
+        """Return the lens to solve with, file or name, and the scale of its shift."""
+        if self.settings.lens:
+            return self.settings.lens, 1.0
+        scenario = items.get('scenario', {})
+        if 'lens' not in scenario:
+            raise ParameterError('no scenario names a lens; set the parameter lens')
+        return scenario['lens'], float(scenario.get('shift_scale', 1.0))
 
     def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
         """Return image points as one view; raise ObservationError for an unknown landmark."""
@@ -109,14 +122,6 @@ class SolverNode(BaseNode):
         for key, value in values.items():
             self._metrics[key].publish(messages.number_message(value))
         self._result.publish(messages.key_values_message(name, values, stamp, text, warn))
-
-    def _lens(self, items: Items) -> tuple[str, float]:
-        if self.settings.lens:
-            return self.settings.lens, 1.0
-        scenario = items.get('scenario', {})
-        if 'lens' not in scenario:
-            raise ParameterError('no scenario names a lens; set the parameter lens')
-        return scenario['lens'], float(scenario.get('shift_scale', 1.0))
 
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         def use(stamp: int, item: Any) -> None:

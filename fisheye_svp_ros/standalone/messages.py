@@ -83,7 +83,8 @@ class Message:
 
     def __init__(self, **values: object) -> None:
         for name, field in self.FIELDS.items():
-            object.__setattr__(self, name, field.default())
+            if name not in values:
+                object.__setattr__(self, name, field.default())
         for name, value in values.items():
             setattr(self, name, value)
 
