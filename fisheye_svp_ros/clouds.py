@@ -5,6 +5,7 @@ Messages come as rclpy, the standalone client or a bag reader made them: only at
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -77,23 +78,31 @@ def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool
 
 
 def _raw_points(cloud: Any, what: str) -> Points:
-    order = '>' if cloud.is_bigendian else '<'
     step, count = int(cloud.point_step), int(cloud.width) * int(cloud.height)
-    names, formats, offsets = [], [], []
-    for field in cloud.fields:
-        size = np.dtype(DATATYPES.get(field.datatype, 'V0')).itemsize
-        if not size or field.count != 1 or field.offset + size > step or field.name in names:
-            raise ObservationError(
-                f'{what}: field {field.name!r} has an impossible type, count or offset'
-            )
-        names.append(field.name)
-        formats.append(order + DATATYPES[field.datatype])
-        offsets.append(int(field.offset))
+    fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields)
+    layout = _layout(fields, step, bool(cloud.is_bigendian), what)
     if len(cloud.data) != step * count:
         raise ObservationError(
             f'{what}: {len(cloud.data)} bytes of data do not hold {count} points of {step} bytes'
         )
-    layout = np.dtype(
+    return np.frombuffer(cloud.data, dtype=layout) if count else np.empty(0, dtype=layout)
+
+
+@lru_cache(maxsize=64)
+def _layout(
+    fields: tuple[tuple[str, int, int, int], ...], step: int, big: bool, what: str
+) -> np.dtype[np.void]:
+    """Return the layout of one point; fields: name, offset, datatype and count."""
+    names, formats, offsets = [], [], []
+    for name, offset, datatype, count in fields:
+        size = np.dtype(DATATYPES.get(datatype, 'V0')).itemsize
+        if not size or count != 1 or offset + size > step or name in names:
+            raise ObservationError(
+                f'{what}: field {name!r} has an impossible type, count or offset'
+            )
+        names.append(name)
+        formats.append(('>' if big else '<') + DATATYPES[datatype])
+        offsets.append(offset)
+    return np.dtype(
         {'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': max(step, 1)}
     )
-    return np.frombuffer(cloud.data, dtype=layout) if count else np.empty(0, dtype=layout)

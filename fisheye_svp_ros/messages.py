@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
     Point,
     PoseStamped,
+    PoseWithCovariance,
     PoseWithCovarianceStamped,
     Quaternion,
     TransformStamped,
@@ -137,10 +138,8 @@ def pose_message(pose: Pose, stamp: int, frame: str) -> Any:
 
 def pose_with_covariance_message(pose: Pose, covariance: Array, stamp: int, frame: str) -> Any:
     """Return PoseWithCovarianceStamped; covariance (6, 6), m and rad, in the order of ROS."""
-    message = PoseWithCovarianceStamped(header=header(stamp, frame))
-    message.pose.pose = _pose(pose)
-    message.pose.covariance = covariance.ravel().tolist()
-    return message
+    inner = PoseWithCovariance(pose=_pose(pose), covariance=covariance.ravel().tolist())
+    return PoseWithCovarianceStamped(header=header(stamp, frame), pose=inner)
 
 
 def read_pose(message: Any, topic: str = 'true_pose') -> Pose:

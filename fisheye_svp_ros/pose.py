@@ -101,18 +101,17 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
 
 def quaternion_from_rotation(rotation: Array) -> Array:
     """Matrices (..., 3, 3) to unit quaternions (..., 4), x, y, z, w with w >= 0."""
-    flat = rotation.reshape(*rotation.shape[:-2], 9)
     # 4 q qT, which is linear in the rotation; its row of the largest diagonal term, one of the
     # four candidates of Shepperd (1978), is the best conditioned multiple of q.
-    outer = (flat @ _OUTER).reshape(*flat.shape[:-1], 4, 4) + np.eye(4)
-    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    chosen = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
-    unit: Array = chosen / np.sqrt((chosen * chosen).sum(axis=-1, keepdims=True))
-    return np.where(unit[..., 3:] < 0, -unit, unit)
+    outer = rotation.reshape(-1, 9) @ _OUTER + _UNIT
+    best = outer[:, ::5].argmax(axis=1)
+    chosen: Array = outer.reshape(-1, 4, 4)[np.arange(len(outer)), best]
+    chosen /= np.copysign(np.sqrt((chosen * chosen).sum(axis=1)), chosen[:, 3])[:, None]
+    return chosen.reshape(*rotation.shape[:-2], 4)
 
 
 def _outer() -> Array:
-    """Return the matrix (9, 16) of 4 q qT - I by the terms of a rotation matrix."""
+    """Return the matrix (9, 16) that makes 4 q qT, but for the identity, of a rotation matrix."""
     outer = np.zeros((3, 3, 4, 4))
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -125,6 +124,7 @@ def _outer() -> Array:
 
 
 _OUTER = _outer()
+_UNIT = np.eye(4).ravel()
 
 
 def nearest_rotation(matrix: Array) -> Array:

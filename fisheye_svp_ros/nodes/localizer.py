@@ -71,14 +71,14 @@ class Localizer(SolverNode):
 
     def _localized(self, model: ForwardModel, views: Views) -> Localization:
         """Solve from where the camera was; from anywhere if that fits worse than it did there."""
-        start, rms = self._before
+        start, before = self._before
         solution = localize_both_sides(model, views, start)
-        as_well = solution.converged[0] and rms_px(solution.residual) < _AS_WELL * rms
-        if start is not None and not as_well:
+        rms = rms_px(solution.residual) if solution.converged[0] else np.inf
+        if start is not None and rms >= _AS_WELL * before:
             solution = localize_both_sides(model, views)
-        self._before = None, 0.0
-        if solution.converged[0]:
-            self._before = solution.pose, max(rms_px(solution.residual), _EXACT)
+            rms = rms_px(solution.residual)
+        converged = solution.converged[0]
+        self._before = (solution.pose, max(rms, _EXACT)) if converged else (None, 0.0)
         return solution
 
 

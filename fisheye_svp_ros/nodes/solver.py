@@ -20,7 +20,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.messages import ImagePoints, LandmarkSet
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode
 from fisheye_svp_ros.nodes.join import StampJoin
-from fisheye_svp_ros.observations import STEREO, Views, views_of
+from fisheye_svp_ros.observations import STEREO, Views
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scenario import model_of
 from fisheye_svp_ros.settings import SolverSettings
@@ -108,10 +108,18 @@ class SolverNode(BaseNode):
     def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
         """Return image points as one view; raise ObservationError for an unknown landmark."""
         points = known_points(landmarks, seen)
-        weight = np.full((1, len(points)), 1 / self.settings.sigma_px)
-        views = views_of(points, seen.uv[None], weight)
-        time_s = np.full_like(weight, stamp / 1e9)
-        return views._replace(landmark=seen.landmark[None], t=time_s, frame=np.array([stamp]))
+        shape = 1, len(points)
+        return Views(
+            points=points[None],
+            uv=seen.uv[None],
+            weight=np.full(shape, 1 / self.settings.sigma_px),
+            landmark=seen.landmark[None],
+            board=np.zeros(shape, dtype=np.int64),
+            t=np.full(shape, stamp / 1e9),
+            frame=np.array([stamp]),
+            camera=np.zeros(1, dtype=np.int64),
+            row=np.arange(len(points))[None],
+        )
 
     def publish_result(
         self, stamp: int, metrics: Mapping[str, Array], text: str = '', warn: bool = False

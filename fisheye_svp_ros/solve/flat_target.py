@@ -41,9 +41,9 @@ def localize_both_sides(
 
 def _centred(views: Views) -> tuple[Array, Array]:
     """Return the points (S, N, 3) about their centre, 0 where there is none; centres (S, 3)."""
-    used = views.weight[..., None] > 0
+    used = (views.weight > 0)[..., None].astype(float)
     centre = (views.points * used).sum(axis=1) / used.sum(axis=1)
-    return np.where(used, views.points - centre[:, None], 0.0), centre
+    return (views.points - centre[:, None]) * used, centre
 
 
 def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
