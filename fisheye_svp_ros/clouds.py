@@ -74,6 +74,8 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
 def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool_]:
     if kind.kind == 'f':
         return np.asarray(np.isfinite(values))
+    if values.dtype == kind:
+        return np.ones(values.shape, dtype=bool)
     return np.asarray((values >= 0) & (values <= np.iinfo(kind).max))
 
 

@@ -28,9 +28,12 @@ class Landmarks:
     def lookup(self, ids: Index) -> tuple[Array, Mask]:
         """Return the points (..., 3) of `ids` (...), and which of them are known."""
         order = np.argsort(self.ids)
-        slot = np.clip(np.searchsorted(self.ids, ids, sorter=order), 0, len(order) - 1)
-        known = self.ids[order[slot]] == ids
-        return np.where(known[..., None], self.points[order[slot]], np.nan), known
+        slot = np.searchsorted(self.ids, ids, sorter=order)
+        place = order[np.minimum(slot, len(order) - 1)]
+        known = np.asarray(self.ids[place] == ids)
+        points = self.points.take(place, axis=0)
+        points[~known] = np.nan
+        return points, known
 
 
 def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:

@@ -114,7 +114,7 @@ def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> 
 def read_image_points(message: Any, topic: str = 'image_points') -> ImagePoints:
     """Return the image points of a PointCloud2."""
     points = unpack(message, IMAGE_POINTS, topic)
-    uv = np.stack([points['u'], points['v']], axis=-1)
+    uv = np.array([points['u'], points['v']]).T
     return ImagePoints(points['landmark'].astype(np.int64), uv, str(message.header.frame_id))
 
 
