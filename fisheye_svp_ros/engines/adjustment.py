@@ -95,10 +95,10 @@ def _left_pose(right, rig, rotation, position, change):
 @njit(**OPTIONS)
 def _equations(w, left, right, cameras, pose, rig, normal):
     """Write the normal equations; return the cost, inf outside the domain, nan if left."""
-    normal[2][:] = 0.0
-    normal[4][:] = 0.0
     total = _right_equations(w, right, pose, normal)
     if cameras == 2 and np.isfinite(total):
+        normal[2][:] = 0.0
+        normal[4][:] = 0.0
         total += _left_equations(w, left, pose, rig, normal)
     return total
 
@@ -158,10 +158,11 @@ def _moved(normal, cameras, block_step, shared_step):
 
 
 @njit(**OPTIONS)
-def _retract(pose, rig, block_step, shared_step, new_pose, new_rig):
+def _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig):
     for v in range(len(block_step)):
         retract(pose[0][v], pose[1][v], block_step[v], new_pose[0][v], new_pose[1][v])
-    retract(rig[0], rig[1], shared_step, new_rig[0], new_rig[1])
+    if cameras == 2:
+        retract(rig[0], rig[1], shared_step, new_rig[0], new_rig[1])
 
 
 @njit(**OPTIONS)
@@ -173,11 +174,11 @@ def _copy(source, target):
 
 
 @njit(**OPTIONS)
-def _accept(new_pose, new_rig, pose, rig):
-    _copy(new_pose[0], pose[0])
-    _copy(new_pose[1], pose[1])
-    _copy(new_rig[0], rig[0])
-    _copy(new_rig[1], rig[1])
+def _copy_state(pose, rig, new_pose, new_rig):
+    _copy(pose[0], new_pose[0])
+    _copy(pose[1], new_pose[1])
+    _copy(rig[0], new_rig[0])
+    _copy(rig[1], new_rig[1])
 
 
 @njit(**OPTIONS)
@@ -207,30 +208,40 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
     work = (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6)))
     new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
     new_rig = (np.empty((3, 3)), np.empty(3))
-    damping, growth = 1e-4, 2.0
+    damping, growth, ended = 1e-4, 2.0, 0
+    # What is accepted changes places with what was there: copies are made at the end, if at all.
+    state_elsewhere = normal_elsewhere = False
     total = _equations(w, left, right, cameras, pose, rig, normal)
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0
     for iteration in range(1, MAX_ITERATIONS + 1):
         moved = _step(normal, cameras, damping, work, block_step, shared_step)
         if np.isnan(moved):
-            return total, iteration, -1
-        _retract(pose, rig, block_step, shared_step, new_pose, new_rig)
+            ended = -1
+            break
+        _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig)
         if moved <= STEP_TOLERANCE**2 + ROUNDING * total and damping < 1.0:
-            _accept(new_pose, new_rig, pose, rig)
-            return max(total - moved, 0.0), iteration, 1
+            pose, rig, new_pose, new_rig = new_pose, new_rig, pose, rig
+            state_elsewhere = not state_elsewhere
+            total, ended = max(total - moved, 0.0), 1
+            break
         cost = _equations(w, left, right, cameras, new_pose, new_rig, fresh)
         if np.isnan(cost):
-            return total, iteration, -1
+            ended = -1
+            break
         if cost <= total * (1.0 + ROUNDING) + NOISE * np.sqrt(total):
             ratio = (total - cost) / moved if moved > 0.0 else 0.0
             damping = max(damping * min(max(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0), 1e-15)
-            growth = 2.0
-            total = cost
-            _accept(new_pose, new_rig, pose, rig)
-            _copy_normal(fresh, normal)
+            growth, total = 2.0, cost
+            pose, rig, new_pose, new_rig = new_pose, new_rig, pose, rig
+            normal, fresh = fresh, normal
+            state_elsewhere, normal_elsewhere = not state_elsewhere, not normal_elsewhere
         else:
             damping, growth = max(damping, 1e-9) * growth, 2.0 * growth
             if damping >= STUCK:
-                return total, iteration, 0
-    return total, MAX_ITERATIONS, 0
+                break
+    if state_elsewhere:
+        _copy_state(pose, rig, new_pose, new_rig)
+    if normal_elsewhere:
+        _copy_normal(normal, fresh)
+    return total, iteration, ended

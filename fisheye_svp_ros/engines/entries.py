@@ -38,6 +38,13 @@ _DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the refer
 
 
 @njit(**OPTIONS)
+def _take(w, n, points):
+    """Put points in the camera frame into their rows."""
+    for i in range(n):
+        w[X + i], w[Y + i], w[Z + i] = points[i, 0], points[i, 1], points[i, 2]
+
+
+@njit(**OPTIONS)
 def _write(w, n, uv, state):
     for i in range(n):
         uv[i, 0] = w[U + i] if w[STATE + i] == VALID else np.nan
@@ -63,17 +70,18 @@ def _inverse(hessian, out):
 def _residual(w, points, uv, row, lens, rotation, position, out):
     """Write measured minus predicted, nan for padding; return whether all could be done."""
     for start in range(0, len(points), B):
-        n = min(B, len(points) - start)
-        load(w, n, points, start, rotation, position)
+        n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
+        load(w, n, points[start:], rotation, position)
         meet(w, n, lens, BEHIND)
         image(w, n, lens)
+        left, off = 0, out[start:]
         for i in range(n):
-            at = start + i
-            if row[at] >= 0 and w[STATE + i] == LEFT:
-                return False
-            seen = row[at] >= 0 and w[STATE + i] != INVALID
-            out[at, 0] = uv[at, 0] - w[U + i] if seen else np.nan
-            out[at, 1] = uv[at, 1] - w[V + i] if seen else np.nan
+            left += (rows[i] >= 0) & (w[STATE + i] == LEFT)
+            seen = (rows[i] >= 0) & (w[STATE + i] != INVALID)
+            off[i, 0] = measured[i, 0] - w[U + i] if seen else np.nan
+            off[i, 1] = measured[i, 1] - w[V + i] if seen else np.nan
+        if left:
+            return False
     return True
 
 
@@ -107,9 +115,7 @@ def project(points, lens, edge, uv, state):
     w = np.empty(SCRATCH)
     for start in range(0, len(points), B):
         n = min(B, len(points) - start)
-        for i in range(n):
-            w[X + i], w[Y + i], w[Z + i] = (
-                points[start + i, 0], points[start + i, 1], points[start + i, 2])
+        _take(w, n, points[start:])
         meet(w, n, lens, edge)
         image(w, n, lens)
         _write(w, n, uv[start:], state[start:])
@@ -121,18 +127,17 @@ def linearise(points, lens, edge, uv, state, d_point, first):
     w = np.empty(SCRATCH)
     for start in range(0, len(points), B):
         n = min(B, len(points) - start)
-        for i in range(n):
-            w[X + i], w[Y + i], w[Z + i] = (
-                points[start + i, 0], points[start + i, 1], points[start + i, 2])
+        _take(w, n, points[start:])
         meet(w, n, lens, edge)
         image(w, n, lens)
         derivatives(w, n, lens)
         _write(w, n, uv[start:], state[start:])
         for row in range(2):
             for axis in range(3):
-                at, to = ROW + row * ROWS + axis * B, first + start
+                at, out = ROW + row * ROWS + axis * B, d_point[row, axis, first + start:]
+                source = w[at:at + B]
                 for i in range(n):
-                    d_point[row, axis, to + i] = w[at + i]
+                    out[i] = source[i]
 
 
 @_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
@@ -143,7 +148,7 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
         r = rotation[s]
         for start in range(0, points.shape[1], B):
             n = min(B, points.shape[1] - start)
-            load(w, n, points[s], start, r, position[s])
+            load(w, n, points[s, start:], r, position[s])
             meet(w, n, lens, edge)
             image(w, n, lens)
             derivatives(w, n, lens)
@@ -155,9 +160,9 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
                 sign = 1.0 if row % 2 else -1.0
                 for k in range(3):
                     a, b, c = sign * r[k, 0], sign * r[k, 1], sign * r[k, 2]
-                    out = d_pose[s, row // 2, 3 * (row % 2) + k]
+                    out = d_pose[s, row // 2, 3 * (row % 2) + k, start:]
                     for i in range(n):
-                        out[start + i] = a * x[i] + b * y[i] + c * z[i]
+                        out[i] = a * x[i] + b * y[i] + c * z[i]
 
 
 _SEEN = (_in(3), _in(3), _in(2))

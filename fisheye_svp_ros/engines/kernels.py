@@ -1,8 +1,9 @@
 """The formulas compiled by Numba, in loops over flat scratch memory that vectorise.
 
 A block of points is a set of rows of `B` numbers in one flat array: separate arrays would make the
-compiler check them for overlap, and calls of libm would end vectorisation.  A lens is one array,
-see `numba_engine.packed`.
+compiler check them for overlap, and calls of libm would end vectorisation.  So would an index that
+might be negative: what starts at a variable place is a slice first.  A lens is one array, see
+`numba_engine.packed`.
 """
 
 from __future__ import annotations
@@ -193,12 +194,11 @@ def derivatives(w, n, lens):
 
 
 @njit(**OPTIONS)
-def load(w, n, points, start, rotation, position):
-    """Bring points from `start` on from the world into the camera frame."""
+def load(w, n, points, rotation, position):
+    """Bring the first n points from the world into the camera frame."""
     r, p = rotation, position
     for i in range(n):
-        x, y, z = (points[start + i, 0] - p[0], points[start + i, 1] - p[1],
-                   points[start + i, 2] - p[2])
+        x, y, z = points[i, 0] - p[0], points[i, 1] - p[1], points[i, 2] - p[2]
         w[X + i] = r[0, 0] * x + r[1, 0] * y + r[2, 0] * z
         w[Y + i] = r[0, 1] * x + r[1, 1] * y + r[2, 1] * z
         w[Z + i] = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
@@ -207,40 +207,62 @@ def load(w, n, points, start, rotation, position):
 @njit(**OPTIONS)
 def add_view(w, points, uv, weight, lens, rotation, position, gram):
     """Add the products of a view's rows to gram (49), camera frame; return how it went."""
-    worst = VALID
     for start in range(0, len(points), B):
-        n = min(B, len(points) - start)
-        load(w, n, points, start, rotation, position)
+        n, weights, measured = min(B, len(points) - start), weight[start:], uv[start:]
+        load(w, n, points[start:], rotation, position)
         for i in range(n):
-            if weight[start + i] == 0.0:
-                w[X + i], w[Y + i], w[Z + i] = 0.0, 0.0, 1.0
+            unused = weights[i] == 0.0
+            w[X + i] = 0.0 if unused else w[X + i]
+            w[Y + i] = 0.0 if unused else w[Y + i]
+            w[Z + i] = 1.0 if unused else w[Z + i]
         meet(w, n, lens, BEHIND)
         image(w, n, lens)
         derivatives(w, n, lens)
+        failed = 0
         for i in range(n):
-            w[STATE + i] = VALID if weight[start + i] == 0.0 else w[STATE + i]
+            failed += (w[STATE + i] != VALID) & (weights[i] != 0.0)
+        if failed:
+            return _worst(w, n, weights)
+        for i in range(n):
+            w[ROW + 6 * B + i] = w[U + i] - measured[i, 0]
+            w[ROW + 13 * B + i] = w[V + i] - measured[i, 1]
+            w[STATE + i] = weights[i] * weights[i]
+        for row in range(7):
+            _add_products(w, n, row, gram)
+    return VALID
+
+
+@njit(**OPTIONS)
+def _worst(w, n, weight):
+    worst = VALID
+    for i in range(n):
+        if weight[i] != 0.0:
             worst = min(worst, w[STATE + i])
-        if worst < VALID:
-            return worst
-        for i in range(n):
-            w[ROW + 6 * B + i] = w[U + i] - uv[start + i, 0]
-            w[ROW + 13 * B + i] = w[V + i] - uv[start + i, 1]
-            w[STATE + i] = weight[start + i] * weight[start + i]
-        _add_products(w[STATE:STATE + n], w[ROW:], w[ROW + ROWS:], gram)
     return worst
 
 
 @njit(**OPTIONS)
-def _add_products(weight, u, v, gram):
-    """Add to the upper triangle of gram (49) what the rows of u and v give."""
-    for a in range(7):
-        ua, va = u[a * B:(a + 1) * B], v[a * B:(a + 1) * B]
-        for b in range(a, 7):
-            ub, vb = u[b * B:(b + 1) * B], v[b * B:(b + 1) * B]
-            total = 0.0
-            for i in range(len(weight)):
-                total += weight[i] * (ua[i] * ub[i] + va[i] * vb[i])
-            gram[7 * a + b] += total
+def _add_products(w, n, row, gram):
+    """Add the products of one row with all seven, weighted by STATE, in one pass over them."""
+    p, q = w[ROW + row * B:], w[ROW + ROWS + row * B:]
+    s0 = s1 = s2 = s3 = s4 = s5 = s6 = 0.0
+    for i in range(n):
+        u, v = w[STATE + i] * p[i], w[STATE + i] * q[i]
+        s0 += u * w[ROW + i] + v * w[ROW + ROWS + i]
+        s1 += u * w[ROW + B + i] + v * w[ROW + ROWS + B + i]
+        s2 += u * w[ROW + 2 * B + i] + v * w[ROW + ROWS + 2 * B + i]
+        s3 += u * w[ROW + 3 * B + i] + v * w[ROW + ROWS + 3 * B + i]
+        s4 += u * w[ROW + 4 * B + i] + v * w[ROW + ROWS + 4 * B + i]
+        s5 += u * w[ROW + 5 * B + i] + v * w[ROW + ROWS + 5 * B + i]
+        s6 += u * w[ROW + 6 * B + i] + v * w[ROW + ROWS + 6 * B + i]
+    at = 7 * row
+    gram[at] += s0
+    gram[at + 1] += s1
+    gram[at + 2] += s2
+    gram[at + 3] += s3
+    gram[at + 4] += s4
+    gram[at + 5] += s5
+    gram[at + 6] += s6
 
 
 @njit(**OPTIONS)
@@ -251,9 +273,6 @@ def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gra
     state = add_view(w, points, uv, weight, lens, rotation, position, gram)
     if state < VALID:
         return np.nan if state == LEFT else np.inf
-    for a in range(7):
-        for b in range(a):
-            gram[7 * a + b] = gram[7 * b + a]
     for part in range(2):
         for a in range(3):
             for b in range(7):
