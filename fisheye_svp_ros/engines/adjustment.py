@@ -208,13 +208,14 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
     work = (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6)))
     new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
     new_rig = (np.empty((3, 3)), np.empty(3))
-    damping, growth, ended = 1e-4, 2.0, 0
+    damping, growth, iteration, ended = 1e-4, 2.0, 0, 0
     # What is accepted changes places with what was there: copies are made at the end, if at all.
     state_elsewhere = normal_elsewhere = False
     total = _equations(w, left, right, cameras, pose, rig, normal)
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    while iteration < MAX_ITERATIONS:
+        iteration += 1
         moved = _step(normal, cameras, damping, work, block_step, shared_step)
         if np.isnan(moved):
             ended = -1

@@ -24,7 +24,7 @@ SHIFTS = (formulas.gennery, formulas.flat_port)
 for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.approach, formulas.point_derivatives):
     register_jitable(**OPTIONS)(formula)
 
-B = 256  # points in a block
+B = 248  # points in a block; rows a power of two apart would share the same lines of the cache
 (X, Y, Z, R, EX, EY, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, HEIGHT, SLOPE,
  U, V, ROW) = (B * i for i in range(20))
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
@@ -32,6 +32,7 @@ GRAM = ROW + 2 * ROWS
 SCRATCH = GRAM + 49 + 42
 VALID, INVALID, LEFT = 1.0, 0.0, -1.0
 SINGULAR = 1e-15  # pivot of a scaled matrix
+DOF = 6  # unknowns of a pose or a rig; a size that the compiler knows is faster
 
 FX, FY, CX, CY, NEAR, HEIGHT_KIND, SHIFT_KIND, HEIGHT_K, SHIFT_K = 0, 1, 2, 3, 4, 5, 6, 7, 11
 LENS = 15
@@ -299,11 +300,10 @@ def factor(hessian, damping, scale, lower):
     scale: what rows and columns are multiplied by; lower: Cholesky's factor, with the reciprocals
     of its diagonal.
     """
-    size = len(scale)
-    for j in range(size):
+    for j in range(DOF):
         scale[j] = 1.0 / np.sqrt(hessian[j, j]) if hessian[j, j] > 0.0 else 1.0
-    for j in range(size):
-        for i in range(j, size):
+    for j in range(DOF):
+        for i in range(j, DOF):
             total = 1.0 + damping if i == j else hessian[i, j] * scale[i] * scale[j]
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
@@ -319,17 +319,16 @@ def factor(hessian, damping, scale, lower):
 @njit(**OPTIONS)
 def substitute(lower, scale, x):
     """Solve for the matrix that was factored, x in place."""
-    size = len(scale)
-    for i in range(size):
+    for i in range(DOF):
         x[i] *= scale[i]
         for k in range(i):
             x[i] -= lower[i, k] * x[k]
         x[i] *= lower[i, i]
-    for i in range(size - 1, -1, -1):
-        for k in range(i + 1, size):
+    for i in range(DOF - 1, -1, -1):
+        for k in range(i + 1, DOF):
             x[i] -= lower[k, i] * x[k]
         x[i] *= lower[i, i]
-    for i in range(size):
+    for i in range(DOF):
         x[i] *= scale[i]
 
 

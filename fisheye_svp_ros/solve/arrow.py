@@ -7,6 +7,7 @@ Adjustment - A Modern Synthesis, 2000, section 6.1).  No sparse solver is needed
 
 from __future__ import annotations
 
+import contextlib
 from typing import NamedTuple
 
 import numpy as np
@@ -138,12 +139,22 @@ def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
 
 def _inverse(matrix: Array) -> Array:
     """Return the inverse of symmetric matrices (..., K, K) without their singular directions."""
+    with contextlib.suppress(np.linalg.LinAlgError):
+        inverse: Array = np.linalg.inv(matrix)
+        # No less than the ratio of the eigenvalues, for a matrix that is no less than singular.
+        spread = np.abs(_trace(inverse) * _trace(matrix))
+        if (spread < 1 / _SINGULAR).all():
+            return inverse
     values, vectors = np.linalg.eigh(matrix)
     kept = values > _SINGULAR * values[..., -1:]
     with np.errstate(divide='ignore'):
         scale = np.where(kept, 1 / values, 0.0)
-    inverse: Array = (vectors * scale[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return inverse
+    return np.asarray((vectors * scale[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+
+
+def _trace(matrix: Array) -> Array:
+    trace: Array = np.trace(matrix, axis1=-2, axis2=-1)
+    return trace
 
 
 def _moved(equations: ArrowEquations, block_step: Array, shared_step: Array) -> Array:
