@@ -140,7 +140,7 @@ def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
 def _inverse(matrix: Array) -> Array:
     """Return the inverse of symmetric matrices (..., K, K) without their singular directions."""
     with contextlib.suppress(np.linalg.LinAlgError):
-        inverse: Array = np.linalg.inv(matrix)
+        inverse = np.asarray(np.linalg.inv(matrix), dtype=float)
         # No less than the ratio of the eigenvalues, for a matrix that is no less than singular.
         spread = np.abs(_trace(inverse) * _trace(matrix))
         if (spread < 1 / _SINGULAR).all():
