@@ -51,7 +51,7 @@ test-oldest:
 $(VENV)/ready: setup.py
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -e '.[standalone,fast,test,lint]'
+	$(BIN)/pip install --quiet -e '.[standalone,fast,dask,test,lint]'
 	touch $@
 
 clean:

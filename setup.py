@@ -49,6 +49,7 @@ setup(
         'dask': ['distributed>=2023.7'],
         'test': [
             'pytest>=7.4', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'opencv-python-headless>=4.6',
+            'psutil>=5.9',
         ],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],
     },

@@ -274,7 +274,7 @@ def test_it_goes_on_with_the_engine_that_it_was_begun_with(
 
 
 def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Path) -> None:
-    psutil = pytest.importorskip('psutil', reason='psutil, which comes with dask, finds workers')
+    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
     out = tmp_path / 'out'
     process = start(write(LONG), '-o', out, '--workers', 2)
     until(lambda: parts_in(out) >= 1)
@@ -289,7 +289,7 @@ def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Pat
 def test_workers_end_with_a_sweep_that_is_killed(
     write: Callable[[str], Path], tmp_path: Path
 ) -> None:
-    psutil = pytest.importorskip('psutil', reason='psutil, which comes with dask, finds workers')
+    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
     out = tmp_path / 'out'
     process = start(write(LONG), '-o', out, '--workers', 2)
     until(lambda: parts_in(out) >= 1)
