@@ -75,7 +75,8 @@ def vector_from_rotation(rotation: Array) -> Array:
     """Logarithm: rotation matrices (..., 3, 3) to rotation vectors (..., 3), rad."""
     quaternion = quaternion_from_rotation(rotation)
     sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, quaternion[..., 3:])
+    # With strides, the last digit of NumPy 1.26's arctan2 depends on where the arrays lie.
+    angle = 2 * np.arctan2(sine, np.ascontiguousarray(quaternion[..., 3:]))
     scale = np.where(sine < 1e-9, 2.0, angle / np.where(sine < 1e-9, 1.0, sine))
     vector: Array = quaternion[..., :3] * scale
     return vector

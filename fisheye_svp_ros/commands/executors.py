@@ -34,8 +34,6 @@ def local(count: int) -> Iterator[Workers]:
     if not count:
         yield Workers(InProcess(), 1)
         return
-    # One thread a process; they inherit this when they start.
-    os.environ.setdefault('OMP_NUM_THREADS', '1')
     executor = ProcessPoolExecutor(
         count, multiprocessing.get_context('spawn'), initializer=_end_with_parent
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
 _LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
 _MARK = 'sweep.txt'
+
+# Rows are the same to the last digit whoever works on them: so are the threads, for on their number
+# the sums of some BLAS depend, which reads it as it is loaded.  Workers inherit it.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

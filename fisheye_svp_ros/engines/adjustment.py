@@ -208,7 +208,7 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
     work = (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6)))
     new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
     new_rig = (np.empty((3, 3)), np.empty(3))
-    damping, growth, iteration, ended = 1e-4, 2.0, 0, 0
+    damping, growth, moved_before, iteration, ended = 1e-4, 2.0, 0.0, 0, 0
     # What is accepted changes places with what was there: copies are made at the end, if at all.
     state_elsewhere = normal_elsewhere = False
     total = _equations(w, left, right, cameras, pose, rig, normal)
@@ -221,7 +221,9 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
             ended = -1
             break
         _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig)
-        if moved <= STEP_TOLERANCE**2 + ROUNDING * total and damping < 1.0:
+        small = moved <= STEP_TOLERANCE**2 + ROUNDING * total
+        small |= moved * moved <= STEP_TOLERANCE**2 * moved_before
+        if small and damping < 1.0:
             pose, rig, new_pose, new_rig = new_pose, new_rig, pose, rig
             state_elsewhere = not state_elsewhere
             total, ended = max(total - moved, 0.0), 1
@@ -233,7 +235,7 @@ def minimise(w, left, right, cameras, pose, rig, normal, fresh):
         if cost <= total * (1.0 + ROUNDING) + NOISE * np.sqrt(total):
             ratio = (total - cost) / moved if moved > 0.0 else 0.0
             damping = max(damping * min(max(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0), 1e-15)
-            growth, total = 2.0, cost
+            growth, total, moved_before = 2.0, cost, moved
             pose, rig, new_pose, new_rig = new_pose, new_rig, pose, rig
             normal, fresh = fresh, normal
             state_elsewhere, normal_elsewhere = not state_elsewhere, not normal_elsewhere

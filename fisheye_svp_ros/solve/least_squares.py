@@ -11,8 +11,9 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 Arrays = tuple[Array, ...]
 
 MAX_ITERATIONS = 60
-# A step that would move the whitened residuals by less than this (their 2-norm) is the last one.
-STEP_TOLERANCE = 1e-9
+# A step that would move the whitened residuals by less than this (their 2-norm) is the last one,
+# and so is one after which, as steps shrink, the next would be.
+STEP_TOLERANCE = 5e-9
 ROUNDING = 1e-13
 # Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
 NOISE = 1e-11
@@ -62,7 +63,7 @@ def levenberg_marquardt(
     active: Index = np.arange(systems)
     total, normal = problem.linearise(state, active)
     damping, growth = np.full(systems, 1e-4), np.full(systems, 2.0)
-    converged = np.zeros(systems, dtype=bool)
+    converged, moved_before = np.zeros(systems, dtype=bool), np.zeros(systems)
     iterations = np.zeros(systems, dtype=np.int64)
     active = active[np.isfinite(total)]
     for _ in range(max_iterations):
@@ -72,7 +73,9 @@ def levenberg_marquardt(
         step, moved = problem.step(_take(normal, active), damping[active])
         trial = problem.retract(_take(state, active), step)
         before = total[active]
-        done = (moved <= STEP_TOLERANCE**2 + ROUNDING * before) & (damping[active] < 1)
+        done = moved <= STEP_TOLERANCE**2 + ROUNDING * before
+        done |= moved * moved <= STEP_TOLERANCE**2 * moved_before[active]
+        done &= damping[active] < 1
         if done.any():
             last, on = active[done], ~done
             converged[last] = True
@@ -87,7 +90,7 @@ def levenberg_marquardt(
         with np.errstate(divide='ignore', invalid='ignore'):
             ratio = np.where(better, (before - cost) / moved, 0.0)
         accepted = active[better]
-        total[accepted] = cost[better]
+        total[accepted], moved_before[accepted] = cost[better], moved[better]
         _put(state, accepted, trial, better)
         _put(normal, accepted, fresh, better)
         damping[active], growth[active] = _adjusted(
