@@ -17,8 +17,8 @@ _LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
 _MARK = 'sweep.txt'
 
-# Rows are the same to the last digit whoever works on them: so are the threads, for on their number
-# the sums of some BLAS depend, which reads it as it is loaded.  Workers inherit it.
+# Rows are the same to the last digit whoever works on them.  Some BLAS gives others on more
+# threads; it reads their number as it is loaded, and workers inherit it.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 

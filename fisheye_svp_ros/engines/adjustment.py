@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from fisheye_svp_ros.engines.kernels import (
+    BARE,
     OPTIONS,
     factor,
     retract,
@@ -27,6 +28,26 @@ from fisheye_svp_ros.solve.least_squares import (
 
 
 @njit(**OPTIONS)
+def empty_normal(views):
+    """Return the arrays of `solve.arrow.ArrowEquations` for one system."""
+    return (np.zeros((views, 6, 6)), np.zeros((views, 6, 6)), np.zeros((6, 6)),
+            np.zeros((views, 6)), np.zeros(6))
+
+
+@njit(**OPTIONS)
+def workspace(views):
+    """Return what `minimise` works in: equations, states, steps, and room for small matrices."""
+    return (
+        empty_normal(views),
+        (np.empty((views, 3, 3)), np.empty((views, 3))), (np.empty((3, 3)), np.empty(3)),
+        np.empty((views, 6)), np.zeros(6),
+        (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6))),
+        (np.empty((6, 6)), np.empty(6), np.zeros((6, 12)), np.empty((3, 3)), np.empty(3),
+         np.empty((6, 12))),
+    )
+
+
+@njit(**BARE)
 def _right_equations(w, seen, pose, normal):
     """Add the right camera's part; return the cost."""
     points, uv, weight, lens = seen
@@ -41,13 +62,12 @@ def _right_equations(w, seen, pose, normal):
     return total
 
 
-@njit(**OPTIONS)
-def _left_equations(w, seen, pose, rig, normal):
+@njit(**BARE)
+def _left_equations(w, seen, pose, rig, normal, room):
     """Add the left camera's part, by way of its pose, `right.compose(rig)`; return the cost."""
     points, uv, weight, lens = seen
     blocks, cross, shared, block_gradient, shared_gradient = normal
-    hessian, gradient, change = np.empty((6, 6)), np.empty(6), np.zeros((6, 12))
-    rotation, position, half = np.empty((3, 3)), np.empty(3), np.empty((6, 12))
+    hessian, gradient, change, rotation, position, half = room
     total = 0.0
     for v in range(len(points)):
         _left_pose((pose[0][v], pose[1][v]), rig, rotation, position, change)
@@ -72,7 +92,7 @@ def _left_equations(w, seen, pose, rig, normal):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _left_pose(right, rig, rotation, position, change):
     """Write the left camera's pose, and its change (6, 12) by those of right camera and rig."""
     for i in range(3):
@@ -92,18 +112,18 @@ def _left_pose(right, rig, rotation, position, change):
         position[i] += right[1][i]
 
 
-@njit(**OPTIONS)
-def _equations(w, left, right, cameras, pose, rig, normal):
+@njit(**BARE)
+def _equations(w, left, right, cameras, pose, rig, normal, room):
     """Write the normal equations; return the cost, inf outside the domain, nan if left."""
     total = _right_equations(w, right, pose, normal)
     if cameras == 2 and np.isfinite(total):
         normal[2][:] = 0.0
         normal[4][:] = 0.0
-        total += _left_equations(w, left, pose, rig, normal)
+        total += _left_equations(w, left, pose, rig, normal, room)
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _step(normal, cameras, damping, work, block_step, shared_step):
     """Solve (H + damping diag H) d = -g; return |J d|^2, nan for a singular system."""
     blocks, cross, shared, block_gradient, shared_gradient = normal
@@ -140,7 +160,7 @@ def _step(normal, cameras, damping, work, block_step, shared_step):
     return _moved(normal, cameras, block_step, shared_step)
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _moved(normal, cameras, block_step, shared_step):
     blocks, cross, shared, _, _ = normal
     total = 0.0
@@ -157,7 +177,7 @@ def _moved(normal, cameras, block_step, shared_step):
     return total
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig):
     for v in range(len(block_step)):
         retract(pose[0][v], pose[1][v], block_step[v], new_pose[0][v], new_pose[1][v])
@@ -165,7 +185,7 @@ def _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig):
         retract(rig[0], rig[1], shared_step, new_rig[0], new_rig[1])
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _copy(source, target):
     # Assigning whole arrays takes Numba longer to compile than all the rest.
     source, target = source.reshape(-1), target.reshape(-1)
@@ -173,7 +193,7 @@ def _copy(source, target):
         target[i] = source[i]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _copy_state(pose, rig, new_pose, new_rig):
     _copy(pose[0], new_pose[0])
     _copy(pose[1], new_pose[1])
@@ -181,7 +201,7 @@ def _copy_state(pose, rig, new_pose, new_rig):
     _copy(rig[1], new_rig[1])
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _copy_normal(source, target):
     _copy(source[0], target[0])
     _copy(source[1], target[1])
@@ -190,45 +210,34 @@ def _copy_normal(source, target):
     _copy(source[4], target[4])
 
 
-@njit(**OPTIONS)
-def empty_normal(views):
-    """Return the arrays of `solve.arrow.ArrowEquations` for one system."""
-    return (np.zeros((views, 6, 6)), np.zeros((views, 6, 6)), np.zeros((6, 6)),
-            np.zeros((views, 6)), np.zeros(6))
-
-
-@njit(**OPTIONS)
-def minimise(w, left, right, cameras, pose, rig, normal, fresh):
+@njit(**BARE)
+def minimise(w, left, right, cameras, pose, rig, normal, work):
     """Move pose and rig to the minimum; return cost, iterations and how it ended.
 
     1: converged; 0: not; -1: left to the reference, wherever it got to.
     """
-    views = len(pose[0])
-    block_step, shared_step = np.empty((views, 6)), np.zeros(6)
-    work = (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6)))
-    new_pose = (np.empty((views, 3, 3)), np.empty((views, 3)))
-    new_rig = (np.empty((3, 3)), np.empty(3))
+    fresh, new_pose, new_rig, block_step, shared_step, small, room = work
     damping, growth, moved_before, iteration, ended = 1e-4, 2.0, 0.0, 0, 0
     # What is accepted changes places with what was there: copies are made at the end, if at all.
     state_elsewhere = normal_elsewhere = False
-    total = _equations(w, left, right, cameras, pose, rig, normal)
+    total = _equations(w, left, right, cameras, pose, rig, normal, room)
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0
     while iteration < MAX_ITERATIONS:
         iteration += 1
-        moved = _step(normal, cameras, damping, work, block_step, shared_step)
+        moved = _step(normal, cameras, damping, small, block_step, shared_step)
         if np.isnan(moved):
             ended = -1
             break
         _retract(pose, rig, cameras, block_step, shared_step, new_pose, new_rig)
-        small = moved <= STEP_TOLERANCE**2 + ROUNDING * total
-        small |= moved * moved <= STEP_TOLERANCE**2 * moved_before
-        if small and damping < 1.0:
+        little = moved <= STEP_TOLERANCE**2 + ROUNDING * total
+        little |= moved * moved <= STEP_TOLERANCE**2 * (1.0 + total) * moved_before
+        if little and damping < 1.0:
             pose, rig, new_pose, new_rig = new_pose, new_rig, pose, rig
             state_elsewhere = not state_elsewhere
             total, ended = max(total - moved, 0.0), 1
             break
-        cost = _equations(w, left, right, cameras, new_pose, new_rig, fresh)
+        cost = _equations(w, left, right, cameras, new_pose, new_rig, fresh, room)
         if np.isnan(cost):
             ended = -1
             break

@@ -8,8 +8,9 @@ import numpy as np
 from numba import config, njit, types
 
 from fisheye_svp_ros.engines import cache
-from fisheye_svp_ros.engines.adjustment import empty_normal, minimise
+from fisheye_svp_ros.engines.adjustment import empty_normal, minimise, workspace
 from fisheye_svp_ros.engines.kernels import (
+    BARE,
     BEHIND,
     INVALID,
     LEFT,
@@ -37,14 +38,14 @@ from fisheye_svp_ros.engines.kernels import (
 _DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the reference
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _take(w, n, points):
     """Put points in the camera frame into their rows."""
     for i in range(n):
         w[X + i], w[Y + i], w[Z + i] = points[i, 0], points[i, 1], points[i, 2]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _write(w, n, uv, state):
     for i in range(n):
         uv[i, 0] = w[U + i] if w[STATE + i] == VALID else np.nan
@@ -52,10 +53,10 @@ def _write(w, n, uv, state):
         state[i] = w[STATE + i]
 
 
-@njit(**OPTIONS)
-def _inverse(hessian, out):
+@njit(**BARE)
+def _inverse(hessian, lower, scale, out):
     """Write the inverse of an information (6, 6); return whether it is determined."""
-    scale, lower, trace = np.empty(6), np.empty((6, 6)), 0.0
+    trace = 0.0
     if not factor(hessian, SINGULAR, scale, lower):
         return False
     out[:] = 0.0
@@ -66,7 +67,7 @@ def _inverse(hessian, out):
     return trace < _DETERMINED
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _residual(w, points, uv, row, lens, rotation, position, out):
     """Write measured minus predicted, nan for padding; return whether all could be done."""
     for start in range(0, len(points), B):
@@ -173,8 +174,8 @@ _SEEN = (_in(3), _in(3), _in(2))
 def localize(points, uv, weight, row, lens, minimum, rotation, position, covariance, residual,
              cost, solved, iterations):
     """Move S poses to their minima; return how many are left to the reference."""
-    w, normal, fresh, left = np.empty(SCRATCH), empty_normal(1), empty_normal(1), 0
-    rig = (np.eye(3), np.zeros(3))
+    w, normal, work, left = np.empty(SCRATCH), empty_normal(1), workspace(1), 0
+    rig, (lower, scale) = work[2], work[5][:2]
     for s in range(len(points)):
         usable, solved[s] = 0, False
         for i in range(weight.shape[1]):
@@ -182,10 +183,10 @@ def localize(points, uv, weight, row, lens, minimum, rotation, position, covaria
         if usable >= minimum:
             seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
             pose = (rotation[s:s + 1], position[s:s + 1])
-            cost[s], iterations[s], ended = minimise(w, seen, seen, 1, pose, rig, normal, fresh)
+            cost[s], iterations[s], ended = minimise(w, seen, seen, 1, pose, rig, normal, work)
             solved[s] = (
                 ended == 1
-                and _inverse(normal[0][0], covariance[s])
+                and _inverse(normal[0][0], lower, scale, covariance[s])
                 and _residual(
                     w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
             )
@@ -200,13 +201,13 @@ def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight
                 shared, block_gradient, shared_gradient):
     """Move S rigs of V views to their minima; return how many are left to the reference."""
     views, left = rotation.shape[1], 0
-    w, fresh = np.empty(SCRATCH), empty_normal(views)
+    w, work = np.empty(SCRATCH), workspace(views)
     for s in range(len(rotation)):
         mine = slice(s * views, (s + 1) * views)
         cost[s], iterations[s], ended[s] = minimise(
             w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
             (points[mine], uv[mine], weight[mine], lens), 2, (rotation[s], position[s]),
             (rig_rotation[s], rig_position[s]),
-            (blocks[s], cross[s], shared[s], block_gradient[s], shared_gradient[s]), fresh)
+            (blocks[s], cross[s], shared[s], block_gradient[s], shared_gradient[s]), work)
         left += ended[s] < 1
     return left

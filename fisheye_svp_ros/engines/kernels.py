@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numba.core.cpu import CPUTargetOptions
 from numba.extending import register_jitable
 
 from fisheye_svp_ros import formulas
@@ -18,6 +19,9 @@ from fisheye_svp_ros.formulas import NOWHERE
 
 # Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
 OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
+# What allocates nothing need not count who holds an array either, which would take a third of its
+# time.  Numba has its own runtime's switch under a private name.
+BARE = OPTIONS | ({'_nrt': False} if hasattr(CPUTargetOptions, '_nrt') else {})
 HEIGHTS = (formulas.orthographic, formulas.equidistant, formulas.equisolid,
            formulas.stereographic, formulas.kannala_brandt)
 SHIFTS = (formulas.gennery, formulas.flat_port)
@@ -28,8 +32,8 @@ B = 248  # points in a block; rows a power of two apart would share the same lin
 (X, Y, Z, R, EX, EY, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, HEIGHT, SLOPE,
  U, V, ROW) = (B * i for i in range(20))
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
-GRAM = ROW + 2 * ROWS
-SCRATCH = GRAM + 49 + 42
+GRAM = ROW + 2 * ROWS  # the upper triangle of 7 x 7, row by row, then room for `view_equations`
+SCRATCH = GRAM + 28 + 49 + 42
 VALID, INVALID, LEFT = 1.0, 0.0, -1.0
 SINGULAR = 1e-15  # pivot of a scaled matrix
 DOF = 6  # unknowns of a pose or a rig; a size that the compiler knows is faster
@@ -38,7 +42,7 @@ FX, FY, CX, CY, NEAR, HEIGHT_KIND, SHIFT_KIND, HEIGHT_K, SHIFT_K = 0, 1, 2, 3, 4
 LENS = 15
 
 
-@njit(inline='always', **OPTIONS)
+@njit(inline='always', **BARE)
 def _half_angle(r, m):
     """Return arctan(r / m) for 0 <= r <= m, to 1e-16."""
     large = r > 0.4142135623730951 * m
@@ -60,7 +64,7 @@ def _half_angle(r, m):
     return (0.7853981633974483 if large else 0.0) + x * p
 
 
-@njit(inline='always', **OPTIONS)
+@njit(inline='always', **BARE)
 def _turned(sin, cos, turn):
     """Return sine and cosine of an angle turned on by up to 0.3 rad."""
     w = turn * turn
@@ -71,7 +75,7 @@ def _turned(sin, cos, turn):
     return sin * c + cos * s, cos * c - sin * s
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def meet(w, n, lens, edge):
     """Solve the ray equation of n points in the rows X, Y, Z; STATE says how it went."""
     for i in range(n):
@@ -97,7 +101,7 @@ def meet(w, n, lens, edge):
             w[STATE + i] = w[STATE + i] if far & settled else LEFT
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _past_shift(w, n, lens):
     for i in range(n):
         w[TURN + i] = 0.0
@@ -113,7 +117,7 @@ def _past_shift(w, n, lens):
                 w[TURN + i] = np.nan
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _approach(w, first, last, lens):
     """Take one Newton step with some points; return how many have not settled."""
     k = lens[SHIFT_K:]
@@ -138,7 +142,7 @@ def _approach(w, first, last, lens):
     return late
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def image(w, n, lens):
     """Write image heights, their slopes and image points."""
     k, kind = lens[HEIGHT_K:], lens[HEIGHT_KIND]
@@ -168,7 +172,7 @@ def image(w, n, lens):
         w[V + i] = cy + fy * w[HEIGHT + i] * w[EY + i]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def derivatives(w, n, lens):
     """Write derivatives by place and by turn in the camera frame, as `numpy_engine` does."""
     fx, fy = lens[FX], lens[FY]
@@ -194,7 +198,7 @@ def derivatives(w, n, lens):
         w[ROW + 12 * B + i] = -fy * w[HEIGHT + i] * ex
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def load(w, n, points, rotation, position):
     """Bring the first n points from the world into the camera frame."""
     r, p = rotation, position
@@ -205,9 +209,9 @@ def load(w, n, points, rotation, position):
         w[Z + i] = r[0, 2] * x + r[1, 2] * y + r[2, 2] * z
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def add_view(w, points, uv, weight, lens, rotation, position, gram):
-    """Add the products of a view's rows to gram (49), camera frame; return how it went."""
+    """Add the products of a view's rows to gram (28), camera frame; return how it went."""
     for start in range(0, len(points), B):
         n, weights, measured = min(B, len(points) - start), weight[start:], uv[start:]
         load(w, n, points[start:], rotation, position)
@@ -228,12 +232,11 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
             w[ROW + 6 * B + i] = w[U + i] - measured[i, 0]
             w[ROW + 13 * B + i] = w[V + i] - measured[i, 1]
             w[STATE + i] = weights[i] * weights[i]
-        for row in range(7):
-            _add_products(w, n, row, gram)
+        _add_products(w, n, gram)
     return VALID
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def _worst(w, n, weight):
     worst = VALID
     for i in range(n):
@@ -242,38 +245,76 @@ def _worst(w, n, weight):
     return worst
 
 
-@njit(**OPTIONS)
-def _add_products(w, n, row, gram):
-    """Add the products of one row with all seven, weighted by STATE, in one pass over them."""
-    p, q = w[ROW + row * B:], w[ROW + ROWS + row * B:]
-    s0 = s1 = s2 = s3 = s4 = s5 = s6 = 0.0
+@njit(inline='always', **BARE)
+def _with(w, i, row, u, v):
+    """Return the product of one row of a point with another."""
+    at = ROW + row * B + i
+    return u * w[at] + v * w[at + ROWS]
+
+
+@njit(**BARE)
+def _add_products(w, n, gram):
+    """Add the products of all rows with each other, weighted by STATE."""
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = b1 = b2 = b3 = b4 = b5 = b6 = 0.0
+    c2 = c3 = c4 = c5 = c6 = d3 = d4 = d5 = d6 = e4 = e5 = e6 = f5 = f6 = g6 = 0.0
+    for i in range(n):  # as many sums at once as there are registers for them
+        s = w[STATE + i]
+        u, v = s * w[ROW + i], s * w[ROW + ROWS + i]
+        a0 += _with(w, i, 0, u, v)
+        a1 += _with(w, i, 1, u, v)
+        a2 += _with(w, i, 2, u, v)
+        a3 += _with(w, i, 3, u, v)
+        a4 += _with(w, i, 4, u, v)
+        a5 += _with(w, i, 5, u, v)
+        a6 += _with(w, i, 6, u, v)
+        u, v = s * w[ROW + B + i], s * w[ROW + ROWS + B + i]
+        b1 += _with(w, i, 1, u, v)
+        b2 += _with(w, i, 2, u, v)
+        b3 += _with(w, i, 3, u, v)
+        b4 += _with(w, i, 4, u, v)
+        b5 += _with(w, i, 5, u, v)
+        b6 += _with(w, i, 6, u, v)
+        u, v = s * w[ROW + 2 * B + i], s * w[ROW + ROWS + 2 * B + i]
+        c2 += _with(w, i, 2, u, v)
+        c3 += _with(w, i, 3, u, v)
+        c4 += _with(w, i, 4, u, v)
+        c5 += _with(w, i, 5, u, v)
+        c6 += _with(w, i, 6, u, v)
     for i in range(n):
-        u, v = w[STATE + i] * p[i], w[STATE + i] * q[i]
-        s0 += u * w[ROW + i] + v * w[ROW + ROWS + i]
-        s1 += u * w[ROW + B + i] + v * w[ROW + ROWS + B + i]
-        s2 += u * w[ROW + 2 * B + i] + v * w[ROW + ROWS + 2 * B + i]
-        s3 += u * w[ROW + 3 * B + i] + v * w[ROW + ROWS + 3 * B + i]
-        s4 += u * w[ROW + 4 * B + i] + v * w[ROW + ROWS + 4 * B + i]
-        s5 += u * w[ROW + 5 * B + i] + v * w[ROW + ROWS + 5 * B + i]
-        s6 += u * w[ROW + 6 * B + i] + v * w[ROW + ROWS + 6 * B + i]
-    at = 7 * row
-    gram[at] += s0
-    gram[at + 1] += s1
-    gram[at + 2] += s2
-    gram[at + 3] += s3
-    gram[at + 4] += s4
-    gram[at + 5] += s5
-    gram[at + 6] += s6
+        s = w[STATE + i]
+        u, v = s * w[ROW + 3 * B + i], s * w[ROW + ROWS + 3 * B + i]
+        d3 += _with(w, i, 3, u, v)
+        d4 += _with(w, i, 4, u, v)
+        d5 += _with(w, i, 5, u, v)
+        d6 += _with(w, i, 6, u, v)
+        u, v = s * w[ROW + 4 * B + i], s * w[ROW + ROWS + 4 * B + i]
+        e4 += _with(w, i, 4, u, v)
+        e5 += _with(w, i, 5, u, v)
+        e6 += _with(w, i, 6, u, v)
+        u, v = s * w[ROW + 5 * B + i], s * w[ROW + ROWS + 5 * B + i]
+        f5 += _with(w, i, 5, u, v)
+        f6 += _with(w, i, 6, u, v)
+        u, v = s * w[ROW + 6 * B + i], s * w[ROW + ROWS + 6 * B + i]
+        g6 += _with(w, i, 6, u, v)
+    sums = (a0, a1, a2, a3, a4, a5, a6, b1, b2, b3, b4, b5, b6, c2, c3, c4, c5, c6,
+            d3, d4, d5, d6, e4, e5, e6, f5, f6, g6)
+    for k in range(28):
+        gram[k] += sums[k]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gradient):
     """Write H (6, 6) and g (6) of one pose; return its cost, inf outside, nan if left."""
-    gram, half = w[GRAM:GRAM + 49], w[GRAM + 49:SCRATCH]
-    gram[:] = 0.0
-    state = add_view(w, points, uv, weight, lens, rotation, position, gram)
+    sums, gram, half = w[GRAM:GRAM + 28], w[GRAM + 28:GRAM + 77], w[GRAM + 77:SCRATCH]
+    sums[:] = 0.0
+    state = add_view(w, points, uv, weight, lens, rotation, position, sums)
     if state < VALID:
         return np.nan if state == LEFT else np.inf
+    k = 0
+    for a in range(7):
+        for b in range(a, 7):
+            gram[7 * a + b] = gram[7 * b + a] = sums[k]
+            k += 1
     for part in range(2):
         for a in range(3):
             for b in range(7):
@@ -293,7 +334,7 @@ def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gra
     return gram[48]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def factor(hessian, damping, scale, lower):
     """Factor a matrix scaled to a unit diagonal and damped; return whether that can be done.
 
@@ -316,7 +357,7 @@ def factor(hessian, damping, scale, lower):
     return True
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def substitute(lower, scale, x):
     """Solve for the matrix that was factored, x in place."""
     for i in range(DOF):
@@ -332,7 +373,7 @@ def substitute(lower, scale, x):
         x[i] *= scale[i]
 
 
-@njit(**OPTIONS)
+@njit(**BARE)
 def retract(rotation, position, change, new_rotation, new_position):
     """Apply a small change (6): `pose.Pose.retract`."""
     x, y, z = change[3], change[4], change[5]

@@ -11,9 +11,9 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 Arrays = tuple[Array, ...]
 
 MAX_ITERATIONS = 60
-# A step that would move the whitened residuals by less than this (their 2-norm) is the last one,
-# and so is one after which, as steps shrink, the next would be.
-STEP_TOLERANCE = 5e-9
+# A step that would move the whitened residuals by less than this (their 2-norm) is the last one;
+# so is one after which, as steps shrink, the next would be that small beside the residuals.
+STEP_TOLERANCE = 2e-9
 ROUNDING = 1e-13
 # Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
 NOISE = 1e-11
@@ -74,7 +74,7 @@ def levenberg_marquardt(
         trial = problem.retract(_take(state, active), step)
         before = total[active]
         done = moved <= STEP_TOLERANCE**2 + ROUNDING * before
-        done |= moved * moved <= STEP_TOLERANCE**2 * moved_before[active]
+        done |= moved * moved <= STEP_TOLERANCE**2 * (1 + before) * moved_before[active]
         done &= damping[active] < 1
         if done.any():
             last, on = active[done], ~done
