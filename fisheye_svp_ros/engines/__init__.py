@@ -15,10 +15,11 @@ from types import ModuleType
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.engines import cache, numpy_engine
-from fisheye_svp_ros.engines.answers import Poses, Rigs, Seen
+from fisheye_svp_ros.engines.answers import Localization, Rigs, Seen
 from fisheye_svp_ros.engines.rays import Incidence
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.pose import Pose
 
 ENGINES = ('auto', 'numpy', 'numba')
 VARIABLE = 'FISHEYE_SVP_ENGINE'
@@ -89,14 +90,15 @@ def pose_equations(
 
 
 def localize(
-    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, ...]
-) -> Poses | None:
-    """Solve single poses from starts (S, 3, 3), (S, 3), if the engine can do so by itself.
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose
+) -> tuple[Localization, int] | None:
+    """Solve single poses from starts (S,), if the engine can do so by itself.
 
-    row (S, N): below 0 for padding; minimum: usable points that a view must have.
+    row (S, N): below 0 for padding; minimum: usable points that a view must have.  Returns also
+    how many have not converged, which are left to the solver.
     """
-    poses: Poses | None = _engine.localize(lens, seen, row, minimum, start)
-    return poses
+    found: tuple[Localization, int] | None = _engine.localize(lens, seen, row, minimum, start)
+    return found
 
 
 def adjust_rigs(

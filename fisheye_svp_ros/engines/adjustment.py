@@ -41,7 +41,7 @@ def workspace(views):
         empty_normal(views),
         (np.empty((views, 3, 3)), np.empty((views, 3))), (np.empty((3, 3)), np.empty(3)),
         np.empty((views, 6)), np.zeros(6),
-        (np.empty((6, 6)), np.empty(6), np.empty((6, 6)), np.empty((views, 7, 6))),
+        (np.empty((6, 6)), np.empty((6, 6)), np.empty((views, 7, 6))),
         (np.empty((6, 6)), np.empty(6), np.zeros((6, 12)), np.empty((3, 3)), np.empty(3),
          np.empty((6, 12))),
     )
@@ -127,7 +127,7 @@ def _equations(w, left, right, cameras, pose, rig, normal, room):
 def _step(normal, cameras, damping, work, block_step, shared_step):
     """Solve (H + damping diag H) d = -g; return |J d|^2, nan for a singular system."""
     blocks, cross, shared, block_gradient, shared_gradient = normal
-    lower, scale, reduced, eliminated = work
+    lower, reduced, eliminated = work
     columns = 7 if cameras == 2 else 1
     if cameras == 2:
         _copy(shared, reduced)
@@ -135,23 +135,23 @@ def _step(normal, cameras, damping, work, block_step, shared_step):
             reduced[k, k] *= 1.0 + damping
             shared_step[k] = -shared_gradient[k]
     for v in range(len(blocks)):
-        if not factor(blocks[v], damping, scale, lower):
+        if not factor(blocks[v], damping, lower):
             return np.nan
         for i in range(6):
             eliminated[v, 0, i] = block_gradient[v, i]
             for k in range(1, columns):
                 eliminated[v, k, i] = cross[v, i, k - 1]
         for k in range(columns):
-            substitute(lower, scale, eliminated[v, k])
+            substitute(lower, eliminated[v, k])
         for k in range(columns - 1):
             for i in range(6):
                 shared_step[k] += cross[v, i, k] * eliminated[v, 0, i]
                 for j in range(6):
                     reduced[j, k] -= cross[v, i, j] * eliminated[v, k + 1, i]
     if cameras == 2:
-        if not factor(reduced, 0.0, scale, lower):
+        if not factor(reduced, 0.0, lower):
             return np.nan
-        substitute(lower, scale, shared_step)
+        substitute(lower, shared_step)
     for v in range(len(blocks)):
         for i in range(6):
             block_step[v, i] = -eliminated[v, 0, i]

@@ -5,25 +5,27 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.pose import Pose
 
 # Points (S, N, 3), m; image points (S, N, 2), px; weights (S, N), 1/px
 Seen = tuple[Array, Array, Array]
 
 
-class Poses(NamedTuple):
-    """S poses at their minima, the fields of `solve.localization.Localization`.
+class Localization(NamedTuple):
+    """Solved poses of S views.
 
-    solved (S,): whether it was; what was not, `left` of them, is left to the solver.
+    pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
+    residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
+    squares; converged, iterations (S,).  A view whose points do not fix a pose (they lie on one
+    line, say) has not converged; where that is so the covariance is NaN.
     """
 
-    rotation: Array
-    position: Array
+    pose: Pose
     covariance: Array
     residual: Array
     cost: Array
-    solved: Mask
+    converged: Mask
     iterations: Index
-    left: int
 
 
 class Rigs(NamedTuple):

@@ -54,16 +54,16 @@ def _write(w, n, uv, state):
 
 
 @njit(**BARE)
-def _inverse(hessian, lower, scale, out):
+def _inverse(hessian, lower, out):
     """Write the inverse of an information (6, 6); return whether it is determined."""
     trace = 0.0
-    if not factor(hessian, SINGULAR, scale, lower):
+    if not factor(hessian, SINGULAR, lower):
         return False
     out[:] = 0.0
     for k in range(6):
         out[k, k] = 1.0
-        substitute(lower, scale, out[k])
-        trace += out[k, k] / (scale[k] * scale[k])
+        substitute(lower, out[k])
+        trace += out[k, k] * hessian[k, k]
     return trace < _DETERMINED
 
 
@@ -175,7 +175,7 @@ def localize(points, uv, weight, row, lens, minimum, rotation, position, covaria
              cost, solved, iterations):
     """Move S poses to their minima; return how many are left to the reference."""
     w, normal, work, left = np.empty(SCRATCH), empty_normal(1), workspace(1), 0
-    rig, (lower, scale) = work[2], work[5][:2]
+    rig, lower = work[2], work[5][0]
     for s in range(len(points)):
         usable, solved[s] = 0, False
         for i in range(weight.shape[1]):
@@ -186,7 +186,7 @@ def localize(points, uv, weight, row, lens, minimum, rotation, position, covaria
             cost[s], iterations[s], ended = minimise(w, seen, seen, 1, pose, rig, normal, work)
             solved[s] = (
                 ended == 1
-                and _inverse(normal[0][0], lower, scale, covariance[s])
+                and _inverse(normal[0][0], lower, covariance[s])
                 and _residual(
                     w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
             )

@@ -35,7 +35,7 @@ ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residua
 GRAM = ROW + 2 * ROWS  # the upper triangle of 7 x 7, row by row, then room for `view_equations`
 SCRATCH = GRAM + 28 + 49 + 42
 VALID, INVALID, LEFT = 1.0, 0.0, -1.0
-SINGULAR = 1e-15  # pivot of a scaled matrix
+SINGULAR = 1e-15  # pivot beside the diagonal
 DOF = 6  # unknowns of a pose or a rig; a size that the compiler knows is faster
 
 FX, FY, CX, CY, NEAR, HEIGHT_KIND, SHIFT_KIND, HEIGHT_K, SHIFT_K = 0, 1, 2, 3, 4, 5, 6, 7, 11
@@ -335,22 +335,19 @@ def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gra
 
 
 @njit(**BARE)
-def factor(hessian, damping, scale, lower):
-    """Factor a matrix scaled to a unit diagonal and damped; return whether that can be done.
+def factor(hessian, damping, lower):
+    """Factor H + damping diag H; return whether that can be done.
 
-    scale: what rows and columns are multiplied by; lower: Cholesky's factor, with the reciprocals
-    of its diagonal.
+    lower: Cholesky's factor, with the reciprocals of its diagonal.
     """
     for j in range(DOF):
-        scale[j] = 1.0 / np.sqrt(hessian[j, j]) if hessian[j, j] > 0.0 else 1.0
-    for j in range(DOF):
         for i in range(j, DOF):
-            total = 1.0 + damping if i == j else hessian[i, j] * scale[i] * scale[j]
+            total = hessian[i, j] * (1.0 + damping if i == j else 1.0)
             for k in range(j):
                 total -= lower[i, k] * lower[j, k]
             if i > j:
                 lower[i, j] = total * lower[j, j]
-            elif total > SINGULAR:
+            elif total > SINGULAR * hessian[j, j]:
                 lower[j, j] = 1.0 / np.sqrt(total)
             else:
                 return False
@@ -358,10 +355,9 @@ def factor(hessian, damping, scale, lower):
 
 
 @njit(**BARE)
-def substitute(lower, scale, x):
+def substitute(lower, x):
     """Solve for the matrix that was factored, x in place."""
     for i in range(DOF):
-        x[i] *= scale[i]
         for k in range(i):
             x[i] -= lower[i, k] * x[k]
         x[i] *= lower[i, i]
@@ -369,8 +365,6 @@ def substitute(lower, scale, x):
         for k in range(i + 1, DOF):
             x[i] -= lower[k, i] * x[k]
         x[i] *= lower[i, i]
-    for i in range(DOF):
-        x[i] *= scale[i]
 
 
 @njit(**BARE)

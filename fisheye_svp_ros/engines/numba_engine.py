@@ -17,9 +17,10 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.engines import entries, kernels, numpy_engine
-from fisheye_svp_ros.engines.answers import Poses, Rigs, Seen
+from fisheye_svp_ros.engines.answers import Localization, Rigs, Seen
 from fisheye_svp_ros.engines.rays import caustic_range, edge, search_limit
 from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.pose import Pose
 
 T = TypeVar('T')
 
@@ -100,30 +101,30 @@ def linearise_views(
 
 
 def localize(
-    lens: Lens, seen: Seen, row: Index, minimum: int, start: tuple[Array, ...]
-) -> Poses | None:
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose
+) -> tuple[Localization, int] | None:
     """Do as `engines.localize` says."""
     numbers = packed(lens)
     if numbers is None:
         return None
-    seen, row = _contiguous(seen), np.ascontiguousarray(row)
     systems, count = row.shape
-    found = (
-        start[0].copy(), start[1].copy(), np.empty((systems, 6, 6)),
-        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=bool),
+    given = [np.ascontiguousarray(array) for array in (*seen, row)]
+    found = Localization(
+        Pose(start.rotation.copy(), start.position.copy()), np.empty((systems, 6, 6)),
+        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.bool_),
         np.empty(systems, dtype=np.int64),
     )
+    if systems == 1:  # by the shortest way: it is called for every frame of a camera
+        return found, entries.localize(*given, numbers, minimum, *found.pose, *found[1:])
 
     def run(part: slice) -> int:
         left: int = entries.localize(
-            *(array[part] for array in seen), row[part], numbers, minimum,
-            *(array[part] for array in found)
+            *(array[part] for array in given), numbers, minimum,
+            *(array[part] for array in (*found.pose, *found[1:]))
         )
         return left
 
-    if systems > 1:
-        return Poses(*found, sum(_spread(run, systems, 4 * systems * count)))
-    return Poses(*found, entries.localize(*seen, row, numbers, minimum, *found))
+    return found, sum(_spread(run, systems, 4 * systems * count))
 
 
 def adjust_rigs(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.engines.answers import Localization as Localization
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
@@ -18,23 +17,6 @@ from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_ma
 MIN_POINTS = 4
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
 _FLOOR = 1e-15  # keeps an exactly singular information invertible
-
-
-class Localization(NamedTuple):
-    """Solved poses of S views.
-
-    pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
-    residual (S, N, 2), px, measured minus predicted, NaN for padding; cost (S,): whitened sum of
-    squares; converged, iterations (S,).  A view whose points do not fix a pose (they lie on one
-    line, say) has not converged; where that is so the covariance is NaN.
-    """
-
-    pose: Pose
-    covariance: Array
-    residual: Array
-    cost: Array
-    converged: Mask
-    iterations: Index
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -48,12 +30,12 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
         start = start_poses(model, views)
     quick = None
     if model.plain:
-        quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, tuple(start))
+        quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, start)
     if quick is None:
         return _by_reference(model, views, start)
-    found = Localization(Pose(*quick[:2]), *quick[2:7])
-    if quick.left:
-        left = np.flatnonzero(~quick.solved)
+    found, unsolved = quick
+    if unsolved:
+        left = np.flatnonzero(~found.converged)
         merge(found, left, _by_reference(model, views.take(left), start.take(left)))
     return found
 
