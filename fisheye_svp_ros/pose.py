@@ -17,6 +17,12 @@ from fisheye_svp_ros.arrays import Array
 # Kita's camera at the origin gazes along -z with x right, y up; the optical frame has y down.
 PAPER_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
 
+_IDENTITY: Array = np.eye(3)
+# [v]x, row by row, of the unit vectors
+_CROSS: Array = np.array([
+    [0.0, 0, 0, 0, 0, -1, 0, 1, 0], [0.0, 0, 1, 0, 0, 0, -1, 0, 0], [0.0, -1, 0, 1, 0, 0, 0, 0, 0],
+])
+
 
 class Pose(NamedTuple):
     """Rotation (..., 3, 3) and position (..., 3), m, of a body in its reference frame."""
@@ -67,7 +73,7 @@ def rotation_from_vector(vector: Array) -> Array:
     half = np.maximum(half, 1e-100)  # sin(x) / x is 1 there
     ratio = np.sin(half) / half
     k = cross_matrix(vector)
-    rotation: Array = np.eye(3) + ratio * (np.cos(half) * k + (0.5 * ratio) * (k @ k))
+    rotation: Array = _IDENTITY + ratio * (np.cos(half) * k + (0.5 * ratio) * (k @ k))
     return rotation
 
 
@@ -84,9 +90,7 @@ def vector_from_rotation(rotation: Array) -> Array:
 
 def cross_matrix(vector: Array) -> Array:
     """Return [v]x (..., 3, 3) of vectors (..., 3)."""
-    cross = np.zeros((*vector.shape, 3))
-    cross[..., (2, 0, 1), (1, 2, 0)] = vector
-    cross[..., (1, 2, 0), (2, 0, 1)] = -vector
+    cross: Array = (vector @ _CROSS).reshape(*vector.shape, 3)
     return cross
 
 
@@ -96,7 +100,7 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     k = cross_matrix(q[..., :3])
     w = q[..., 3, None, None]
-    rotation: Array = np.eye(3) + 2 * w * k + 2 * (k @ k)
+    rotation: Array = _IDENTITY + 2 * w * k + 2 * (k @ k)
     return rotation
 
 

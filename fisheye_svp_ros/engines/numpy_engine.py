@@ -13,15 +13,35 @@ from fisheye_svp_ros.engines.rays import Incidence, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
 
-_BLOCK = 12_000  # points; rows a power of two apart would share the same lines of the cache
+_BLOCK = 10_000  # points; rows a power of two apart would share the same lines of the cache
+
+# What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
+# camera frame, or by a turn of the points about these axes; of u, v; the `_terms`.
+_PLACE = [
+    [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
+    [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
+    [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]],
+]
+_TURN = [
+    [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
+    [[-1, 0, -1, 0, 0, 0], [0, 0, 0, -1, 0, 0]],
+    [[0, 0, 0, 0, 0, 1], [0, 0, 0, 0, -1, 0]],
+]
+_BY_POINT = np.array(_PLACE, dtype=float)
+_BY_CAMERA = np.array([-_BY_POINT, _TURN])  # which moves the other way
+
+# Where there is no image, there is something to divide by zero.
+_quiet = np.errstate(divide='ignore', invalid='ignore')
 
 
+@_quiet
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Do as `engines.incidence` says."""
     parts = [_meet(lens, _rows(points[part]), limited) for part in _blocks(len(points))]
     return Incidence(*(np.concatenate(field, axis=-1) for field in zip(*parts, strict=True)))
 
 
+@_quiet
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Do as `engines.project` says."""
     uv, valid = np.empty((2, len(points))), np.empty(len(points), dtype=bool)
@@ -29,69 +49,80 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
         rays = _meet(lens, _rows(points[part]), limited)
         height, _ = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
         valid[part] = rays.valid
-        _image(lens, rays, height, uv[:, part])
+        _image(lens, height * rays.unit, rays.valid, uv[:, part])
     return uv.T, valid
 
 
+@_quiet
 def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise` says."""
     count = len(points)
-    uv, valid, d_point = np.empty((2, count)), np.empty(count, dtype=bool), np.empty((2, 3, count))
+    uv, valid, d_point = np.empty((2, count)), np.empty(count, dtype=bool), np.empty((6, count))
+    sums = (_BY_POINT * _pair(lens.fx, lens.fy, 2)).reshape(6, 6)
     for part in _blocks(count):
-        rays = _meet(lens, _rows(points[part]), limited)
-        height, parts = _derivatives(lens, rays)
+        local = _rows(points[part])
+        rays = _meet(lens, local, limited)
+        height, *parts = _derivatives(lens, rays)
         valid[part] = rays.valid
-        _image(lens, rays, height, uv[:, part])
-        _by_place(rays, parts, _pair(lens.fx, lens.fy, uv), d_point[..., part])
-    return uv.T, valid, np.moveaxis(d_point, -1, 0)
+        _image(lens, height * rays.unit, rays.valid, uv[:, part])
+        terms = np.empty((6, len(height)))
+        _by_place(terms, rays, *parts)
+        np.matmul(sums, terms, out=d_point[:, part])
+    return uv.T, valid, d_point.reshape(3, 2, count).T
 
 
+@_quiet
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise_views` says."""
     shape = points.shape[:2]
     uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
-    d_pose = np.empty((2, shape[0], 6, shape[1]))
+    d_pose, sums = np.empty((2, 6, *shape)), _by_camera(lens, rotation)
     for part in _tiles(*shape):
-        arm, local = _seen(rotation, position, points, part)
+        local = _seen(rotation, position, points, part)
         rays = _meet(lens, local, limited)
-        height, parts = _derivatives(lens, rays)
-        valid[part] = rays.valid
-        _image(lens, rays, height, uv[:, *part])
-        own = np.empty((2, 3, *rays.theta.shape))
-        _by_place(rays, parts, _pair(-lens.fx, -lens.fy, uv), own)  # the camera moves
-        own = np.swapaxes(rotation[part[0]] @ np.swapaxes(own, 1, 2), 1, 2)
-        out = np.swapaxes(d_pose[:, part[0], :, part[1]], 1, 2)
-        out[:, :3] = own
-        _cross(arm, own, out[:, 3:])
-    return np.moveaxis(uv, 0, -1), valid, d_pose.transpose(1, 3, 0, 2)
+        height, *parts = _derivatives(lens, rays)
+        valid[part], terms = rays.valid, _terms(rays, local[2], height, *parts)
+        _image(lens, terms[1, 4:], rays.valid, uv[:, *part])
+        out = d_pose[:, :, *part].transpose(2, 0, 1, 3)
+        np.matmul(sums[part[0]], terms.transpose(2, 0, 1, 3), out=out)
+    return uv.transpose(1, 2, 0), valid, d_pose.reshape(6, 2, *shape).transpose(2, 3, 1, 0)
 
 
+@_quiet
 def pose_equations(
     lens: Lens, rotation: Array, position: Array, seen: Seen
 ) -> tuple[Array, Array, Array]:
     """Do as `engines.pose_equations` says."""
     points, uv, weight = seen
     systems, count = weight.shape
-    gram = np.zeros((systems, 7, 7))
+    cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
+    sums = _by_camera(lens, rotation)
     for part in _tiles(systems, count):
-        _, local = _seen(rotation, position, points, part)
-        unused = weight[part] == 0
-        if unused.any():
-            local[:, unused] = np.array([[0.0], [0.0], [1.0]])
+        own, weights = part[0], weight[part]
+        local = _seen(rotation, position, points, part)
+        if not weights.all():
+            local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
         rays = _meet(lens, local, False)
-        height, parts = _derivatives(lens, rays)
-        rows = np.empty((len(unused), 7, 2, unused.shape[1]))
-        out = np.moveaxis(rows, (1, 2), (1, 0))
-        _by_place(rays, parts, _pair(lens.fx, lens.fy, out[:, 0]) * weight[part], out[:, :3])
-        _cross(out[:, :3], local, out[:, 3:6])
-        _image(lens, rays, height, out[:, 6])
-        out[:, 6] -= np.moveaxis(uv[part], -1, 0)
-        out[:, 6] *= weight[part]
+        height, *parts = _derivatives(lens, rays)
+        rows = np.empty((len(weights), 14, weights.shape[1]))
+        off = rows[:, 12:].transpose(1, 0, 2)
+        _image(lens, height * rays.unit, rays.valid, off)
+        off -= uv[part].transpose(2, 0, 1)
+        off *= weights
+        for factor in (height, *parts):
+            factor *= weights
+        terms = _terms(rays, local[2], height, *parts).transpose(2, 0, 1, 3)
+        np.matmul(sums[own], terms, out=rows[:, :12].reshape(-1, 2, 6, terms.shape[-1]))
+        cost[own] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
-        gram[part[0]] += flat @ np.swapaxes(flat, -1, -2)
-    return _in_world(gram, rotation)
+        # All seven times all seven would be BLAS's syrk, which is slower at this size.
+        gram[own] += flat[:, :6] @ flat.swapaxes(1, 2)
+    outside = ~np.isfinite(cost)
+    if outside.any():
+        cost[outside], gram[outside] = np.inf, np.eye(6, 7)
+    return cost, gram[..., :6], gram[..., 6]
 
 
 def localize(*_: object) -> None:
@@ -121,84 +152,70 @@ def _rows(points: Array) -> Array:
 
 
 def _meet(lens: Lens, local: Array, limited: bool) -> Incidence:
-    """Return where points (3, ...) in the camera frame meet the lens; moves those on its axis."""
+    """Do as `rays.meet` does; moves points off the axis."""
     local[0] += NOWHERE
-    with np.errstate(divide='ignore', invalid='ignore'):
-        return meet(lens, local, limited)
+    return meet(lens, local, limited)
 
 
 def _seen(
     rotation: Array, position: Array, points: Array, part: tuple[slice, slice]
-) -> tuple[Array, Array]:
-    """Return a tile's points from their cameras, along the axes of the world and of the camera.
-
-    Both (3, S, N).
-    """
-    arm = np.subtract(np.moveaxis(points[part], -1, 0), position[part[0]].T[..., None], order='C')
+) -> Array:
+    """Return a tile's points (3, S, N) in the frames of their cameras."""
+    own, seen = part[0], points[part].transpose(2, 0, 1)
+    arm = np.subtract(seen, position[own].T[..., None], order='C')
     local = np.empty_like(arm)
-    turned = np.swapaxes(rotation[part[0]], -1, -2)
-    np.matmul(turned, np.swapaxes(arm, 0, 1), out=np.swapaxes(local, 0, 1))
-    return arm, local
+    np.matmul(rotation[own].swapaxes(1, 2), arm.swapaxes(0, 1), out=local.swapaxes(0, 1))
+    return local
 
 
-def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, tuple[Array, Array, Array]]:
+def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, Array, Array, Array]:
     """Return the image height and what `formulas.point_derivatives` does."""
     height, slope = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        parts = point_derivatives(
-            height, slope, rays.sin, rays.cos, rays.radius, rays.clearance
-        )
-    return height, parts
+    return height, *point_derivatives(
+        height, slope, rays.sin, rays.cos, rays.radius, rays.clearance
+    )
 
 
-def _image(lens: Lens, rays: Incidence, height: Array, out: Array) -> None:
-    """Write image points (2, ...), px, NaN where there is none."""
-    np.multiply(height, rays.unit, out=out)
-    out *= _pair(lens.fx, lens.fy, out)
-    out += _pair(lens.cx, lens.cy, out)
-    if not rays.valid.all():
-        out[:, ~rays.valid] = np.nan
+def _image(lens: Lens, where: Array, valid: Mask, out: Array) -> None:
+    """Write image points (2, ...), px, of places h/f in the image; NaN where there is none."""
+    np.multiply(where, _pair(lens.fx, lens.fy, out.ndim), out=out)
+    out += _pair(lens.cx, lens.cy, out.ndim)
+    if not valid.all():
+        out[:, ~valid] = np.nan
 
 
-def _by_place(
-    rays: Incidence, parts: tuple[Array, Array, Array], scale: Array, out: Array
-) -> None:
-    """Write the derivatives (2, 3, ...) of `scale` h/f by a point's place in the camera frame.
+def _terms(
+    rays: Incidence, z: Array, height: Array, across: Array, along: Array, axial: Array
+) -> Array:
+    """Return what derivatives by place and by turn are sums of (2, 6, ...)."""
+    terms = np.empty((2, 6, *z.shape))
+    _by_place(terms[0], rays, across, along, axial)
+    level, tilted = terms[1, :2]
+    np.multiply(across, z, out=level)
+    np.multiply(along, z, out=tilted)
+    axial *= rays.radius
+    tilted -= axial
+    np.multiply(tilted * rays.unit[0], rays.unit, out=terms[1, 2:4])
+    np.multiply(height, rays.unit, out=terms[1, 4:])
+    return terms
 
-    scale (2, ...): of u and of v.
+
+def _by_place(terms: Array, rays: Incidence, across: Array, along: Array, axial: Array) -> None:
+    """Write what derivatives by place are sums of (6, ...)."""
+    terms[0], terms[1] = across, along
+    np.multiply(along * rays.unit[0], rays.unit, out=terms[2:4])
+    np.multiply(axial, rays.unit, out=terms[4:])
+
+
+def _by_camera(lens: Lens, rotation: Array) -> Array:
+    """Return which sums of terms are the derivatives by the changes of cameras (S, 2, 6, 6).
+
+    By place and by turn; by x of u, of v, by y, ...; the terms.
     """
-    across, along, axial = parts
-    height = rays.unit * scale
-    np.multiply((along * height)[:, None], rays.unit, out=out[:, :2])
-    out[0, 0] += across * scale[0]
-    out[1, 1] += across * scale[1]
-    np.multiply(axial, height, out=out[:, 2])
+    sums = (_BY_CAMERA * _pair(lens.fx, lens.fy, 2)).reshape(2, 3, 12)
+    return (rotation[:, None] @ sums).reshape(-1, 2, 6, 6)
 
 
-def _cross(a: Array, b: Array, out: Array) -> None:
-    """Write cross products (..., 3, S, N) of vectors.
-
-    Of an arm with derivatives by place they are those by turn.
-    """
-    (a0, a1, a2), (b0, b1, b2) = np.moveaxis(a, -3, 0), np.moveaxis(b, -3, 0)
-    np.subtract(a1 * b2, a2 * b1, out=out[..., 0, :, :])
-    np.subtract(a2 * b0, a0 * b2, out=out[..., 1, :, :])
-    np.subtract(a0 * b1, a1 * b0, out=out[..., 2, :, :])
-
-
-def _pair(u: float, v: float, like: Array) -> Array:
-    """Return two numbers to be applied to rows (2, ...)."""
-    return np.array([u, v]).reshape(2, *(1,) * (like.ndim - 1))
-
-
-def _in_world(gram: Array, rotation: Array) -> tuple[Array, Array, Array]:
-    """Turn sums of products of camera-frame rows (by place, by turn, residual) into equations."""
-    turn = np.zeros((len(gram), 6, 6))
-    turn[:, :3, :3], turn[:, 3:, 3:] = -rotation, rotation  # the camera moves, not the point
-    hessian = turn @ gram[:, :6, :6] @ np.swapaxes(turn, -1, -2)
-    gradient = (turn @ gram[:, :6, 6:])[..., 0]
-    cost = gram[:, 6, 6]
-    outside = ~np.isfinite(cost)
-    if outside.any():
-        hessian[outside], gradient[outside], cost[outside] = np.eye(6), 0.0, np.inf
-    return cost, hessian, gradient
+def _pair(u: float, v: float, dimensions: int) -> Array:
+    """Return two numbers to be applied to rows (2, ...) of some dimensions."""
+    return np.array((u, v)).reshape(2, *(1,) * (dimensions - 1))

@@ -45,18 +45,24 @@ class Incidence(NamedTuple):
 def meet(lens: Lens, local: Array, limited: bool) -> Incidence:
     """Return where points (3, ...) in the camera frame meet the lens, none exactly on its axis.
 
-    limited: see `edge`.
+    limited: see `edge`.  Of `local` only the last row stays what it is.
     """
     x, y, z = local
-    r2 = x * x + y * y
-    r, distance = np.sqrt(r2), np.sqrt(r2 + z * z)
+    r2 = x * x
+    r2 += y * y
+    distance = z * z
+    distance += r2
+    r, distance = np.sqrt(r2, out=r2), np.sqrt(distance, out=distance)
     scale = 1.0 / distance
     theta, sin, cos = np.arctan2(r, z), r * scale, z * scale
     clearance = distance
     if lens.viewpoint_shift is not None:
         theta, sin, cos, clearance = _past_shift(lens, r, z, distance, (theta, sin, cos))
-    valid = (clearance > CLEAR) & (theta <= edge(lens, limited))
-    return Incidence(theta, sin, cos, local[:2] * (1.0 / r), r, clearance, valid)
+    valid = clearance > CLEAR
+    valid &= theta <= edge(lens, limited)
+    unit = local[:2]
+    unit *= 1.0 / r
+    return Incidence(theta, sin, cos, unit, r, clearance, valid)
 
 
 def edge(lens: Lens, limited: bool) -> float:
@@ -101,14 +107,20 @@ def _newton(
     shift: ViewpointShift, r: Array, z: Array, theta: Array, sin: Array, cos: Array,
     steps: int = NEWTON_STEPS, more: int = MORE_STEPS,
 ) -> tuple[Array, Array, Array, Array, Mask]:
-    """Take Newton steps, and up to so many more with the points that have not settled."""
+    """Take Newton steps, and up to so many more with the points that have not settled.
+
+    theta and cos are used up.
+    """
     for count in range(steps):
         if count:
             sin, cos = _sine_and_cosine(theta)
         step, clearance = approach(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
-        theta = theta + step
+        theta += step
     # The last step is so small that sine and cosine follow it in a straight line.
-    found = (theta, sin + step * cos, cos - step * sin, clearance, np.abs(step) < SETTLED)
+    sin_step, cos_step = step * cos, step * sin
+    sin_step += sin
+    cos -= cos_step
+    found = (theta, sin_step, cos, clearance, np.abs(step, out=step) < SETTLED)
     late = ~found[-1]
     if more and late.any():
         start = theta[late], *_sine_and_cosine(theta[late])
@@ -120,10 +132,14 @@ def _newton(
 
 def _sine_and_cosine(theta: Array) -> tuple[Array, Array]:
     """Return both by way of tan(theta / 2), which NumPy has faster."""
-    half_tan = np.tan(0.5 * theta)
-    square = half_tan * half_tan
-    scale = 1.0 / (1.0 + square)
-    return 2.0 * half_tan * scale, (1.0 - square) * scale
+    half_tan = 0.5 * theta
+    np.tan(half_tan, out=half_tan)
+    cos = half_tan * half_tan
+    cos += 1.0
+    np.divide(2.0, cos, out=cos)
+    half_tan *= cos
+    cos -= 1.0
+    return half_tan, cos
 
 
 def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:

@@ -110,9 +110,8 @@ def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, 
     block_scale, shared_scale = _scale(equations.blocks), _scale(equations.shared)
     blocks = equations.blocks / (block_scale[..., :, None] * block_scale[..., None, :])
     shared = equations.shared / (shared_scale[:, :, None] * shared_scale[:, None, :])
-    b, k = range(blocks.shape[-1]), range(shared.shape[-1])
-    blocks[..., b, b] = (1 + _FLOOR + damping)[:, None, None]
-    shared[..., k, k] = (1 + _FLOOR + damping)[:, None]
+    np.einsum('svbb->svb', blocks)[...] = (1 + _FLOOR + damping)[:, None, None]
+    np.einsum('skk->sk', shared)[...] = (1 + _FLOOR + damping)[:, None]
     scaled = ArrowEquations(
         blocks,
         equations.cross / (block_scale[..., :, None] * shared_scale[:, None, None, :]),

@@ -102,23 +102,25 @@ class _Rigs:
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         right, rig = Pose(*state[:2]), Pose(*state[2:])
-        poses = (_left_pose(right, rig), right)
-        changes = (_left_change(right, rig), np.broadcast_to(np.eye(6, 12), (1, 1, 6, 12)))
-        shape = right.position.shape[:2]
-        cost, hessian = np.zeros(shape), np.zeros((*shape, 12, 12))
-        gradient = np.zeros((*shape, 12))
-        for model, views, pose, change in zip(
-            self._models, self._views, poses, changes, strict=True
-        ):
-            seen = views
-            if len(index) < len(self._rows):
-                seen = views.take(self._rows[index].ravel())
-            own_cost, (own_hessian, own_gradient) = pose_equations(model, _flat(pose), seen)
-            transposed = np.swapaxes(change, -1, -2)
-            cost += own_cost.reshape(shape)
-            hessian += transposed @ own_hessian.reshape(*shape, 6, 6) @ change
-            gradient += (transposed @ own_gradient.reshape(*shape, 6, 1))[..., 0]
-        return arrow_of_views(cost, hessian, gradient, block=6)
+        (left_cost, *left_normal), (cost, *normal) = (
+            self._equations(side, pose, index)
+            for side, pose in enumerate((_left_pose(right, rig), right))
+        )
+        change = _left_change(right, rig)
+        transposed = np.swapaxes(change, -1, -2)
+        hessian = transposed @ left_normal[0] @ change
+        gradient = (transposed @ left_normal[1][..., None])[..., 0]
+        hessian[..., :6, :6] += normal[0]
+        gradient[..., :6] += normal[1]
+        return arrow_of_views(left_cost + cost, hessian, gradient, block=6)
+
+    def _equations(self, side: int, pose: Pose, index: Index) -> tuple[Array, Array, Array]:
+        """Return costs (S, V), H (S, V, 6, 6) and g (S, V, 6) of one camera's poses (S, V)."""
+        views, shape = self._views[side], pose.position.shape[:2]
+        if len(index) < len(self._rows):
+            views = views.take(self._rows[index].ravel())
+        cost, (hessian, gradient) = pose_equations(self._models[side], _flat(pose), views)
+        return cost.reshape(shape), hessian.reshape(*shape, 6, 6), gradient.reshape(*shape, 6)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         return arrow_step(normal, damping)
