@@ -121,10 +121,10 @@ def approach(
 def point_derivatives(
     height: Array, slope: Array, sin: Array, cos: Array, r: Array, clearance: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the derivatives of h/f across, along (less across) and parallel to the axis, 1/m."""
+    """Return the derivatives of h/f across, along (less across) and against the axis, 1/m."""
     steep = slope / clearance
     across = height / r
     along = steep * cos
     along -= across
     steep *= sin
-    return across, along, -steep
+    return across, along, steep

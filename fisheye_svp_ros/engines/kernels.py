@@ -177,21 +177,21 @@ def derivatives(w, n, lens):
     """Write derivatives by place and by turn in the camera frame, as `numpy_engine` does."""
     fx, fy = lens[FX], lens[FY]
     for i in range(n):
-        across, along, axial = formulas.point_derivatives(
+        across, along, fall = formulas.point_derivatives(
             w[HEIGHT + i], w[SLOPE + i], w[SIN + i], w[COS + i], w[R + i], w[CLEARANCE + i])
         ex, ey, r, z = w[EX + i], w[EY + i], w[R + i], w[Z + i]
-        level, tilted = across * z, along * z - axial * r
+        level, tilted = across * z, along * z + fall * r
         eu, ev = fx * ex, fy * ey
         steep, lean = along * eu, tilted * eu
         w[ROW + i] = steep * ex + fx * across
         w[ROW + B + i] = steep * ey
-        w[ROW + 2 * B + i] = axial * eu
+        w[ROW + 2 * B + i] = -fall * eu
         w[ROW + 3 * B + i] = lean * ey
         w[ROW + 4 * B + i] = -lean * ex - fx * level
         steep, lean = along * ev, tilted * ev
         w[ROW + 7 * B + i] = steep * ex
         w[ROW + 8 * B + i] = steep * ey + fy * across
-        w[ROW + 9 * B + i] = axial * ev
+        w[ROW + 9 * B + i] = -fall * ev
         w[ROW + 10 * B + i] = lean * ey + fy * level
         w[ROW + 11 * B + i] = -lean * ex
         w[ROW + 5 * B + i] = fx * w[HEIGHT + i] * ey

@@ -13,14 +13,15 @@ from fisheye_svp_ros.engines.rays import Incidence, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
 
-_BLOCK = 10_000  # points; rows a power of two apart would share the same lines of the cache
+_BLOCK = 14_000  # points; rows a power of two apart would share the same lines of the cache
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
-# camera frame, or by a turn of the points about these axes; of u, v; the `_terms`.
+# camera frame, or by a turn of the points about these axes; of u, v; what `_by_place` and
+# `_by_turn` write.
 _PLACE = [
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
     [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
-    [[0, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]],
+    [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
 ]
 _TURN = [
     [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
@@ -83,10 +84,9 @@ def linearise_views(
         local = _seen(rotation, position, points, part)
         rays = _meet(lens, local, limited)
         height, *parts = _derivatives(lens, rays)
-        valid[part], terms = rays.valid, _terms(rays, local[2], height, *parts)
-        _image(lens, terms[1, 4:], rays.valid, uv[:, *part])
-        out = d_pose[:, :, *part].transpose(2, 0, 1, 3)
-        np.matmul(sums[part[0]], terms.transpose(2, 0, 1, 3), out=out)
+        valid[part], out = rays.valid, d_pose[:, :, *part].transpose(2, 0, 1, 3)
+        place = _add_up(sums[part[0]], rays, local[2], height, *parts, out=out)
+        _image(lens, place, rays.valid, uv[:, *part])
     return uv.transpose(1, 2, 0), valid, d_pose.reshape(6, 2, *shape).transpose(2, 3, 1, 0)
 
 
@@ -113,8 +113,8 @@ def pose_equations(
         off *= weights
         for factor in (height, *parts):
             factor *= weights
-        terms = _terms(rays, local[2], height, *parts).transpose(2, 0, 1, 3)
-        np.matmul(sums[own], terms, out=rows[:, :12].reshape(-1, 2, 6, terms.shape[-1]))
+        out = rows[:, :12].reshape(len(rows), 2, 6, -1)
+        _add_up(sums[own], rays, local[2], height, *parts, out=out)
         cost[own] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
         # All seven times all seven would be BLAS's syrk, which is slower at this size.
@@ -176,35 +176,46 @@ def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, Array, Array, Arra
     )
 
 
-def _image(lens: Lens, where: Array, valid: Mask, out: Array) -> None:
+def _image(lens: Lens, place: Array, valid: Mask, out: Array) -> None:
     """Write image points (2, ...), px, of places h/f in the image; NaN where there is none."""
-    np.multiply(where, _pair(lens.fx, lens.fy, out.ndim), out=out)
+    np.multiply(place, _pair(lens.fx, lens.fy, out.ndim), out=out)
     out += _pair(lens.cx, lens.cy, out.ndim)
     if not valid.all():
         out[:, ~valid] = np.nan
 
 
-def _terms(
-    rays: Incidence, z: Array, height: Array, across: Array, along: Array, axial: Array
+def _add_up(
+    sums: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
+    fall: Array, *, out: Array,
 ) -> Array:
-    """Return what derivatives by place and by turn are sums of (2, 6, ...)."""
-    terms = np.empty((2, 6, *z.shape))
-    _by_place(terms[0], rays, across, along, axial)
-    level, tilted = terms[1, :2]
-    np.multiply(across, z, out=level)
-    np.multiply(along, z, out=tilted)
-    axial *= rays.radius
-    tilted -= axial
-    np.multiply(tilted * rays.unit[0], rays.unit, out=terms[1, 2:4])
-    np.multiply(height, rays.unit, out=terms[1, 4:])
-    return terms
+    """Write derivatives by place and by turn (S, 2, 6, N); return places h/f in the image."""
+    terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
+    by_system = terms.swapaxes(0, 1)
+    _by_place(terms, rays, across, along, fall)
+    np.matmul(sums[:, 0], by_system, out=out[:, 0])
+    _by_turn(terms, rays, z, height, across, along, fall)
+    np.matmul(sums[:, 1], by_system, out=out[:, 1])
+    return terms[4:]
 
 
-def _by_place(terms: Array, rays: Incidence, across: Array, along: Array, axial: Array) -> None:
+def _by_place(terms: Array, rays: Incidence, across: Array, along: Array, fall: Array) -> None:
     """Write what derivatives by place are sums of (6, ...)."""
     terms[0], terms[1] = across, along
     np.multiply(along * rays.unit[0], rays.unit, out=terms[2:4])
-    np.multiply(axial, rays.unit, out=terms[4:])
+    np.multiply(fall, rays.unit, out=terms[4:])
+
+
+def _by_turn(
+    terms: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
+    fall: Array,
+) -> None:
+    """Write what derivatives by turn are sums of (6, ...)."""
+    level, tilted = terms[:2]
+    np.multiply(across, z, out=level)
+    np.multiply(along, z, out=tilted)
+    tilted += fall * rays.radius
+    np.multiply(tilted * rays.unit[0], rays.unit, out=terms[2:4])
+    np.multiply(height, rays.unit, out=terms[4:])
 
 
 def _by_camera(lens: Lens, rotation: Array) -> Array:

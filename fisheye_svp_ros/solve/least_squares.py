@@ -18,6 +18,7 @@ ROUNDING = 1e-13
 # Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
 NOISE = 1e-11
 STUCK = 1e12
+_LEAST = 1e-300  # what is divided by in place of 0
 
 
 class Problem(Protocol):
@@ -80,21 +81,20 @@ def levenberg_marquardt(
             last, on = active[done], ~done
             converged[last] = True
             total[last] = np.maximum(before - moved, 0.0)[done]
-            _put(state, last, trial, done)
+            state = _put(state, last, trial, done)
             active, before, moved = active[on], before[on], moved[on]
             trial = tuple(array[on] for array in trial)
             if not active.size:
                 break
         cost, fresh = problem.linearise(trial, active)
         better = cost <= before * (1 + ROUNDING) + NOISE * np.sqrt(before)
-        with np.errstate(divide='ignore', invalid='ignore'):
-            ratio = np.where(better, (before - cost) / moved, 0.0)
+        ratio = np.where(better, before - cost, 0.0) / np.fmax(moved, _LEAST)
         accepted = active[better]
         total[accepted], moved_before[accepted] = cost[better], moved[better]
-        _put(state, accepted, trial, better)
-        _put(normal, accepted, fresh, better)
+        state = _put(state, accepted, trial, better)
+        normal = _put(normal, accepted, fresh, better)
         damping[active], growth[active] = _adjusted(
-            damping[active], growth[active], better, np.nan_to_num(ratio)
+            damping[active], growth[active], better, ratio
         )
         active = active[damping[active] < STUCK]
     return Solved(state, total, converged, iterations, normal)
@@ -105,12 +105,11 @@ def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
 
     A parameter that nothing depends on stays where it is.
     """
-    size = range(hessian.shape[-1])
     diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = hessian / (scale[..., :, None] * scale[..., None, :])
     # The floor keeps an exactly singular system solvable; it is far below the data's weight.
-    scaled[..., size, size] = (1 + 1e-15 + damping)[..., None]
+    np.einsum('...ii->...i', scaled)[...] = (1 + 1e-15 + damping)[..., None]
     step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
     return step
 
@@ -135,6 +134,10 @@ def _take(arrays: Arrays, index: Index) -> Arrays:
     return tuple(array[index] for array in arrays)
 
 
-def _put(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> None:
+def _put(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> Arrays:
+    """Return arrays with the masked ones of the new rows, which go to `index`."""
+    if len(index) == len(arrays[0]):
+        return new
     for array, values in zip(arrays, new, strict=True):
         array[index] = values[mask]
+    return arrays

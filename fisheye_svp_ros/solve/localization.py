@@ -101,7 +101,7 @@ def _covariance(hessian: Array) -> tuple[Array, Mask]:
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scale = scale[..., :, None] * scale[..., None, :]
     relative = hessian / scale
-    relative[..., range(6), range(6)] = 1 + _FLOOR
+    np.einsum('...ii->...i', relative)[...] = 1 + _FLOOR
     inverse = np.linalg.inv(relative)
     # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
     spread = np.trace(inverse, axis1=-2, axis2=-1)
