@@ -30,6 +30,7 @@ _TURN = [
 ]
 _BY_POINT = np.array(_PLACE, dtype=float)
 _BY_CAMERA = np.array([-_BY_POINT, _TURN])  # which moves the other way
+_IMAGE = np.eye(2, 6, 4)  # the place itself, which `_by_turn` writes, too
 
 # Where there is no image, there is something to divide by zero.
 _quiet = np.errstate(divide='ignore', invalid='ignore')
@@ -50,7 +51,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
         rays = _meet(lens, _rows(points[part]), limited)
         height, _ = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
         valid[part] = rays.valid
-        _image(lens, height * rays.unit, rays.valid, uv[:, part])
+        _image(lens, rays, height, uv[:, part])
     return uv.T, valid
 
 
@@ -65,7 +66,7 @@ def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Ar
         rays = _meet(lens, local, limited)
         height, *parts = _derivatives(lens, rays)
         valid[part] = rays.valid
-        _image(lens, height * rays.unit, rays.valid, uv[:, part])
+        _image(lens, rays, height, uv[:, part])
         terms = np.empty((6, len(height)))
         _by_place(terms, rays, *parts)
         np.matmul(sums, terms, out=d_point[:, part])
@@ -78,16 +79,17 @@ def linearise_views(
 ) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise_views` says."""
     shape = points.shape[:2]
-    uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
-    d_pose, sums = np.empty((2, 6, *shape)), _by_camera(lens, rotation)
+    rows, valid = np.empty((14, *shape)), np.empty(shape, dtype=bool)
+    sums = _sums(lens, rotation)
     for part in _tiles(*shape):
         local = _seen(rotation, position, points, part)
         rays = _meet(lens, local, limited)
         height, *parts = _derivatives(lens, rays)
-        valid[part], out = rays.valid, d_pose[:, :, *part].transpose(2, 0, 1, 3)
-        place = _add_up(sums[part[0]], rays, local[2], height, *parts, out=out)
-        _image(lens, place, rays.valid, uv[:, *part])
-    return uv.transpose(1, 2, 0), valid, d_pose.reshape(6, 2, *shape).transpose(2, 3, 1, 0)
+        valid[part], out = rays.valid, rows[:, *part]
+        _add_up(sums[part[0]], rays, local[2], height, *parts, out=out.swapaxes(0, 1))
+        _centre(lens, rays.valid, out[12:])
+    d_pose = rows[:12].reshape(6, 2, *shape)
+    return rows[12:].transpose(1, 2, 0), valid, d_pose.transpose(2, 3, 1, 0)
 
 
 @_quiet
@@ -98,7 +100,7 @@ def pose_equations(
     points, uv, weight = seen
     systems, count = weight.shape
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
-    sums = _by_camera(lens, rotation)
+    sums, centre = _sums(lens, rotation), _pair(lens.cx, lens.cy, 3)
     for part in _tiles(systems, count):
         own, weights = part[0], weight[part]
         local = _seen(rotation, position, points, part)
@@ -106,15 +108,14 @@ def pose_equations(
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
         rays = _meet(lens, local, False)
         height, *parts = _derivatives(lens, rays)
-        rows = np.empty((len(weights), 14, weights.shape[1]))
-        off = rows[:, 12:].transpose(1, 0, 2)
-        _image(lens, height * rays.unit, rays.valid, off)
-        off -= uv[part].transpose(2, 0, 1)
-        off *= weights
         for factor in (height, *parts):
             factor *= weights
-        out = rows[:, :12].reshape(len(rows), 2, 6, -1)
-        _add_up(sums[own], rays, local[2], height, *parts, out=out)
+        rows = np.empty((len(weights), 14, weights.shape[1]))
+        _add_up(sums[own], rays, local[2], height, *parts, out=rows)
+        off = rows[:, 12:].transpose(1, 0, 2)
+        off -= (uv[part].transpose(2, 0, 1) - centre) * weights
+        if not rays.valid.all():
+            off[:, ~rays.valid] = np.nan
         cost[own] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
         # All seven times all seven would be BLAS's syrk, which is slower at this size.
@@ -176,32 +177,38 @@ def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, Array, Array, Arra
     )
 
 
-def _image(lens: Lens, place: Array, valid: Mask, out: Array) -> None:
-    """Write image points (2, ...), px, of places h/f in the image; NaN where there is none."""
-    np.multiply(place, _pair(lens.fx, lens.fy, out.ndim), out=out)
-    out += _pair(lens.cx, lens.cy, out.ndim)
+def _image(lens: Lens, rays: Incidence, height: Array, out: Array) -> None:
+    """Write image points (2, M), px; NaN where there is none."""
+    np.multiply(height, rays.unit, out=out)
+    out *= _pair(lens.fx, lens.fy, 2)
+    _centre(lens, rays.valid, out)
+
+
+def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
+    """Move image points (2, ...), px, from around the origin; NaN where there is none."""
+    uv += _pair(lens.cx, lens.cy, uv.ndim)
     if not valid.all():
-        out[:, ~valid] = np.nan
+        uv[:, ~valid] = np.nan
 
 
 def _add_up(
     sums: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
     fall: Array, *, out: Array,
-) -> Array:
-    """Write derivatives by place and by turn (S, 2, 6, N); return places h/f in the image."""
+) -> None:
+    """Write derivatives by place and by turn, and image points around the origin (S, 14, N)."""
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
     by_system = terms.swapaxes(0, 1)
     _by_place(terms, rays, across, along, fall)
-    np.matmul(sums[:, 0], by_system, out=out[:, 0])
+    np.matmul(sums[:, :6], by_system, out=out[:, :6])
     _by_turn(terms, rays, z, height, across, along, fall)
-    np.matmul(sums[:, 1], by_system, out=out[:, 1])
-    return terms[4:]
+    np.matmul(sums[:, 6:], by_system, out=out[:, 6:])
 
 
 def _by_place(terms: Array, rays: Incidence, across: Array, along: Array, fall: Array) -> None:
     """Write what derivatives by place are sums of (6, ...)."""
     terms[0], terms[1] = across, along
-    np.multiply(along * rays.unit[0], rays.unit, out=terms[2:4])
+    np.multiply(along, rays.unit, out=terms[2:4])
+    terms[2:4] *= rays.unit[0]
     np.multiply(fall, rays.unit, out=terms[4:])
 
 
@@ -209,22 +216,28 @@ def _by_turn(
     terms: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
     fall: Array,
 ) -> None:
-    """Write what derivatives by turn are sums of (6, ...)."""
+    """Write what derivatives by turn are sums of (6, ...); fall is used up."""
     level, tilted = terms[:2]
     np.multiply(across, z, out=level)
     np.multiply(along, z, out=tilted)
-    tilted += fall * rays.radius
-    np.multiply(tilted * rays.unit[0], rays.unit, out=terms[2:4])
+    fall *= rays.radius
+    tilted += fall
+    np.multiply(tilted, rays.unit, out=terms[2:4])
+    terms[2:4] *= rays.unit[0]
     np.multiply(height, rays.unit, out=terms[4:])
 
 
-def _by_camera(lens: Lens, rotation: Array) -> Array:
-    """Return which sums of terms are the derivatives by the changes of cameras (S, 2, 6, 6).
+def _sums(lens: Lens, rotation: Array) -> Array:
+    """Return which sums of terms are the rows that `_add_up` writes (S, 14, 6).
 
-    By place and by turn; by x of u, of v, by y, ...; the terms.
+    By place: by x of u, of v, by y, ...; then by turn; then u, v themselves.
     """
-    sums = (_BY_CAMERA * _pair(lens.fx, lens.fy, 2)).reshape(2, 3, 12)
-    return (rotation[:, None] @ sums).reshape(-1, 2, 6, 6)
+    focal = _pair(lens.fx, lens.fy, 2)
+    sums = np.empty((len(rotation), 14, 6))
+    turned = rotation[:, None] @ (_BY_CAMERA * focal).reshape(2, 3, 12)
+    sums[:, :12] = turned.reshape(-1, 12, 6)
+    sums[:, 12:] = _IMAGE * focal
+    return sums
 
 
 def _pair(u: float, v: float, dimensions: int) -> Array:

@@ -53,15 +53,14 @@ def meet(lens: Lens, local: Array, limited: bool) -> Incidence:
     distance = z * z
     distance += r2
     r, distance = np.sqrt(r2, out=r2), np.sqrt(distance, out=distance)
-    scale = 1.0 / distance
-    theta, sin, cos = np.arctan2(r, z), r * scale, z * scale
+    theta, sin, cos = np.arctan2(r, z), r / distance, z / distance
     clearance = distance
     if lens.viewpoint_shift is not None:
         theta, sin, cos, clearance = _past_shift(lens, r, z, distance, (theta, sin, cos))
     valid = clearance > CLEAR
     valid &= theta <= edge(lens, limited)
     unit = local[:2]
-    unit *= 1.0 / r
+    unit /= r
     return Incidence(theta, sin, cos, unit, r, clearance, valid)
 
 
