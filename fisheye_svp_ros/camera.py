@@ -98,7 +98,9 @@ def project(lens: Lens, points: Array, limited: bool = True) -> Image:
 def project_with_jacobian(lens: Lens, points: Array, limited: bool = True) -> LinearImage:
     """Project points (..., 3), m, and differentiate by the point and by both lens curves."""
     shape = points.shape[:-1]
-    uv, valid, d_point = engines.linearise(lens, points.reshape(-1, 3), limited)
+    still = np.eye(3)[None], np.zeros((1, 3))
+    uv, valid, d_pose = engines.linearise_views(lens, *still, points.reshape(1, -1, 3), limited)
+    d_point = -d_pose[..., :3]  # the camera moves the other way
     return LinearImage(lens, points, limited, uv.reshape(*shape, 2), valid.reshape(shape),
                        d_point.reshape(*shape, 2, 3))
 

@@ -58,16 +58,21 @@ def points_of_all_kinds(lens):
 
 @pytest.mark.parametrize('lens', LENSES)
 @pytest.mark.parametrize('limited', [True, False])
-def test_projection_and_derivatives_by_the_point(compiled, lens, limited):
+def test_projection_and_derivatives_of_any_point(compiled, lens, limited):
     points = points_of_all_kinds(lens)
-    for name in ('project', 'linearise'):
-        expected = getattr(numpy_engine, name)(lens, points, limited)
-        found = getattr(compiled, name)(lens, points, limited)
-        both_equal(expected[:2], found[:2], scale=lens.fx)
-        if name == 'linearise':
-            seen = expected[1]
-            size = np.abs(expected[2][seen]).max(axis=(1, 2), keepdims=True)
-            both_equal([expected[2][seen] / size], [found[2][seen] / size])
+    projected, expected, found = (
+        numpy_engine.project(lens, points, limited), *(
+            [part[0] for part in engine.linearise_views(lens, *identity(1), points[None], limited)]
+            for engine in (numpy_engine, compiled)
+        )
+    )
+    both_equal(projected, compiled.project(lens, points, limited), scale=lens.fx)
+    some = np.isfinite(points).all(axis=1)  # no rotation turns a point at infinity
+    both_equal([p[some] for p in projected], [e[some] for e in expected[:2]], scale=lens.fx)
+    both_equal(expected[:2], found[:2], scale=lens.fx)
+    seen = expected[1]
+    size = np.abs(expected[2][seen]).max(axis=(1, 2), keepdims=True)
+    both_equal([expected[2][seen] / size], [found[2][seen] / size])
 
 
 @pytest.mark.parametrize('count', [0, 1, 33, 255, 256, 257, 20_000])
@@ -88,8 +93,9 @@ def test_any_number_of_threads(compiled, monkeypatch, threads):
     points = points_on_rays(FISH214, np.random.default_rng(93), 100_001, nearest=0.3)
     both_equal(numpy_engine.project(FISH214, points, True),
                compiled.project(FISH214, points, True), scale=1e3)
-    both_equal(numpy_engine.linearise(FISH214, points, True),
-               compiled.linearise(FISH214, points, True), scale=1e3)
+    views = *identity(1000), points[1:].reshape(1000, 100, 3)
+    both_equal(numpy_engine.linearise_views(FISH214, *views, True),
+               compiled.linearise_views(FISH214, *views, True), scale=1e3)
 
 
 def views_and_poses(count, points=33):
@@ -166,7 +172,10 @@ def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
     lens = replace(FISH214, viewpoint_shift=shift)
     points = points_around(np.random.default_rng(96), 50, 0.3, 2.0, 90.0)
     assert compiled.packed(lens) is None
-    both_equal(numpy_engine.linearise(lens, points, True), compiled.linearise(lens, points, True))
+    both_equal(numpy_engine.project(lens, points, True), compiled.project(lens, points, True))
+    views = *identity(1), points[None]
+    both_equal(numpy_engine.linearise_views(lens, *views, True),
+               compiled.linearise_views(lens, *views, True))
 
 
 def test_many_lenses_in_turn_are_not_mixed_up(compiled):

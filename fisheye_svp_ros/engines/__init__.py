@@ -60,12 +60,6 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     return uv, valid
 
 
-def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
-    """Return what `project` does, and the derivatives (M, 2, 3) by the point, px/m."""
-    uv, valid, d_point = _engine.linearise(lens, points, limited)
-    return uv, valid, d_point
-
-
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:

@@ -122,25 +122,6 @@ def project(points, lens, edge, uv, state):
         _write(w, n, uv[start:], state[start:])
 
 
-@_entry(types.void, _in(2), *_LENS, _out(2), _out(1), _out(3), types.int64)
-def linearise(points, lens, edge, uv, state, d_point, first):
-    """Write also derivatives (2, 3, M') by the point, from the column `first` on."""
-    w = np.empty(SCRATCH)
-    for start in range(0, len(points), B):
-        n = min(B, len(points) - start)
-        _take(w, n, points[start:])
-        meet(w, n, lens, edge)
-        image(w, n, lens)
-        derivatives(w, n, lens)
-        _write(w, n, uv[start:], state[start:])
-        for row in range(2):
-            for axis in range(3):
-                at, out = ROW + row * ROWS + axis * B, d_point[row, axis, first + start:]
-                source = w[at:at + B]
-                for i in range(n):
-                    out[i] = source[i]
-
-
 @_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
 def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
     """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""

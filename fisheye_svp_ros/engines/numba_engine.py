@@ -48,28 +48,6 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     return uv, state > 0
 
 
-def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
-    """Do as `engines.linearise` says."""
-    numbers = packed(lens)
-    if numbers is None:
-        return numpy_engine.linearise(lens, points, limited)
-    points, limit = np.ascontiguousarray(points, dtype=float), edge(lens, limited)
-    count = len(points)
-    uv, state, d_point = np.empty((count, 2)), np.empty(count), np.empty((2, 3, count))
-
-    def run(part: slice) -> None:
-        entries.linearise(
-            points[part], numbers, limit, uv[part], state[part], d_point, part.start
-        )
-
-    _spread(run, count, count)
-    by_point = np.moveaxis(d_point, -1, 0)
-    left = _left(state, numbers)
-    if left is not None:
-        uv[left], state[left], by_point[left] = numpy_engine.linearise(lens, points[left], limited)
-    return uv, state > 0, by_point
-
-
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:

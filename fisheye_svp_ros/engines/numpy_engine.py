@@ -18,18 +18,17 @@ _BLOCK = 14_000  # points; rows a power of two apart would share the same lines 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
 # camera frame, or by a turn of the points about these axes; of u, v; what `_by_place` and
 # `_by_turn` write.
-_PLACE = [
+_PLACE = np.array([
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
     [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
     [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
-]
-_TURN = [
+], dtype=float)
+_TURN = np.array([
     [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
     [[-1, 0, -1, 0, 0, 0], [0, 0, 0, -1, 0, 0]],
     [[0, 0, 0, 0, 0, 1], [0, 0, 0, 0, -1, 0]],
-]
-_BY_POINT = np.array(_PLACE, dtype=float)
-_BY_CAMERA = np.array([-_BY_POINT, _TURN])  # which moves the other way
+], dtype=float)
+_BY_CAMERA = np.array([-_PLACE, _TURN])  # which moves the other way
 _IMAGE = np.eye(2, 6, 4)  # the place itself, which `_by_turn` writes, too
 
 # Where there is no image, there is something to divide by zero.
@@ -51,26 +50,10 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
         rays = _meet(lens, _rows(points[part]), limited)
         height, _ = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
         valid[part] = rays.valid
-        _image(lens, rays, height, uv[:, part])
+        np.multiply(height, rays.unit, out=uv[:, part])
+        uv[:, part] *= _pair(lens.fx, lens.fy, 2)
+        _centre(lens, rays.valid, uv[:, part])
     return uv.T, valid
-
-
-@_quiet
-def linearise(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask, Array]:
-    """Do as `engines.linearise` says."""
-    count = len(points)
-    uv, valid, d_point = np.empty((2, count)), np.empty(count, dtype=bool), np.empty((6, count))
-    sums = (_BY_POINT * _pair(lens.fx, lens.fy, 2)).reshape(6, 6)
-    for part in _blocks(count):
-        local = _rows(points[part])
-        rays = _meet(lens, local, limited)
-        height, *parts = _derivatives(lens, rays)
-        valid[part] = rays.valid
-        _image(lens, rays, height, uv[:, part])
-        terms = np.empty((6, len(height)))
-        _by_place(terms, rays, *parts)
-        np.matmul(sums, terms, out=d_point[:, part])
-    return uv.T, valid, d_point.reshape(3, 2, count).T
 
 
 @_quiet
@@ -175,13 +158,6 @@ def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, Array, Array, Arra
     return height, *point_derivatives(
         height, slope, rays.sin, rays.cos, rays.radius, rays.clearance
     )
-
-
-def _image(lens: Lens, rays: Incidence, height: Array, out: Array) -> None:
-    """Write image points (2, M), px; NaN where there is none."""
-    np.multiply(height, rays.unit, out=out)
-    out *= _pair(lens.fx, lens.fy, 2)
-    _centre(lens, rays.valid, out)
 
 
 def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
