@@ -13,7 +13,7 @@ from fisheye_svp_ros.engines.rays import Incidence, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
 
-_BLOCK = 14_000  # points; rows a power of two apart would share the same lines of the cache
+_BLOCK = 16_700  # points; rows a power of two apart would share the same lines of the cache
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
 # camera frame, or by a turn of the points about these axes; of u, v; what `_by_place` and
