@@ -24,11 +24,11 @@ Written by `make bench`, which runs `{command}` in an environment of its own
 All sides of a table do the same work with the same lens (of `config/lenses`), the same data with
 {noise} px of noise, and the same start unless a note says otherwise; they run in one process in
 turns of 20 ms or, where that takes longer, of one call, on one core unless said otherwise. Figures
-are medians over the turns, of processor time unless said otherwise. "Off" is the largest distance of a result from that of the common answer:
-image points from those of the NumPy engine, poses and rigs from those of SciPy's `least_squares`
-with tolerances of 1e-14 and a last Gauss-Newton step (SciPy compares sums of squares, which cannot
-tell poses 1e-10 m apart). Ratios say how many times faster the package is than the peer in that
-line.
+are medians over the turns, of processor time unless said otherwise. "Off" is the largest distance
+of a result from that of the common answer: image points from those of the NumPy engine, poses and
+rigs from those of SciPy's `least_squares` with tolerances of 1e-14 and a last Gauss-Newton step
+(SciPy compares sums of squares, which cannot tell poses 1e-10 m apart). Ratios say how many times
+faster the package is than the peer in that line.
 """
 
 
