@@ -16,8 +16,7 @@ from fisheye_svp_ros.lens import Lens
 _BLOCK = 16_700  # points; rows a power of two apart would share the same lines of the cache
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
-# camera frame, or by a turn of the points about these axes; of u, v; what `_by_place` and
-# `_by_turn` write.
+# camera frame, or by a turn of the points about these axes; of u, v; the terms of `_add_up`.
 _PLACE = np.array([
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
     [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
@@ -29,7 +28,7 @@ _TURN = np.array([
     [[0, 0, 0, 0, 0, 1], [0, 0, 0, 0, -1, 0]],
 ], dtype=float)
 _BY_CAMERA = np.array([-_PLACE, _TURN])  # which moves the other way
-_IMAGE = np.eye(2, 6, 4)  # the place itself, which `_by_turn` writes, too
+_IMAGE = np.eye(2, 6, 4)  # the place itself: the last terms by turn
 
 # Where there is no image, there is something to divide by zero.
 _quiet = np.errstate(divide='ignore', invalid='ignore')
@@ -171,28 +170,17 @@ def _add_up(
     sums: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
     fall: Array, *, out: Array,
 ) -> None:
-    """Write derivatives by place and by turn, and image points around the origin (S, 14, N)."""
+    """Write derivatives by place and by turn, and image points around the origin (S, 14, N).
+
+    `fall` is used up.
+    """
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
     by_system = terms.swapaxes(0, 1)
-    _by_place(terms, rays, across, along, fall)
-    np.matmul(sums[:, :6], by_system, out=out[:, :6])
-    _by_turn(terms, rays, z, height, across, along, fall)
-    np.matmul(sums[:, 6:], by_system, out=out[:, 6:])
-
-
-def _by_place(terms: Array, rays: Incidence, across: Array, along: Array, fall: Array) -> None:
-    """Write what derivatives by place are sums of (6, ...)."""
     terms[0], terms[1] = across, along
     np.multiply(along, rays.unit, out=terms[2:4])
     terms[2:4] *= rays.unit[0]
     np.multiply(fall, rays.unit, out=terms[4:])
-
-
-def _by_turn(
-    terms: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
-    fall: Array,
-) -> None:
-    """Write what derivatives by turn are sums of (6, ...); fall is used up."""
+    np.matmul(sums[:, :6], by_system, out=out[:, :6])
     level, tilted = terms[:2]
     np.multiply(across, z, out=level)
     np.multiply(along, z, out=tilted)
@@ -201,6 +189,7 @@ def _by_turn(
     np.multiply(tilted, rays.unit, out=terms[2:4])
     terms[2:4] *= rays.unit[0]
     np.multiply(height, rays.unit, out=terms[4:])
+    np.matmul(sums[:, 6:], by_system, out=out[:, 6:])
 
 
 def _sums(lens: Lens, rotation: Array) -> Array:

@@ -47,12 +47,10 @@ def meet(lens: Lens, local: Array, limited: bool) -> Incidence:
 
     limited: see `edge`.  Of `local` only the last row stays what it is.
     """
-    x, y, z = local
-    r2 = x * x
-    r2 += y * y
-    distance = z * z
-    distance += r2
-    r, distance = np.sqrt(r2, out=r2), np.sqrt(distance, out=distance)
+    squares, z = local * local, local[2]
+    squares[0] += squares[1]
+    squares[2] += squares[0]
+    r, distance = np.sqrt(squares[::2], out=squares[::2])
     theta, sin, cos = np.arctan2(r, z), r / distance, z / distance
     clearance = distance
     if lens.viewpoint_shift is not None:
