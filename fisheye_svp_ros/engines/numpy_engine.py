@@ -61,17 +61,17 @@ def linearise_views(
 ) -> tuple[Array, Mask, Array]:
     """Do as `engines.linearise_views` says."""
     shape = points.shape[:2]
-    rows, valid = np.empty((14, *shape)), np.empty(shape, dtype=bool)
-    sums = _sums(lens, rotation)
+    uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
+    d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
     for part in _tiles(*shape):
         local = _seen(rotation, position, points, part)
         rays = _meet(lens, local, limited)
-        height, *parts = _derivatives(lens, rays)
-        valid[part], out = rays.valid, rows[:, *part]
-        _add_up(sums[part[0]], rays, local[2], height, *parts, out=out.swapaxes(0, 1))
-        _centre(lens, rays.valid, out[12:])
-    d_pose = rows[:12].reshape(6, 2, *shape)
-    return rows[12:].transpose(1, 2, 0), valid, d_pose.transpose(2, 3, 1, 0)
+        out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
+        _add_up(sums[part[0]], rays, local[2], _derivatives(lens, rays), *out)
+        _centre(lens, rays.valid, uv[:, *part])
+        valid[part] = rays.valid
+    d_pose = d_pose.reshape(6, 2, *shape)
+    return uv.transpose(1, 2, 0), valid, d_pose.transpose(2, 3, 1, 0)
 
 
 @_quiet
@@ -89,11 +89,11 @@ def pose_equations(
         if not weights.all():
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
         rays = _meet(lens, local, False)
-        height, *parts = _derivatives(lens, rays)
-        for factor in (height, *parts):
+        parts = _derivatives(lens, rays)
+        for factor in parts:
             factor *= weights
         rows = np.empty((len(weights), 14, weights.shape[1]))
-        _add_up(sums[own], rays, local[2], height, *parts, out=rows)
+        _add_up(sums[own], rays, local[2], parts, rows[:, :12], rows[:, 12:])
         off = rows[:, 12:].transpose(1, 0, 2)
         off -= (uv[part].transpose(2, 0, 1) - centre) * weights
         if not rays.valid.all():
@@ -167,20 +167,20 @@ def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
 
 
 def _add_up(
-    sums: Array, rays: Incidence, z: Array, height: Array, across: Array, along: Array,
-    fall: Array, *, out: Array,
+    sums: Array, rays: Incidence, z: Array, parts: tuple[Array, ...], d_pose: Array, uv: Array
 ) -> None:
-    """Write derivatives by place and by turn, and image points around the origin (S, 14, N).
+    """Write derivatives by place and by turn (S, 12, N), and image points around the origin.
 
-    `fall` is used up.
+    parts: of `_derivatives`, the last of which is used up; uv (S, 2, N).
     """
+    height, across, along, fall = parts
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
     by_system = terms.swapaxes(0, 1)
     terms[0], terms[1] = across, along
     np.multiply(along, rays.unit, out=terms[2:4])
     terms[2:4] *= rays.unit[0]
     np.multiply(fall, rays.unit, out=terms[4:])
-    np.matmul(sums[:, :6], by_system, out=out[:, :6])
+    np.matmul(sums[:, :6], by_system, out=d_pose[:, :6])
     level, tilted = terms[:2]
     np.multiply(across, z, out=level)
     np.multiply(along, z, out=tilted)
@@ -189,7 +189,8 @@ def _add_up(
     np.multiply(tilted, rays.unit, out=terms[2:4])
     terms[2:4] *= rays.unit[0]
     np.multiply(height, rays.unit, out=terms[4:])
-    np.matmul(sums[:, 6:], by_system, out=out[:, 6:])
+    np.matmul(sums[:, 6:12], by_system, out=d_pose[:, 6:])
+    np.matmul(sums[:, 12:], by_system, out=uv)
 
 
 def _sums(lens: Lens, rotation: Array) -> Array:
