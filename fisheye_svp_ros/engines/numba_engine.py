@@ -56,7 +56,7 @@ def linearise_views(
     if numbers is None:
         return numpy_engine.linearise_views(lens, rotation, position, points, limited)
     systems, count = points.shape[:2]
-    rotation, position, points = map(np.ascontiguousarray, (rotation, position, points))
+    rotation, position, points = _contiguous(rotation, position, points)
     uv, state = np.empty((systems, count, 2)), np.empty((systems, count))
     d_pose, limit = np.empty((systems, 2, 6, count)), edge(lens, limited)
 
@@ -86,7 +86,7 @@ def localize(
     if numbers is None:
         return None
     systems, count = row.shape
-    given = [np.ascontiguousarray(array) for array in (*seen, row)]
+    given = _contiguous(*seen, row)
     found = Localization(
         Pose(start.rotation.copy(), start.position.copy()), np.empty((systems, 6, 6)),
         np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.bool_),
@@ -120,7 +120,7 @@ def adjust_rigs(
         (views, *square), (views, *square), square, (views, 6), (6,)
     ))
     lost = entries.adjust_rigs(
-        *_contiguous(seen[0]), left, *_contiguous(seen[1]), right, *state, whole, iterations,
+        *_contiguous(*seen[0]), left, *_contiguous(*seen[1]), right, *state, whole, iterations,
         ended, *normal
     )
     return None if lost else Rigs(state, whole, iterations, normal)
@@ -157,9 +157,8 @@ def _pack(lens: Lens) -> Array | None:
     return numbers
 
 
-def _contiguous(arrays: Seen) -> Seen:
-    points, uv, weight = map(np.ascontiguousarray, arrays)
-    return points, uv, weight
+def _contiguous(*arrays: Any) -> list[Any]:
+    return [np.ascontiguousarray(array) for array in arrays]
 
 
 def _left(state: Array, numbers: Array) -> tuple[Index, ...] | None:

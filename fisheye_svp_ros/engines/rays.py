@@ -114,10 +114,10 @@ def _newton(
         step, clearance = approach(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
         theta += step
     # The last step is so small that sine and cosine follow it in a straight line.
-    sin_step, cos_step = step * cos, step * sin
-    sin_step += sin
-    cos -= cos_step
-    found = (theta, sin_step, cos, clearance, np.abs(step, out=step) < SETTLED)
+    turned = step * cos
+    turned += sin
+    cos -= step * sin
+    found = (theta, turned, cos, clearance, np.abs(step, out=step) < SETTLED)
     late = ~found[-1]
     if more and late.any():
         start = theta[late], *_sine_and_cosine(theta[late])

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.solve.least_squares import Arrays
+from fisheye_svp_ros.solve.least_squares import Arrays, with_unit_diagonal
 
-_FLOOR = 1e-15  # keeps an exactly singular block solvable; far below any data's weight
 _SINGULAR = 1e-14  # relative eigenvalue below which shared parameters are left where they are
 
 
@@ -107,11 +106,8 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
 
 def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
     """Scale to a unit diagonal and damp it; return also the scales (S, V, B) and (S, K)."""
-    block_scale, shared_scale = _scale(equations.blocks), _scale(equations.shared)
-    blocks = equations.blocks / (block_scale[..., :, None] * block_scale[..., None, :])
-    shared = equations.shared / (shared_scale[:, :, None] * shared_scale[:, None, :])
-    np.einsum('svbb->svb', blocks)[...] = (1 + _FLOOR + damping)[:, None, None]
-    np.einsum('skk->sk', shared)[...] = (1 + _FLOOR + damping)[:, None]
+    blocks, block_scale = with_unit_diagonal(equations.blocks, damping[:, None])
+    shared, shared_scale = with_unit_diagonal(equations.shared, damping)
     scaled = ArrowEquations(
         blocks,
         equations.cross / (block_scale[..., :, None] * shared_scale[:, None, None, :]),
@@ -120,11 +116,6 @@ def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, 
         equations.shared_gradient / shared_scale,
     )
     return scaled, block_scale, shared_scale
-
-
-def _scale(hessian: Array) -> Array:
-    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
-    return np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
 
 
 def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:

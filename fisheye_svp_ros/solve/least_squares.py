@@ -19,6 +19,7 @@ ROUNDING = 1e-13
 NOISE = 1e-11
 STUCK = 1e12
 _LEAST = 1e-300  # what is divided by in place of 0
+_FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 
 
 class Problem(Protocol):
@@ -56,8 +57,8 @@ def levenberg_marquardt(
     """Minimise every system from its own start, with a damping of its own.
 
     Source: Marquardt's scaling with Nielsen's damping (IMM-REP-1999-05, section 3).  A step that
-    leaves the domain of the lens costs infinity and is refused; one too small to matter is taken
-    without another look, and is the last.
+    leaves the domain of the lens costs infinity and is refused; one too small to matter, or after
+    which the next would be, is taken without another look, and is the last.
     """
     systems = start[0].shape[0]
     state = tuple(array.copy() for array in start)
@@ -105,13 +106,21 @@ def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
 
     A parameter that nothing depends on stays where it is.
     """
+    scaled, scale = with_unit_diagonal(hessian, damping)
+    step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
+    return step
+
+
+def with_unit_diagonal(hessian: Array, damping: Array | float) -> tuple[Array, Array]:
+    """Return H (..., P, P) scaled to a unit diagonal and damped, and the scale (..., P).
+
+    damping (...): added to the diagonal.
+    """
     diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = hessian / (scale[..., :, None] * scale[..., None, :])
-    # The floor keeps an exactly singular system solvable; it is far below the data's weight.
-    np.einsum('...ii->...i', scaled)[...] = (1 + 1e-15 + damping)[..., None]
-    step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
-    return step
+    np.einsum('...ii->...i', scaled)[...] = np.asarray(1 + _FLOOR + damping)[..., None]
+    return scaled, scale
 
 
 def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:

@@ -12,11 +12,15 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
+from fisheye_svp_ros.solve.least_squares import (
+    Arrays,
+    dense_step,
+    levenberg_marquardt,
+    with_unit_diagonal,
+)
 
 MIN_POINTS = 4
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
-_FLOOR = 1e-15  # keeps an exactly singular information invertible
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -97,15 +101,12 @@ def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
 
 def _covariance(hessian: Array) -> tuple[Array, Mask]:
     """Return the inverses of information (S, 6, 6), and which (S,) are determined."""
-    diagonal = np.diagonal(hessian, axis1=-2, axis2=-1)
-    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scale = scale[..., :, None] * scale[..., None, :]
-    relative = hessian / scale
-    np.einsum('...ii->...i', relative)[...] = 1 + _FLOOR
+    relative, scale = with_unit_diagonal(hessian, 0.0)
     inverse = np.linalg.inv(relative)
     # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
     spread = np.trace(inverse, axis1=-2, axis2=-1)
-    return inverse / scale, (spread > 0) & (spread < 1 / _UNDETERMINED)
+    outer = scale[..., :, None] * scale[..., None, :]
+    return inverse / outer, (spread > 0) & (spread < 1 / _UNDETERMINED)
 
 
 class _Localization:
