@@ -20,7 +20,7 @@ import numpy as np
 
 from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.engines.rays import Incidence as Incidence
+from fisheye_svp_ros.engines.answers import Incidence as Incidence
 from fisheye_svp_ros.engines.rays import caustic_range
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.lens import Lens

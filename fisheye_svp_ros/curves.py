@@ -16,7 +16,8 @@ import numpy as np
 from fisheye_svp_ros import formulas
 from fisheye_svp_ros.arrays import Array
 
-# (theta, sin, cos, *coefficients) -> value and slope; of a shift: value and slope times sin
+# Of a height, (theta, *coefficients) or (sin, cos) -> value and slope; of a shift, (theta, sin,
+# cos, *coefficients) -> value and slope times sin
 Formula = Callable[..., tuple[Array, Array]]
 
 
@@ -36,7 +37,7 @@ class ImageHeight(Protocol):
         """Largest incidence angle up to which the height grows, rad."""
 
     def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        """Return h/f and its derivative with respect to theta."""
+        """Return h/f and its derivative with respect to theta, in arrays of their own."""
 
     def angle(self, height: Array) -> Array:
         """Return theta of heights h/f within the monotone range; anything beyond it."""
@@ -76,14 +77,22 @@ class _Height:
         return tuple(getattr(self, name) for name in self.coefficient_names)
 
     def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
-        return self.formula(theta, np.sin(theta), np.cos(theta), *self.coefficients)
+        return self.formula(theta, *self.coefficients)
 
     def columns(self, theta: Array) -> Array:
         return np.empty((*np.shape(theta), 0))
 
 
+class Trigonometric(_Height):
+    """An image height whose formula has sine and cosine of theta alone."""
+
+    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
+        """Do as `ImageHeight.value_and_slope` says."""
+        return self.formula(np.sin(theta), np.cos(theta))
+
+
 @dataclass(frozen=True)
-class Orthographic(_Height):
+class Orthographic(Trigonometric):
     """h = f sin(theta)."""
 
     limit: ClassVar[float] = np.pi / 2
@@ -105,7 +114,7 @@ class Equidistant(_Height):
 
 
 @dataclass(frozen=True)
-class Equisolid(_Height):
+class Equisolid(Trigonometric):
     """h = 2 f sin(theta / 2)."""
 
     limit: ClassVar[float] = np.pi
@@ -116,7 +125,7 @@ class Equisolid(_Height):
 
 
 @dataclass(frozen=True)
-class Stereographic(_Height):
+class Stereographic(Trigonometric):
     """h = 2 f tan(theta / 2)."""
 
     limit: ClassVar[float] = np.pi
@@ -211,16 +220,6 @@ class FlatPort(_Shift):
         cos, n = np.cos(theta), self.refractive_index
         root = np.sqrt(n * n - np.sin(theta) ** 2)
         return np.stack([1 - cos / root, self.thickness * cos * n / root**3], axis=-1)
-
-
-def height_at(
-    curve: ImageHeight, theta: Array, sin: Array, cos: Array
-) -> tuple[Array, Array]:
-    """Return h/f and its derivative where sine and cosine are at hand."""
-    formula: Formula | None = getattr(curve, 'formula', None)
-    if formula is None:
-        return curve.value_and_slope(theta)
-    return formula(theta, sin, cos, *curve.coefficients)
 
 
 def shift_at(

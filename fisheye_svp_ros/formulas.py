@@ -1,8 +1,8 @@
 """The formulas of a lens, point by point: what every engine computes, written once.
 
 Each works alike on arrays and on single numbers, so that one engine can run them with NumPy and
-another can compile them.  What is changed in place is their own: NumPy is faster so.  Angles in
-rad, lengths in m; `sin` and `cos` are those of theta.
+another can compile them.  What is changed in place is their own, as what they return is the
+caller's: NumPy is faster so.  Angles in rad, lengths in m; `sin` and `cos` are those of theta.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from fisheye_svp_ros.arrays import Array
 NOWHERE = 1e-30  # m; added to X, it gives points on the axis a direction and changes no other
 
 
-def orthographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+def orthographic(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return sin(theta) and its derivative."""
-    return sin, cos
+    return sin * 1.0, cos * 1.0
 
 
-def equidistant(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+def equidistant(theta: Array) -> tuple[Array, Array]:
     """Return theta and its derivative."""
-    return theta, theta * 0.0 + 1.0
+    return theta * 1.0, theta * 0.0 + 1.0
 
 
-def equisolid(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+def equisolid(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 sin(theta / 2) and its derivative."""
     half_sin, half_cos = halved(sin, cos)
     return 2.0 * half_sin, half_cos
 
 
-def stereographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+def stereographic(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 tan(theta / 2) and its derivative."""
     half_sin, half_cos = halved(sin, cos)
     half_tan = half_sin / half_cos
@@ -38,7 +38,7 @@ def stereographic(theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
 
 
 def kannala_brandt(
-    theta: Array, sin: Array, cos: Array, k1: float, k2: float, k3: float, k4: float
+    theta: Array, k1: float, k2: float, k3: float, k4: float
 ) -> tuple[Array, Array]:
     """Return theta + k1 theta^3 + k2 theta^5 + k3 theta^7 + k4 theta^9 and its derivative."""
     z = theta * theta
@@ -119,12 +119,16 @@ def approach(
 
 
 def point_derivatives(
-    height: Array, slope: Array, sin: Array, cos: Array, r: Array, clearance: Array
+    ratio: Array, slope: Array, square: Array, outward: Array, axial: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the derivatives of h/f across, along (less across) and against the axis, 1/m."""
-    steep = slope / clearance
-    across = height / r
-    along = steep * cos
-    along -= across
-    steep *= sin
-    return across, along, steep
+    """Return how the image height h/f changes with a point, and how it bends the image.
+
+    ratio: h / (f r), 1/m; slope: of h/f by theta; square: r^2; outward: dtheta/dr; axial:
+    -dtheta/dZ / r.  Rise: dh/dr / f, 1/m; fall: -dh/dZ / (f r), 1/m^2; bend: that of the ratio
+    by r, over r, 1/m^3.  The last two that are given are used up.
+    """
+    outward *= slope
+    axial *= slope
+    bend = outward - ratio
+    bend /= square
+    return outward, axial, bend

@@ -15,8 +15,7 @@ from types import ModuleType
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.engines import cache, numpy_engine
-from fisheye_svp_ros.engines.answers import Localization, Rigs, Seen
-from fisheye_svp_ros.engines.rays import Incidence
+from fisheye_svp_ros.engines.answers import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.pose import Pose

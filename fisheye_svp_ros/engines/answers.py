@@ -11,6 +11,17 @@ from fisheye_svp_ros.pose import Pose
 Seen = tuple[Array, Array, Array]
 
 
+class Incidence(NamedTuple):
+    """Where points meet the lens, and whether they do.
+
+    theta (...), rad; unit (2, ...): direction of the image height; valid (...).
+    """
+
+    theta: Array
+    unit: Array
+    valid: Mask
+
+
 class Localization(NamedTuple):
     """Solved poses of S views.
 

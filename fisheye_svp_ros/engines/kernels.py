@@ -29,8 +29,8 @@ for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.approach, formulas.
     register_jitable(**OPTIONS)(formula)
 
 B = 248  # points in a block; rows a power of two apart would share the same lines of the cache
-(X, Y, Z, R, EX, EY, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, HEIGHT, SLOPE,
- U, V, ROW) = (B * i for i in range(20))
+(X, Y, Z, R, THETA0, SIN0, COS0, THETA, SIN, COS, TURN, CLEARANCE, STATE, RATIO, SLOPE,
+ U, V, ROW) = (B * i for i in range(18))
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
 GRAM = ROW + 2 * ROWS  # the upper triangle of 7 x 7, row by row, then room for `view_equations`
 SCRATCH = GRAM + 28 + 49 + 42
@@ -84,11 +84,10 @@ def meet(w, n, lens, edge):
         r, d = np.sqrt(r2), np.sqrt(r2 + z * z)
         half = 2.0 * _half_angle(r, d + abs(z))
         w[THETA0 + i] = w[THETA + i] = half if z >= 0.0 else np.pi - half
-        scale, inverse = 1.0 / d, 1.0 / r
-        w[SIN0 + i] = w[SIN + i] = r * scale
-        w[COS0 + i] = w[COS + i] = z * scale
+        inverse = 1.0 / d
+        w[SIN0 + i] = w[SIN + i] = r * inverse
+        w[COS0 + i] = w[COS + i] = z * inverse
         w[R + i], w[CLEARANCE + i] = r, d
-        w[EX + i], w[EY + i] = x * inverse, y * inverse
     if lens[SHIFT_KIND] >= 0:
         _past_shift(w, n, lens)
     for i in range(n):
@@ -144,32 +143,29 @@ def _approach(w, first, last, lens):
 
 @njit(**BARE)
 def image(w, n, lens):
-    """Write image heights, their slopes and image points."""
+    """Write image heights over the radius, slopes of the heights, and image points."""
     k, kind = lens[HEIGHT_K:], lens[HEIGHT_KIND]
     if kind == 0:
         for i in range(n):
-            w[HEIGHT + i], w[SLOPE + i] = formulas.orthographic(
-                w[THETA + i], w[SIN + i], w[COS + i])
+            w[RATIO + i], w[SLOPE + i] = formulas.orthographic(w[SIN + i], w[COS + i])
     elif kind == 1:
         for i in range(n):
-            w[HEIGHT + i], w[SLOPE + i] = formulas.equidistant(
-                w[THETA + i], w[SIN + i], w[COS + i])
+            w[RATIO + i], w[SLOPE + i] = formulas.equidistant(w[THETA + i])
     elif kind == 2:
         for i in range(n):
-            w[HEIGHT + i], w[SLOPE + i] = formulas.equisolid(
-                w[THETA + i], w[SIN + i], w[COS + i])
+            w[RATIO + i], w[SLOPE + i] = formulas.equisolid(w[SIN + i], w[COS + i])
     elif kind == 3:
         for i in range(n):
-            w[HEIGHT + i], w[SLOPE + i] = formulas.stereographic(
-                w[THETA + i], w[SIN + i], w[COS + i])
+            w[RATIO + i], w[SLOPE + i] = formulas.stereographic(w[SIN + i], w[COS + i])
     else:
         for i in range(n):
-            w[HEIGHT + i], w[SLOPE + i] = formulas.kannala_brandt(
-                w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1], k[2], k[3])
+            w[RATIO + i], w[SLOPE + i] = formulas.kannala_brandt(
+                w[THETA + i], k[0], k[1], k[2], k[3])
     fx, fy, cx, cy = lens[FX], lens[FY], lens[CX], lens[CY]
     for i in range(n):
-        w[U + i] = cx + fx * w[HEIGHT + i] * w[EX + i]
-        w[V + i] = cy + fy * w[HEIGHT + i] * w[EY + i]
+        w[RATIO + i] /= w[R + i]
+        w[U + i] = cx + fx * w[RATIO + i] * w[X + i]
+        w[V + i] = cy + fy * w[RATIO + i] * w[Y + i]
 
 
 @njit(**BARE)
@@ -177,25 +173,24 @@ def derivatives(w, n, lens):
     """Write derivatives by place and by turn in the camera frame, as `numpy_engine` does."""
     fx, fy = lens[FX], lens[FY]
     for i in range(n):
-        across, along, fall = formulas.point_derivatives(
-            w[HEIGHT + i], w[SLOPE + i], w[SIN + i], w[COS + i], w[R + i], w[CLEARANCE + i])
-        ex, ey, r, z = w[EX + i], w[EY + i], w[R + i], w[Z + i]
-        level, tilted = across * z, along * z + fall * r
-        eu, ev = fx * ex, fy * ey
-        steep, lean = along * eu, tilted * eu
-        w[ROW + i] = steep * ex + fx * across
-        w[ROW + B + i] = steep * ey
-        w[ROW + 2 * B + i] = -fall * eu
-        w[ROW + 3 * B + i] = lean * ey
-        w[ROW + 4 * B + i] = -lean * ex - fx * level
-        steep, lean = along * ev, tilted * ev
-        w[ROW + 7 * B + i] = steep * ex
-        w[ROW + 8 * B + i] = steep * ey + fy * across
-        w[ROW + 9 * B + i] = -fall * ev
-        w[ROW + 10 * B + i] = lean * ey + fy * level
-        w[ROW + 11 * B + i] = -lean * ex
-        w[ROW + 5 * B + i] = fx * w[HEIGHT + i] * ey
-        w[ROW + 12 * B + i] = -fy * w[HEIGHT + i] * ex
+        x, y, z, r, ratio = w[X + i], w[Y + i], w[Z + i], w[R + i], w[RATIO + i]
+        inverse = 1.0 / (w[CLEARANCE + i] * r)
+        _, fall, bend = formulas.point_derivatives(
+            ratio, w[SLOPE + i], r * r, w[COS + i] * r * inverse, w[SIN + i] * inverse)
+        turn, level = bend * z + fall, ratio * z
+        x2, y2, mixed = x * x, y * y, x * y
+        w[ROW + i] = fx * (ratio + x2 * bend)
+        w[ROW + B + i] = fx * mixed * bend
+        w[ROW + 2 * B + i] = -fx * x * fall
+        w[ROW + 3 * B + i] = fx * mixed * turn
+        w[ROW + 4 * B + i] = -fx * (level + x2 * turn)
+        w[ROW + 5 * B + i] = fx * y * ratio
+        w[ROW + 7 * B + i] = fy * mixed * bend
+        w[ROW + 8 * B + i] = fy * (ratio + y2 * bend)
+        w[ROW + 9 * B + i] = -fy * y * fall
+        w[ROW + 10 * B + i] = fy * (level + y2 * turn)
+        w[ROW + 11 * B + i] = -fy * mixed * turn
+        w[ROW + 12 * B + i] = -fy * x * ratio
 
 
 @njit(**BARE)

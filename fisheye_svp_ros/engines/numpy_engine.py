@@ -7,27 +7,26 @@ from collections.abc import Iterator
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.curves import height_at
-from fisheye_svp_ros.engines.answers import Seen
-from fisheye_svp_ros.engines.rays import Incidence, meet
+from fisheye_svp_ros.engines.answers import Incidence, Seen
+from fisheye_svp_ros.engines.rays import Meeting, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
 
 _BLOCK = 16_700  # points; rows a power of two apart would share the same lines of the cache
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
-# camera frame, or by a turn of the points about these axes; of u, v; the terms of `_add_up`.
+# camera frame, or by a turn of the point about these axes; of u, v; the terms of `_add_up`.
 _PLACE = np.array([
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
-    [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
+    [[0, 0, 0, 1, 0, 0], [0, 1, -1, 0, 0, 0]],
     [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
 ], dtype=float)
 _TURN = np.array([
-    [[0, 0, 0, 1, 0, 0], [1, 1, -1, 0, 0, 0]],
-    [[-1, 0, -1, 0, 0, 0], [0, 0, 0, -1, 0, 0]],
-    [[0, 0, 0, 0, 0, 1], [0, 0, 0, 0, -1, 0]],
+    [[0, 0, 0, -1, 0, 0], [-1, -1, 1, 0, 0, 0]],
+    [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
+    [[0, 0, 0, 0, 0, -1], [0, 0, 0, 0, 1, 0]],
 ], dtype=float)
-_BY_CAMERA = np.array([-_PLACE, _TURN])  # which moves the other way
+_BY_CAMERA = -np.array([_PLACE, _TURN])  # which moves the other way
 _IMAGE = np.eye(2, 6, 4)  # the place itself: the last terms by turn
 
 # Where there is no image, there is something to divide by zero.
@@ -37,8 +36,13 @@ _quiet = np.errstate(divide='ignore', invalid='ignore')
 @_quiet
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Do as `engines.incidence` says."""
-    parts = [_meet(lens, _rows(points[part]), limited) for part in _blocks(len(points))]
-    return Incidence(*(np.concatenate(field, axis=-1) for field in zip(*parts, strict=True)))
+    theta, valid = np.empty(len(points)), np.empty(len(points), dtype=bool)
+    unit = np.empty((2, len(points)))
+    for part in _blocks(len(points)):
+        met = _meet(lens, _rows(points[part]), limited)
+        theta[part], valid[part] = met.theta, met.valid
+        np.divide((met.x, met.y), met.r, out=unit[:, part])
+    return Incidence(theta, unit, valid)
 
 
 @_quiet
@@ -46,12 +50,14 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Do as `engines.project` says."""
     uv, valid = np.empty((2, len(points))), np.empty(len(points), dtype=bool)
     for part in _blocks(len(points)):
-        rays = _meet(lens, _rows(points[part]), limited)
-        height, _ = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
-        valid[part] = rays.valid
-        np.multiply(height, rays.unit, out=uv[:, part])
+        met = _meet(lens, _rows(points[part]), limited)
+        ratio, _ = met.height(lens.image_height)
+        ratio /= met.r
+        np.multiply(met.x, ratio, out=uv[0, part])
+        np.multiply(met.y, ratio, out=uv[1, part])
         uv[:, part] *= _pair(lens.fx, lens.fy, 2)
-        _centre(lens, rays.valid, uv[:, part])
+        _centre(lens, met.valid, uv[:, part])
+        valid[part] = met.valid
     return uv.T, valid
 
 
@@ -65,11 +71,11 @@ def linearise_views(
     d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
     for part in _tiles(*shape):
         local = _seen(rotation, position, points, part)
-        rays = _meet(lens, local, limited)
+        met = _meet(lens, local, limited)
         out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
-        _add_up(sums[part[0]], rays, local[2], _derivatives(lens, rays), *out)
-        _centre(lens, rays.valid, uv[:, *part])
-        valid[part] = rays.valid
+        _add_up(sums[part[0]], met, met.height(lens.image_height), *out)
+        _centre(lens, met.valid, uv[:, *part])
+        valid[part] = met.valid
     d_pose = d_pose.reshape(6, 2, *shape)
     return uv.transpose(1, 2, 0), valid, d_pose.transpose(2, 3, 1, 0)
 
@@ -88,16 +94,16 @@ def pose_equations(
         local = _seen(rotation, position, points, part)
         if not weights.all():
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
-        rays = _meet(lens, local, False)
-        parts = _derivatives(lens, rays)
-        for factor in parts:
-            factor *= weights
+        met = _meet(lens, local, False)
+        height, slope = met.height(lens.image_height)
+        height *= weights
+        slope *= weights
         rows = np.empty((len(weights), 14, weights.shape[1]))
-        _add_up(sums[own], rays, local[2], parts, rows[:, :12], rows[:, 12:])
+        _add_up(sums[own], met, (height, slope), rows[:, :12], rows[:, 12:])
         off = rows[:, 12:].transpose(1, 0, 2)
         off -= (uv[part].transpose(2, 0, 1) - centre) * weights
-        if not rays.valid.all():
-            off[:, ~rays.valid] = np.nan
+        if not met.valid.all():
+            off[:, ~met.valid] = np.nan
         cost[own] += np.einsum('usn,usn->s', off, off)
         flat = rows.reshape(len(rows), 7, -1)
         # All seven times all seven would be BLAS's syrk, which is slower at this size.
@@ -134,7 +140,7 @@ def _rows(points: Array) -> Array:
     return np.array(points.T, order='C')
 
 
-def _meet(lens: Lens, local: Array, limited: bool) -> Incidence:
+def _meet(lens: Lens, local: Array, limited: bool) -> Meeting:
     """Do as `rays.meet` does; moves points off the axis."""
     local[0] += NOWHERE
     return meet(lens, local, limited)
@@ -145,18 +151,11 @@ def _seen(
 ) -> Array:
     """Return a tile's points (3, S, N) in the frames of their cameras."""
     own, seen = part[0], points[part].transpose(2, 0, 1)
-    arm = np.subtract(seen, position[own].T[..., None], order='C')
+    arm = np.array(seen, order='C')  # faster copied than subtracted
+    arm -= position[own].T[..., None]
     local = np.empty_like(arm)
     np.matmul(rotation[own].swapaxes(1, 2), arm.swapaxes(0, 1), out=local.swapaxes(0, 1))
     return local
-
-
-def _derivatives(lens: Lens, rays: Incidence) -> tuple[Array, Array, Array, Array]:
-    """Return the image height and what `formulas.point_derivatives` does."""
-    height, slope = height_at(lens.image_height, rays.theta, rays.sin, rays.cos)
-    return height, *point_derivatives(
-        height, slope, rays.sin, rays.cos, rays.radius, rays.clearance
-    )
 
 
 def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
@@ -167,28 +166,32 @@ def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
 
 
 def _add_up(
-    sums: Array, rays: Incidence, z: Array, parts: tuple[Array, ...], d_pose: Array, uv: Array
+    sums: Array, met: Meeting, height: tuple[Array, Array], d_pose: Array, uv: Array
 ) -> None:
     """Write derivatives by place and by turn (S, 12, N), and image points around the origin.
 
-    parts: of `_derivatives`, the last of which is used up; uv (S, 2, N).
+    height: of `Meeting.height`, used up; uv (S, 2, N).
     """
-    height, across, along, fall = parts
+    ratio, slope = height
+    ratio /= met.r
+    rise, fall, bend = point_derivatives(ratio, slope, met.r2, *met.change())
+    x, y, z, mixed = met.x, met.y, met.z, met.x * met.y
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
     by_system = terms.swapaxes(0, 1)
-    terms[0], terms[1] = across, along
-    np.multiply(along, rays.unit, out=terms[2:4])
-    terms[2:4] *= rays.unit[0]
-    np.multiply(fall, rays.unit, out=terms[4:])
+    terms[0], terms[1] = ratio, rise
+    np.multiply(met.x2, bend, out=terms[2])
+    np.multiply(mixed, bend, out=terms[3])
+    np.multiply(x, fall, out=terms[4])
+    np.multiply(y, fall, out=terms[5])
     np.matmul(sums[:, :6], by_system, out=d_pose[:, :6])
-    level, tilted = terms[:2]
-    np.multiply(across, z, out=level)
-    np.multiply(along, z, out=tilted)
-    fall *= rays.radius
-    tilted += fall
-    np.multiply(tilted, rays.unit, out=terms[2:4])
-    terms[2:4] *= rays.unit[0]
-    np.multiply(height, rays.unit, out=terms[4:])
+    bend *= z
+    bend += fall
+    np.multiply(ratio, z, out=terms[0])
+    np.multiply(met.r2, bend, out=terms[1])
+    np.multiply(met.x2, bend, out=terms[2])
+    np.multiply(mixed, bend, out=terms[3])
+    np.multiply(x, ratio, out=terms[4])
+    np.multiply(y, ratio, out=terms[5])
     np.matmul(sums[:, 6:12], by_system, out=d_pose[:, 6:])
     np.matmul(sums[:, 12:], by_system, out=uv)
 

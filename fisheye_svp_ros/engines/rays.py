@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.curves import ViewpointShift, shift_at
+from fisheye_svp_ros.curves import ImageHeight, Trigonometric, ViewpointShift, shift_at
 from fisheye_svp_ros.formulas import approach
 from fisheye_svp_ros.lens import Lens
 
@@ -26,40 +26,66 @@ _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside
 BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
 
 
-class Incidence(NamedTuple):
-    """Where points meet the lens; every field (...), but unit (2, ...).
+Bent = tuple[Array, Array, Array]
 
-    theta: rad; sin, cos: of theta; unit: direction of the image height; radius: distance from the
-    axis, m; clearance: derivative of the ray equation, m, positive where theta is unique.
+
+class Meeting(NamedTuple):
+    """Where points meet the lens; every field (...).
+
+    x, y, z: in the camera frame, m; x2: x^2; r2, r: of the distance r from the axis; d2: of that
+    from the origin; theta: rad; bent: sine and cosine of theta and the clearance, m (the ray
+    equation's derivative by theta, its sign turned), where the lens has a shift.
     """
 
+    x: Array
+    y: Array
+    z: Array
+    x2: Array
+    r2: Array
+    d2: Array
+    r: Array
     theta: Array
-    sin: Array
-    cos: Array
-    unit: Array
-    radius: Array
-    clearance: Array
+    bent: Bent | None
     valid: Mask
 
+    def height(self, curve: ImageHeight) -> tuple[Array, Array]:
+        """Return h/f and its derivative by theta."""
+        if not isinstance(curve, Trigonometric):
+            return curve.value_and_slope(self.theta)
+        if self.bent is not None:
+            return curve.formula(*self.bent[:2])
+        inverse = 1.0 / np.sqrt(self.d2)
+        return curve.formula(self.r * inverse, self.z * inverse)
 
-def meet(lens: Lens, local: Array, limited: bool) -> Incidence:
+    def change(self) -> tuple[Array, Array]:
+        """Return dtheta/dr, 1/m, and -dtheta/dZ / r, 1/m^2."""
+        if self.bent is None:
+            axial = 1.0 / self.d2
+            return self.z * axial, axial
+        sin, cos, clearance = self.bent
+        return cos / clearance, sin / (clearance * self.r)
+
+
+def meet(lens: Lens, local: Array, limited: bool) -> Meeting:
     """Return where points (3, ...) in the camera frame meet the lens, none exactly on its axis.
 
-    limited: see `edge`.  Of `local` only the last row stays what it is.
+    limited: see `edge`.
     """
-    squares, z = local * local, local[2]
-    squares[0] += squares[1]
-    squares[2] += squares[0]
-    r, distance = np.sqrt(squares[::2], out=squares[::2])
-    theta, sin, cos = np.arctan2(r, z), r / distance, z / distance
-    clearance = distance
-    if lens.viewpoint_shift is not None:
-        theta, sin, cos, clearance = _past_shift(lens, r, z, distance, (theta, sin, cos))
-    valid = clearance > CLEAR
+    x, y, z = local
+    x2, r2, d2 = local * local
+    r2 += x2
+    d2 += r2
+    r = np.sqrt(r2)
+    theta = np.arctan2(r, z)
+    bent: Bent | None = None
+    if lens.viewpoint_shift is None:
+        valid = d2 > CLEAR * CLEAR
+    else:
+        distance = np.sqrt(d2)
+        theta, bent = _past_shift(lens, r, z, distance, (theta, r / distance, z / distance))
+        valid = bent[2] > CLEAR
     valid &= theta <= edge(lens, limited)
-    unit = local[:2]
-    unit /= r
-    return Incidence(theta, sin, cos, unit, r, clearance, valid)
+    return Meeting(x, y, z, x2, r2, d2, r, theta, bent, valid)
 
 
 def edge(lens: Lens, limited: bool) -> float:
@@ -85,8 +111,8 @@ def caustic_range(shift: ViewpointShift, limit: float) -> float:
 
 def _past_shift(
     lens: Lens, r: Array, z: Array, distance: Array, start: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array, Array]:
-    """Return theta, its sine and cosine, and the clearance; NaN where there is no ray."""
+) -> tuple[Array, Bent]:
+    """Return theta, and its sine, cosine and clearance; NaN where there is no ray."""
     shift = lens.viewpoint_shift
     assert shift is not None
     theta, sin, cos, clearance, settled = _newton(shift, r, z, *start)
@@ -97,7 +123,7 @@ def _past_shift(
         theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
         value, rise = shift_at(shift, found, sin[apart], cos[apart])
         clearance[apart] = approach(r[apart], z[apart], sin[apart], cos[apart], value, rise)[1]
-    return theta, sin, cos, clearance
+    return theta, (sin, cos, clearance)
 
 
 def _newton(
