@@ -21,9 +21,9 @@ import numpy as np
 from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.engines.answers import Incidence as Incidence
-from fisheye_svp_ros.engines.rays import caustic_range
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.rays import caustic_range
 
 _EDGE_SLACK = 1e-9  # of h/f; keeps image points exactly at the edge of the field inside it
 

@@ -10,7 +10,7 @@ from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
-_SOURCES = ('formulas.py', 'engines/rays.py', 'engines/kernels.py', 'engines/adjustment.py',
+_SOURCES = ('formulas.py', 'rays.py', 'engines/kernels.py', 'engines/adjustment.py',
             'engines/entries.py', 'solve/least_squares.py')
 
 

@@ -14,8 +14,8 @@ from numba.core.cpu import CPUTargetOptions
 from numba.extending import register_jitable
 
 from fisheye_svp_ros import formulas
-from fisheye_svp_ros.engines.rays import BEHIND, CLEAR, MORE_STEPS, NEWTON_STEPS, SETTLED
 from fisheye_svp_ros.formulas import NOWHERE
+from fisheye_svp_ros.rays import BEHIND, CLEAR, MORE_STEPS, NEWTON_STEPS, SETTLED
 
 # Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
 OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
@@ -175,7 +175,7 @@ def derivatives(w, n, lens):
     for i in range(n):
         x, y, z, r, ratio = w[X + i], w[Y + i], w[Z + i], w[R + i], w[RATIO + i]
         inverse = 1.0 / (w[CLEARANCE + i] * r)
-        _, fall, bend = formulas.point_derivatives(
+        rise, fall, bend = formulas.point_derivatives(
             ratio, w[SLOPE + i], r * r, w[COS + i] * r * inverse, w[SIN + i] * inverse)
         turn, level = bend * z + fall, ratio * z
         x2, y2, mixed = x * x, y * y, x * y
@@ -186,7 +186,7 @@ def derivatives(w, n, lens):
         w[ROW + 4 * B + i] = -fx * (level + x2 * turn)
         w[ROW + 5 * B + i] = fx * y * ratio
         w[ROW + 7 * B + i] = fy * mixed * bend
-        w[ROW + 8 * B + i] = fy * (ratio + y2 * bend)
+        w[ROW + 8 * B + i] = fy * (rise - x2 * bend)
         w[ROW + 9 * B + i] = -fy * y * fall
         w[ROW + 10 * B + i] = fy * (level + y2 * turn)
         w[ROW + 11 * B + i] = -fy * mixed * turn

@@ -18,9 +18,9 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.engines import entries, kernels, numpy_engine
 from fisheye_svp_ros.engines.answers import Localization, Rigs, Seen
-from fisheye_svp_ros.engines.rays import caustic_range, edge, search_limit
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rays import caustic_range, edge, search_limit
 
 T = TypeVar('T')
 

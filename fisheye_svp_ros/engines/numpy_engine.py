@@ -8,9 +8,9 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.engines.answers import Incidence, Seen
-from fisheye_svp_ros.engines.rays import Meeting, meet
 from fisheye_svp_ros.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.rays import Meeting, meet
 
 _BLOCK = 16_700  # points; rows a power of two apart would share the same lines of the cache
 
@@ -170,15 +170,14 @@ def _add_up(
 ) -> None:
     """Write derivatives by place and by turn (S, 12, N), and image points around the origin.
 
-    height: of `Meeting.height`, used up; uv (S, 2, N).
+    height: of `Meeting.height`; uv (S, 2, N).
     """
-    ratio, slope = height
-    ratio /= met.r
-    rise, fall, bend = point_derivatives(ratio, slope, met.r2, *met.change())
     x, y, z, mixed = met.x, met.y, met.z, met.x * met.y
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache
     by_system = terms.swapaxes(0, 1)
-    terms[0], terms[1] = ratio, rise
+    ratio = np.divide(height[0], met.r, out=terms[0])
+    axial = met.change(terms[1])
+    _, fall, bend = point_derivatives(ratio, height[1], met.r2, terms[1], axial)
     np.multiply(met.x2, bend, out=terms[2])
     np.multiply(mixed, bend, out=terms[3])
     np.multiply(x, fall, out=terms[4])
@@ -186,12 +185,12 @@ def _add_up(
     np.matmul(sums[:, :6], by_system, out=d_pose[:, :6])
     bend *= z
     bend += fall
-    np.multiply(ratio, z, out=terms[0])
     np.multiply(met.r2, bend, out=terms[1])
     np.multiply(met.x2, bend, out=terms[2])
     np.multiply(mixed, bend, out=terms[3])
     np.multiply(x, ratio, out=terms[4])
     np.multiply(y, ratio, out=terms[5])
+    ratio *= z
     np.matmul(sums[:, 6:12], by_system, out=d_pose[:, 6:])
     np.matmul(sums[:, 12:], by_system, out=uv)
 

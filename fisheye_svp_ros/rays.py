@@ -57,13 +57,15 @@ class Meeting(NamedTuple):
         inverse = 1.0 / np.sqrt(self.d2)
         return curve.formula(self.r * inverse, self.z * inverse)
 
-    def change(self) -> tuple[Array, Array]:
-        """Return dtheta/dr, 1/m, and -dtheta/dZ / r, 1/m^2."""
+    def change(self, outward: Array) -> Array:
+        """Write dtheta/dr, 1/m, and return -dtheta/dZ / r, 1/m^2."""
         if self.bent is None:
             axial = 1.0 / self.d2
-            return self.z * axial, axial
+            np.multiply(self.z, axial, out=outward)
+            return axial
         sin, cos, clearance = self.bent
-        return cos / clearance, sin / (clearance * self.r)
+        np.divide(cos, clearance, out=outward)
+        return sin / (clearance * self.r)
 
 
 def meet(lens: Lens, local: Array, limited: bool) -> Meeting:
