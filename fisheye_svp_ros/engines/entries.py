@@ -8,7 +8,13 @@ import numpy as np
 from numba import config, njit, types
 
 from fisheye_svp_ros.engines import cache
-from fisheye_svp_ros.engines.adjustment import empty_normal, minimise, workspace
+from fisheye_svp_ros.engines.adjustment import (
+    copy,
+    minimise,
+    normal_of,
+    pose_of,
+    workspace,
+)
 from fisheye_svp_ros.engines.kernels import (
     BARE,
     BEHIND,
@@ -155,19 +161,24 @@ _SEEN = (_in(3), _in(3), _in(2))
 def localize(points, uv, weight, row, lens, minimum, rotation, position, covariance, residual,
              cost, solved, iterations):
     """Move S poses to their minima; return how many are left to the reference."""
-    w, normal, work, left = np.empty(SCRATCH), empty_normal(1), workspace(1), 0
-    rig, lower = work[2], work[5][0]
+    w, work, left = np.empty(SCRATCH), workspace(1), 0
+    states, normals, lower = work[0], work[1], work[4]
     for s in range(len(points)):
         usable, solved[s] = 0, False
         for i in range(weight.shape[1]):
             usable += weight[s, i] > 0.0
         if usable >= minimum:
+            pose = pose_of(states[0, 0])
+            copy(rotation[s], pose[0])
+            copy(position[s], pose[1])
             seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
-            pose = (rotation[s:s + 1], position[s:s + 1])
-            cost[s], iterations[s], ended = minimise(w, seen, seen, 1, pose, rig, normal, work)
+            cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work)
+            pose = pose_of(states[at, 0])
+            copy(pose[0], rotation[s])
+            copy(pose[1], position[s])
             solved[s] = (
                 ended == 1
-                and _inverse(normal[0][0], lower, covariance[s])
+                and _inverse(normal_of(normals[known, 0])[0], lower, covariance[s])
                 and _residual(
                     w, points[s], uv[s], row[s], lens, rotation[s], position[s], residual[s])
             )
@@ -175,20 +186,23 @@ def localize(points, uv, weight, row, lens, minimum, rotation, position, covaria
     return left
 
 
-@_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(3), _out(3), _out(2), _out(1),
-        _out(1, types.int64), _out(1, types.int64), _out(4), _out(4), _out(3), _out(3), _out(2))
-def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, rotation,
-                position, rig_rotation, rig_position, cost, iterations, ended, blocks, cross,
-                shared, block_gradient, shared_gradient):
-    """Move S rigs of V views to their minima; return how many are left to the reference."""
-    views, left = rotation.shape[1], 0
+@_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(4), _out(1),
+        _out(1, types.int64))
+def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, state,
+                normal, cost, iterations):
+    """Move S rigs of V views to their minima; return how many are left to the reference.
+
+    state (S, V + 1, 4, 3); normal (S, V + 1, 13, 6): see `adjustment`.
+    """
+    views, left = state.shape[1] - 1, 0
     w, work = np.empty(SCRATCH), workspace(views)
-    for s in range(len(rotation)):
+    for s in range(len(state)):
         mine = slice(s * views, (s + 1) * views)
-        cost[s], iterations[s], ended[s] = minimise(
+        copy(state[s], work[0][0])
+        cost[s], iterations[s], ended, at, known = minimise(
             w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
-            (points[mine], uv[mine], weight[mine], lens), 2, (rotation[s], position[s]),
-            (rig_rotation[s], rig_position[s]),
-            (blocks[s], cross[s], shared[s], block_gradient[s], shared_gradient[s]), work)
-        left += ended[s] < 1
+            (points[mine], uv[mine], weight[mine], lens), 2, work)
+        copy(work[0][at], state[s])
+        copy(work[1][known], normal[s])
+        left += ended < 1
     return left

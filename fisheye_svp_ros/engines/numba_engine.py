@@ -17,6 +17,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.engines import entries, kernels, numpy_engine
+from fisheye_svp_ros.engines.adjustment import NORMAL, POSE
 from fisheye_svp_ros.engines.answers import Localization, Rigs, Seen
 from fisheye_svp_ros.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -112,18 +113,21 @@ def adjust_rigs(
     left, right = map(packed, lenses)
     if left is None or right is None:
         return None
-    state = tuple(array.copy() for array in state)
     systems, views = state[0].shape[:2]
-    whole, square = np.empty(systems), (6, 6)
-    ended, iterations = np.empty((2, systems), dtype=np.int64)
-    normal = tuple(np.zeros((systems, *shape)) for shape in (
-        (views, *square), (views, *square), square, (views, 6), (6,)
-    ))
-    lost = entries.adjust_rigs(
-        *_contiguous(*seen[0]), left, *_contiguous(*seen[1]), right, *state, whole, iterations,
-        ended, *normal
+    poses = np.empty((systems, views + 1, *POSE))
+    poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3] = state
+    normal, cost = np.empty((systems, views + 1, *NORMAL)), np.empty(systems)
+    iterations = np.empty(systems, dtype=np.int64)
+    if entries.adjust_rigs(
+        *_contiguous(*seen[0]), left, *_contiguous(*seen[1]), right, poses, normal, cost,
+        iterations,
+    ):
+        return None
+    block, shared = normal[:, :-1], normal[:, -1]
+    return Rigs(
+        (poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3]), cost, iterations,
+        (block[:, :, :6], block[:, :, 6:12], shared[:, :6], block[:, :, 12], shared[:, 12]),
     )
-    return None if lost else Rigs(state, whole, iterations, normal)
 
 
 def packed(lens: Lens) -> Array | None:
