@@ -26,6 +26,7 @@ from fisheye_svp_ros.rays import caustic_range, edge, search_limit
 T = TypeVar('T')
 
 _SHARE = 20_000  # points below which a thread of their own does not pay
+_PIECES = 4  # a thread: one that is held up leaves more of them to the others
 _KEPT = 64  # lenses
 
 _lenses: dict[int, tuple[Lens, Array | None]] = {}
@@ -177,7 +178,7 @@ def _spread(run: Callable[[slice], T], count: int, points: int) -> list[T]:
     threads = min(_threads(), count, points // _SHARE)
     if threads < 2:
         return [run(slice(0, count))]
-    edges = np.linspace(0, count, threads + 1).astype(int).tolist()
+    edges = np.linspace(0, count, min(_PIECES * threads, count) + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(run, (slice(*pair) for pair in itertools.pairwise(edges))))
 
