@@ -88,20 +88,18 @@ def localize(
     if numbers is None:
         return None
     systems, count = row.shape
-    given = _contiguous(*seen, row)
+    poses = np.empty((systems, *POSE))
+    poses[:, :3], poses[:, 3] = start
     found = Localization(
-        Pose(start.rotation.copy(), start.position.copy()), np.empty((systems, 6, 6)),
-        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.bool_),
-        np.empty(systems, dtype=np.int64),
+        Pose(poses[:, :3], poses[:, 3]), np.empty((systems, 6, 6)), np.empty((systems, count, 2)),
+        np.empty(systems), np.empty(systems, dtype=np.bool_), np.empty(systems, dtype=np.int64),
     )
+    arrays = (*_contiguous(*seen, row), poses, *found[1:])
     if systems == 1:  # by the shortest way: it is called for every frame of a camera
-        return found, entries.localize(*given, numbers, minimum, *found.pose, *found[1:])
+        return found, entries.localize(numbers, minimum, *arrays)
 
     def run(part: slice) -> int:
-        left: int = entries.localize(
-            *(array[part] for array in given), numbers, minimum,
-            *(array[part] for array in (*found.pose, *found[1:]))
-        )
+        left: int = entries.localize(numbers, minimum, *(array[part] for array in arrays))
         return left
 
     return found, sum(_spread(run, systems, 4 * systems * count))
