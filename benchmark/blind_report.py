@@ -48,8 +48,6 @@ divided like that of the diagnosis by the numbers of effects and of their forms.
 """
 
 
-
-
 def write_report(saved: Mapping[str, tuple[str, list[Outcome]]], directory: Path) -> None:
     """Write blind.md from the commands and outcomes by mode, and the pictures beside it."""
     sections: dict[str, Callable[[Sequence[Outcome], Path], str]] = {

@@ -35,6 +35,7 @@ AGREES = 1e-10  # m
 
 def test_sides_take_turns_after_a_warm_up():
     calls = []
+
     def busy(name):
         calls.append(name)
         end = time.process_time() + 0.03

@@ -86,5 +86,3 @@ def test_agreeing_counts_z_and_residuals_only():
     tables[1, 2, 1, 2] *= 1.07
     assert agreeing(tables, 0.05) == 35
     assert agreeing(tables, 0.10) == 36
-
-

@@ -101,7 +101,6 @@ def residual_fields(records: Iterable[Any], spread: str = 'whole') -> list[Resid
     ]
 
 
-
 def _is_shown(task: Task, row: dict[str, Any]) -> bool:
     if task.name == 'depth':
         return bool(row['set'] == LENSES.index(row['lens']))

@@ -263,4 +263,3 @@ def _no_relation(one: Evaluation, other: Evaluation) -> Claim:
          'median ratio of 2.0 m to 0.2 m': float(np.median(error3[:, 0] / error3[:, 2])),
          'cases of 6 in which parallel is not the worst style': float((ranks != 0).sum())},
     )
-

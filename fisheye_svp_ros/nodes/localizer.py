@@ -68,7 +68,6 @@ class Localizer(SolverNode):
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
 
-
     def _localized(self, model: ForwardModel, views: Views) -> Localization:
         """Solve from where the camera was; from anywhere if that fits worse than it did there."""
         start, before = self._before
