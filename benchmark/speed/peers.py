@@ -101,7 +101,7 @@ def opencv(scene: Scene) -> Solve:
 
 
 def gtsam(scene: Scene) -> Solve:
-    """GTSAM's Levenberg-Marquardt; one custom factor a view, with the hand-written kernel."""
+    """Levenberg-Marquardt as GTSAM has it; one custom factor a view, with the hand-written kernel."""
     import gtsam
 
     views = [fast_view(scene.lens, scene.landmarks, uv) for uv in scene.views.uv]
