@@ -101,7 +101,7 @@ def opencv(scene: Scene) -> Solve:
 
 
 def gtsam(scene: Scene) -> Solve:
-    """Levenberg-Marquardt as GTSAM has it; one custom factor a view, with the hand-written kernel."""
+    """Levenberg-Marquardt as GTSAM has it; one custom factor a view, with the kernel in C."""
     import gtsam
 
     views = [fast_view(scene.lens, scene.landmarks, uv) for uv in scene.views.uv]
