@@ -78,7 +78,7 @@ def _residual(w, points, uv, row, lens, pose, out):
     """Write measured minus predicted, nan for padding; return whether all could be done."""
     for start in range(0, len(points), B):
         n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
-        load(w, n, points[start:], *pose_of(pose))
+        load(w, n, points[start:], *pose)
         meet(w, n, lens, BEHIND)
         image(w, n, lens)
         left, off = 0, out[start:]
@@ -156,11 +156,11 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
 _SEEN = (_in(3), _in(3), _in(2))
 
 
-@_entry(types.int64, _in(1), types.int64, *_SEEN, _in(2, types.int64), _out(3), _out(3), _out(3),
-        _out(1), _out(1, types.boolean), _out(1, types.int64))
-def localize(lens, minimum, points, uv, weight, row, poses, covariance, residual, cost, solved,
-             iterations):
-    """Move S poses (S, 4, 3) to their minima; return how many are left to the reference."""
+@_entry(types.int64, _in(1), types.int64, *_SEEN, _in(2, types.int64), _out(3), _out(2), _out(3),
+        _out(3), _out(1), _out(1, types.boolean), _out(1, types.int64))
+def localize(lens, minimum, points, uv, weight, row, rotation, position, covariance, residual,
+             cost, solved, iterations):
+    """Move S poses to their minima; return how many are left to the reference."""
     w, work, left = np.empty(SCRATCH), workspace(1), 0
     states, normals, lower = work[0], work[1], work[4]
     for s in range(len(points)):
@@ -168,14 +168,18 @@ def localize(lens, minimum, points, uv, weight, row, poses, covariance, residual
         for i in range(weight.shape[1]):
             usable += weight[s, i] > 0.0
         if usable >= minimum:
-            copy(poses[s], states[0, 0])
+            pose = pose_of(states[0, 0])
+            copy(rotation[s], pose[0])
+            copy(position[s], pose[1])
             seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
             cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work)
-            copy(states[at, 0], poses[s])
+            pose = pose_of(states[at, 0])
+            copy(pose[0], rotation[s])
+            copy(pose[1], position[s])
             solved[s] = (
                 ended == 1
                 and _inverse(normal_of(normals[known, 0])[0], lower, covariance[s])
-                and _residual(w, points[s], uv[s], row[s], lens, poses[s], residual[s])
+                and _residual(w, points[s], uv[s], row[s], lens, pose, residual[s])
             )
         left += not solved[s]
     return left

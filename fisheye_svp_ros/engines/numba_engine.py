@@ -88,13 +88,12 @@ def localize(
     if numbers is None:
         return None
     systems, count = row.shape
-    poses = np.empty((systems, *POSE))
-    poses[:, :3], poses[:, 3] = start
     found = Localization(
-        Pose(poses[:, :3], poses[:, 3]), np.empty((systems, 6, 6)), np.empty((systems, count, 2)),
-        np.empty(systems), np.empty(systems, dtype=np.bool_), np.empty(systems, dtype=np.int64),
+        Pose(start.rotation.copy(), start.position.copy()), np.empty((systems, 6, 6)),
+        np.empty((systems, count, 2)), np.empty(systems), np.empty(systems, dtype=np.bool_),
+        np.empty(systems, dtype=np.int64),
     )
-    arrays = (*_contiguous(*seen, row), poses, *found[1:])
+    arrays = (*_contiguous(*seen, row), *found.pose, *found[1:])
     if systems == 1:  # by the shortest way: it is called for every frame of a camera
         return found, entries.localize(numbers, minimum, *arrays)
 
