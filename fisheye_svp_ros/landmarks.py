@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,13 +28,16 @@ class Landmarks:
 
     def lookup(self, ids: Index) -> tuple[Array, Mask]:
         """Return the points (..., 3) of `ids` (...), and which of them are known."""
-        order = np.argsort(self.ids)
-        slot = np.searchsorted(self.ids, ids, sorter=order)
-        place = order[np.minimum(slot, len(order) - 1)]
+        slot = np.searchsorted(self.ids, ids, sorter=self._order)
+        place = self._order[np.minimum(slot, len(self.ids) - 1)]
         known = np.asarray(self.ids[place] == ids)
         points = self.points.take(place, axis=0)
         points[~known] = np.nan
         return points, known
+
+    @cached_property
+    def _order(self) -> Index:
+        return np.argsort(self.ids)
 
 
 def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:

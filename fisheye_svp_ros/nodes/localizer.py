@@ -21,7 +21,6 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.settings import SolverSettings
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import Localization
-from fisheye_svp_ros.solve.measured import rms_px
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
 _EXACT = 1e-6  # px; what fits better fits perfectly
@@ -72,13 +71,19 @@ class Localizer(SolverNode):
         """Solve from where the camera was; from anywhere if that fits worse than it did there."""
         start, before = self._before
         solution = localize_both_sides(model, views, start)
-        rms = rms_px(solution.residual) if solution.converged[0] else np.inf
-        if start is not None and rms >= _AS_WELL * before:
+        if start is not None and not self._rms_px(solution) < _AS_WELL * before:
             solution = localize_both_sides(model, views)
-            rms = rms_px(solution.residual)
-        converged = solution.converged[0]
-        self._before = (solution.pose, max(rms, _EXACT)) if converged else (None, 0.0)
+        found = solution.converged[0]
+        rms = max(self._rms_px(solution), _EXACT)
+        self._before = (solution.pose, rms) if found else (None, 0.0)
         return solution
+
+    def _rms_px(self, solution: Localization) -> float:
+        """Return what `rms_px` does of the residuals, from the cost; infinite without a pose."""
+        if not solution.converged[0]:
+            return np.inf
+        points = solution.residual.shape[1]
+        return float(np.sqrt(solution.cost[0] / points)) * self.settings.sigma_px
 
 
 def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:

@@ -25,8 +25,8 @@ def localize_both_sides(
     No start value is needed.  Raises GeometryError as `localize` does.
     """
     found = localize(model, views, start)
-    centred, centre = _centred(views)
-    extent, axes = np.linalg.eigh(np.swapaxes(centred, -1, -2) @ centred)
+    centre, spread = _moments(views)
+    extent, axes = np.linalg.eigh(spread)
     flat = np.flatnonzero(extent[:, 0] < _FLAT**2 * extent[:, 2])
     if not flat.size:
         return found
@@ -39,11 +39,12 @@ def localize_both_sides(
     return found
 
 
-def _centred(views: Views) -> tuple[Array, Array]:
-    """Return the points (S, N, 3) about their centre, 0 where there is none; centres (S, 3)."""
-    used = (views.weight > 0)[..., None].astype(float)
-    centre = (views.points * used).sum(axis=1) / used.sum(axis=1)
-    return (views.points - centre[:, None]) * used, centre
+def _moments(views: Views) -> tuple[Array, Array]:
+    """Return centres (S, 3) and spread (S, 3, 3) of the weighted points."""
+    weight = views.weight[:, None]
+    centre = weight @ views.points / weight.sum(axis=2, keepdims=True)
+    centred = views.points - centre
+    return centre[:, 0], (np.swapaxes(centred, -1, -2) * weight) @ centred
 
 
 def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
