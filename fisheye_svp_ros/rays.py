@@ -25,16 +25,15 @@ _MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still get
 _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
 BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
 
-
-Bent = tuple[Array, Array, Array]
+Bent = tuple[Array, Array, Array]  # sine and cosine of theta, clearance (m)
 
 
 class Meeting(NamedTuple):
     """Where points meet the lens; every field (...).
 
     x, y, z: in the camera frame, m; x2: x^2; r2, r: of the distance r from the axis; d2: of that
-    from the origin; theta: rad; bent: sine and cosine of theta and the clearance, m (the ray
-    equation's derivative by theta, its sign turned), where the lens has a shift.
+    from the origin; theta: rad; bent: where the lens has a shift; its clearance is the ray
+    equation's derivative by theta, the sign turned.
     """
 
     x: Array
