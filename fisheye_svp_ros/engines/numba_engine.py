@@ -113,7 +113,9 @@ def adjust_rigs(
         return None
     systems, views = state[0].shape[:2]
     poses = np.empty((systems, views + 1, *POSE))
-    poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3] = state
+    parts = poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3]
+    for part, given in zip(parts, state, strict=True):
+        part[...] = given
     normal, cost = np.empty((systems, views + 1, *NORMAL)), np.empty(systems)
     iterations = np.empty(systems, dtype=np.int64)
     if entries.adjust_rigs(
@@ -123,7 +125,7 @@ def adjust_rigs(
         return None
     block, shared = normal[:, :-1], normal[:, -1]
     return Rigs(
-        (poses[:, :-1, :3], poses[:, :-1, 3], poses[:, -1, :3], poses[:, -1, 3]), cost, iterations,
+        parts, cost, iterations,
         (block[:, :, :6], block[:, :, 6:12], shared[:, :6], block[:, :, 12], shared[:, 12]),
     )
 

@@ -71,11 +71,12 @@ class Localizer(SolverNode):
         """Solve from where the camera was; from anywhere if that fits worse than it did there."""
         start, before = self._before
         solution = localize_both_sides(model, views, start)
-        if start is not None and not self._rms_px(solution) < _AS_WELL * before:
+        rms = self._rms_px(solution)
+        if start is not None and rms >= _AS_WELL * before:
             solution = localize_both_sides(model, views)
-        found = solution.converged[0]
-        rms = max(self._rms_px(solution), _EXACT)
-        self._before = (solution.pose, rms) if found else (None, 0.0)
+            rms = self._rms_px(solution)
+        converged = solution.converged[0]
+        self._before = (solution.pose, max(rms, _EXACT)) if converged else (None, 0.0)
         return solution
 
     def _rms_px(self, solution: Localization) -> float:
