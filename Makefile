@@ -17,6 +17,7 @@ test: $(VENV)/ready lint
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
 
 # The paper's tables and figures beside ours; then the search for what the paper does not print
 # (some minutes), which overwrites what it found before in config/.

@@ -52,7 +52,7 @@ setup(
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
             'opencv-python-headless>=4.6',
         ],
-        'lint': ['ruff>=0.6', 'mypy>=1.11', 'types-PyYAML', 'scipy-stubs'],
+        'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.0', 'types-PyYAML', 'scipy-stubs'],
     },
     zip_safe=True,
     maintainer='fisheye_svp_ros maintainers',

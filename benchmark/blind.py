@@ -21,7 +21,7 @@ from benchmark.blind_effects import HIDDEN
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_report import write_report
 from benchmark.blind_trial import MODES, Outcome, Task, run_trial
-from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting.progress import progress
 
 SIZES = (1.0, 0.5, 0.2, 0.1, 0.05)

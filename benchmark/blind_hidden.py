@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmark.blind_scene import World
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens
 
 Rng = np.random.Generator
 

@@ -11,8 +11,8 @@ import numpy as np
 from benchmark.blind_hidden import Hidden, Rng, centre_of, focal_of, unit
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.curves import IMAGE_HEIGHTS, Gennery, ImageHeight, invert_height
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, Gennery, ImageHeight, invert_height
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import rotation_from_vector
 
 

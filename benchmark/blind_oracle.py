@@ -10,9 +10,9 @@ from scipy import optimize, stats
 from benchmark.blind_hidden import Hidden
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.criticism.model import Linearised, State, intrinsic_names, prepare
-from fisheye_svp_ros.criticism.projection import Nuisance
-from fisheye_svp_ros.criticism.selection import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.model import Linearised, State, intrinsic_names, prepare
+from fisheye_svp_ros.diagnosis.projection import Nuisance
+from fisheye_svp_ros.diagnosis.selection import SIGNIFICANCE
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect

@@ -25,7 +25,7 @@ from benchmark.blind_figures import (
 )
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_trial import Outcome
-from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 
 _GOALS = {1.0: 0.98, 0.5: 0.95, 0.2: 0.85}

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.camera import project
-from fisheye_svp_ros.curves import Gennery, KannalaBrandt
-from fisheye_svp_ros.lens import Lens, load_lens
-from fisheye_svp_ros.observations import Observations, make_observations
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.share import lens_path
+from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 FRAMES = 30
 NEAREST, FARTHEST = 0.25, 2.5  # m

@@ -14,8 +14,8 @@ from benchmark.blind_oracle import LinearScene, oracle_finds
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import Needs, Scene, draw_scene
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.criticism.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.criticism.projection import Nuisance, score
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.projection import Nuisance, score
 from fisheye_svp_ros.effects.base import Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect

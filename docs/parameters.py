@@ -18,8 +18,8 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from fisheye_svp_ros import standalone  # noqa: E402
+from fisheye_svp_ros.io.parameters import Row, rows  # noqa: E402
 from fisheye_svp_ros.nodes import NODES  # noqa: E402
-from fisheye_svp_ros.parameters import Row, rows  # noqa: E402
 
 _TABLE = '<!-- parameters of {node} -->\n{table}<!-- end -->'
 

@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _add_engine(commands.choices[named])
         parsed = parser.parse_args(arguments)
         if named in _SOLVING and parsed.engine:
-            import_module('fisheye_svp_ros.engines').use(parsed.engine)
+            import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
         parsed.run(parsed)
         sys.stdout.flush()
     except FisheyeSvpError as error:

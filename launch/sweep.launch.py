@@ -9,7 +9,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from fisheye_svp_ros.commands.sweep_file import read_sweep
-from fisheye_svp_ros.share import sweep_path
+from fisheye_svp_ros.io.share import sweep_path
 
 PACKAGE = 'fisheye_svp_ros'
 PATIENCE = 3600.0  # s: in lock-step nothing is lost, only late

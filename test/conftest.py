@@ -4,29 +4,17 @@ from __future__ import annotations
 
 import fcntl
 import os
-import queue
 import random
-import re
-import signal
 import socket
-import subprocess
 import sys
 import tempfile
-import threading
-import time
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import pytest
+from helpers.nodes import ROOT, Caller, NodeProcess
 
-from fisheye_svp_ros import engines
-
-# Asked before any test installs the standalone client, which answers to the name of rclpy.
-GENUINE = find_spec('rclpy') is not None
-ROOT = Path(__file__).resolve().parent.parent
-TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is
+from fisheye_svp_ros.optics import engines
 
 _INSTALL = 'from fisheye_svp_ros import standalone; standalone.install()\n'
 
@@ -79,51 +67,6 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
     pytest.fail('all ROS domains from 1 to 101 are taken')
 
 
-class NodeProcess:
-    """A node in a process of its own, and the lines it writes."""
-
-    def __init__(self, command: list[str], env: dict[str, str]) -> None:
-        self.lines: list[str] = []
-        self._queue: queue.Queue[str | None] = queue.Queue()
-        self.process = subprocess.Popen(
-            command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self) -> None:
-        assert self.process.stdout
-        for line in self.process.stdout:
-            self._queue.put(line.rstrip('\n'))
-        self._queue.put(None)
-
-    def wait_for(self, pattern: str, timeout: float = TIMEOUT) -> re.Match[str]:
-        """Return the first new line that matches; fail when the process ends before."""
-        end = time.monotonic() + timeout
-        while (left := end - time.monotonic()) > 0:
-            try:
-                line = self._queue.get(timeout=left)
-            except queue.Empty:
-                break
-            if line is None:
-                self._queue.put(None)
-                break
-            self.lines.append(line)
-            if match := re.search(pattern, line):
-                return match
-        raise AssertionError(f'no line with {pattern!r} in:\n' + '\n'.join(self.lines))
-
-    def finish(self, number: signal.Signals | None = None, timeout: float = TIMEOUT) -> int:
-        """Wait for the end, after a signal if one is given; return the exit status."""
-        if number is not None:
-            self.process.send_signal(number)
-        status = self.process.wait(timeout)
-        self._thread.join(timeout)
-        while (line := self._queue.get(timeout=timeout)) is not None:
-            self.lines.append(line)
-        self._queue.put(None)
-        return status
-
-
 @pytest.fixture
 def run_node(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
     """Return a function that runs Python code or a script as a standalone node."""
@@ -148,51 +91,8 @@ def run_node(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
             node.process.wait()
 
 
-class Caller:
-    """A service client for tests, on the wire of the standalone client."""
-
-    def __init__(self, domain: int) -> None:
-        from fisheye_svp_ros.standalone import dds
-
-        self._dds = dds
-        self._participant = dds.Participant(domain)
-        self._sequence = 0
-
-    def call(self, typename: str, service: str, **request: Any) -> Any:
-        """Call a service and return its response."""
-        from fisheye_svp_ros.standalone.messages import service_class
-        from fisheye_svp_ros.standalone.qos import QoSProfile
-
-        dds, qos, types = self._dds, QoSProfile(depth=10), service_class(typename)
-        participant = self._participant
-        writer = dds.Writer(
-            participant, f'rq{service}Request', types.Request.TYPENAME, qos, 'clientid=1.2.3;')
-        reader = dds.Reader(
-            participant, f'rr{service}Reply', types.Response, qos, 'clientid=1.2.3;')
-        until(lambda: bool(
-            writer.entity.get_matched_subscriptions() and reader.entity.get_matched_publications()
-        ))
-        self._sequence += 1
-        header = dds.Header(writer.entity.instance_handle % 2**64, self._sequence)
-        writer.write_call(header, types.Request(**request))
-        while taken := until(reader.take_call):
-            if taken[0][:2] == header[:2]:
-                return taken[1]
-        raise AssertionError('no reply')
-
-
 @pytest.fixture
 def caller(ros_domain: int) -> Iterator[Caller]:
     """Return a service client on the domain of the test."""
     pytest.importorskip('cyclonedds')
     yield Caller(ros_domain)
-
-
-def until(condition: Callable[[], Any], timeout: float = TIMEOUT) -> Any:
-    """Return the first true answer of a function, or fail after a while."""
-    end = time.monotonic() + timeout
-    while time.monotonic() < end:
-        if answer := condition():
-            return answer
-        time.sleep(0.01)
-    raise AssertionError('nothing happened in time')

@@ -11,9 +11,9 @@ from benchmark.speed.compiled import Kernel
 from benchmark.speed.harness import NotHereError
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import views_of
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, cross_matrix
+from fisheye_svp_ros.scene.observations import views_of
 
 # rotation (3, 3) and position (3) of the camera -> residuals (2N) and derivatives (2N, 6)
 View = Callable[[Array, Array], tuple[Array, Array]]

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmark.speed.report import Table, number
-from fisheye_svp_ros.engines import VARIABLE
+from fisheye_svp_ros.optics.engines import VARIABLE
 
 ONE_CORE = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _OV_PLANE = Path(__file__).parents[3] / 'shared' / 'data' / 'ov_plane'

@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmark.speed.harness import NotHereError
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.curves import Equidistant, Gennery, KannalaBrandt
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.optics.curves import Equidistant, Gennery, KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
 
 _HERE = Path(__file__).parent
 # Where `make bench` puts the sources of mrcal.

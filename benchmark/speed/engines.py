@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from benchmark.speed.harness import OURS, Side
-from fisheye_svp_ros.engines import use as use
+from fisheye_svp_ros.optics.engines import use as use
 
 
 def engines() -> list[str]:

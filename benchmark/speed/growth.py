@@ -12,19 +12,19 @@ from benchmark.speed.engines import use
 from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
-from fisheye_svp_ros.camera import project
-from fisheye_svp_ros.criticism.correlation import Correlation
-from fisheye_svp_ros.criticism.diagnosis import diagnose
-from fisheye_svp_ros.criticism.model import Linearised, fit, prepare, start
-from fisheye_svp_ros.criticism.projection import Nuisance
-from fisheye_svp_ros.criticism.screening import screen
+from fisheye_svp_ros.diagnosis.correlation import Correlation
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.diagnosis.projection import Nuisance
+from fisheye_svp_ros.diagnosis.screening import screen
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.landmarks import environment
-from fisheye_svp_ros.observations import Observations
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.rig import paper_pose
-from fisheye_svp_ros.simulation import simulate
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.rigs import paper_pose
+from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 

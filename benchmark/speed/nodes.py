@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmark.speed.engines import engines
 from benchmark.speed.report import Table, number
-from fisheye_svp_ros.engines import VARIABLE
+from fisheye_svp_ros.optics.engines import VARIABLE
 
 _GOAL = 1e-3  # s that a localizer may add
 _TEXT = """From `image_points` in to `~/pose` out, through a localizer (33 landmarks, ShiftVP) and

@@ -11,7 +11,7 @@ from benchmark.speed.adjustment import fast_view, scipy_pose
 from benchmark.speed.harness import NotHereError
 from benchmark.speed.scenes import Scene
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import (
     Pose,
     quaternion_from_rotation,

@@ -12,10 +12,10 @@ from benchmark.speed.harness import Goal, Row, Side, available, measure, require
 from benchmark.speed.peers import camera_matrix
 from benchmark.speed.scenes import points, shift_lens, svp_lens
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.camera import project
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.observations import views_of
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.scene.observations import views_of
 
 KERNEL = 'hand-written C'
 MRCAL = "mrcal's CAHVORE core"

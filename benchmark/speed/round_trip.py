@@ -23,9 +23,9 @@ import numpy as np
 from benchmark.speed.scenes import LANDMARKS, localization
 from fisheye_svp_ros import standalone
 from fisheye_svp_ros.commands.processes import domain
-from fisheye_svp_ros.landmarks import Landmarks
-from fisheye_svp_ros.lens import load_lens
-from fisheye_svp_ros.share import lens_path
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.scene.landmarks import Landmarks
 
 _LENS = 'fish214'
 _VIEWS = 50
@@ -45,7 +45,7 @@ class Probe:
         from rclpy.node import Node
         from sensor_msgs.msg import PointCloud2
 
-        from fisheye_svp_ros import messages
+        from fisheye_svp_ros.nodes import messages
         from fisheye_svp_ros.nodes.base import LATCHED, RELIABLE
 
         rclpy.init(args=[])
@@ -74,7 +74,7 @@ class Probe:
 
     def send(self, name: str) -> int:
         """Send the next set; return its stamp."""
-        from fisheye_svp_ros import messages
+        from fisheye_svp_ros.nodes import messages
 
         self._sent += 1
         message = self._sets[self._sent % _VIEWS]

@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.camera import project
-from fisheye_svp_ros.lens import Lens, load_lens
-from fisheye_svp_ros.observations import Views, views_of
-from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.rig import rig
-from fisheye_svp_ros.share import lens_path
+from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.rigs import rig
 
 LANDMARKS = 33
 NOISE_PX = 0.3

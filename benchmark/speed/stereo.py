@@ -14,8 +14,8 @@ from benchmark.speed.harness import Goal, Row, Side, available, measure, require
 from benchmark.speed.peers import TOLERANCE
 from benchmark.speed.rig_adjustment import gtsam_rig, mrcal_pose, mrcal_rig, opencv_rig, scipy_rig
 from benchmark.speed.scenes import StereoScene, stereo, svp_lens
-from fisheye_svp_ros.curves import Stereographic
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.optics.curves import Stereographic
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 

@@ -20,8 +20,8 @@ from benchmark.speed.harness import Goal, NotHereError, Row, Side, available, me
 from benchmark.speed.scenes import localization, points, shift_lens
 from benchmark.speed.worker import worker
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.observations import views_of
 from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.localization import localize
 
 NUMBA = engines.name_of('numba')

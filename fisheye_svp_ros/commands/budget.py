@@ -43,8 +43,9 @@ def run(args: argparse.Namespace) -> None:
     """Tabulate, answer, draw."""
     import numpy as np
 
-    from fisheye_svp_ros.evaluation.budget import Setup, at_point, make_budget, widest_spread
-    from fisheye_svp_ros.lens import load_lens
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.results import write_json
+    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.budget_report import (
         HEADER,
         Asked,
@@ -54,10 +55,9 @@ def run(args: argparse.Namespace) -> None:
         rows,
     )
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.results import write_json
     from fisheye_svp_ros.reporting.tables import print_table
-    from fisheye_svp_ros.rig import rig
-    from fisheye_svp_ros.share import lens_path
+    from fisheye_svp_ros.scene.rigs import rig
+    from fisheye_svp_ros.study.budget import Setup, at_point, make_budget, widest_spread
 
     lens = load_lens(lens_path(args.lens))
     spread = widest_spread(lens) if args.spread is None else np.radians(args.spread).item()

@@ -17,7 +17,7 @@ _UNITS = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.curves import IMAGE_HEIGHTS
+    from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 
     parser.add_argument('observations', metavar='OBS',
                         help='observations: a CSV file or a folder of ORPC files')
@@ -36,10 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens."""
     from fisheye_svp_ros.commands.notes import note_left_out, say
-    from fisheye_svp_ros.lens import save_lens
-    from fisheye_svp_ros.readers import read_observations
+    from fisheye_svp_ros.io.lens_files import save_lens
+    from fisheye_svp_ros.io.readers import read_observations
+    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.results import write_json
     from fisheye_svp_ros.solve.lens_calibration import calibrate
 
     observations = read_observations(args.observations)

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.evaluation.demonstration import Shown
+    from fisheye_svp_ros.paper.demonstration import Shown
 
 _PATIENCE = 900.0  # s; only a hang takes this long
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.evaluation.paper_tables import LENSES
-    from fisheye_svp_ros.landmarks import RADII
+    from fisheye_svp_ros.paper.tables import LENSES
+    from fisheye_svp_ros.scene.landmarks import RADII
 
     parser.add_argument('-o', '--output', type=Path, default=Path('demo'), metavar='DIR',
                         help='folder for the recording (an earlier one is replaced), demo.json, '
@@ -31,12 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the graph; make everything else from its recording."""
-    from fisheye_svp_ros.bags import Bag
-    from fisheye_svp_ros.evaluation.demonstration import shown
-    from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
-    from fisheye_svp_ros.reporting.columns import write_columns
+    from fisheye_svp_ros.io.bags import Bag
+    from fisheye_svp_ros.io.columns import write_columns
+    from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+    from fisheye_svp_ros.io.results import write_json
+    from fisheye_svp_ros.paper.demonstration import shown
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.results import write_json
 
     bag = args.output / 'recording'
     with progress('running the nodes'):
@@ -56,7 +56,7 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     """Run the node graph through its scenarios, in lock-step, into a recording."""
     from fisheye_svp_ros.commands.lock_step import start_in_step, values
     from fisheye_svp_ros.commands.processes import Processes
-    from fisheye_svp_ros.evaluation.demonstration import TASKS
+    from fisheye_svp_ros.paper.demonstration import TASKS
 
     if bag.is_dir():
         shutil.rmtree(bag)
@@ -79,7 +79,7 @@ def _scenarios(
     task: str, lenses: Sequence[str], radii: Sequence[float]
 ) -> Iterator[tuple[str, Any]]:
     """Yield the camera's parameters for the scenarios of a task."""
-    from fisheye_svp_ros.evaluation.demonstration import DEPTH_POSES, TASKS
+    from fisheye_svp_ros.paper.demonstration import DEPTH_POSES, TASKS
 
     swept, values = next((t.swept, t.values) for t in TASKS if t.name == task)
     yield 'sweep.lens', _list(lenses)
@@ -127,12 +127,12 @@ def _cells(row: Shown) -> tuple[str, ...]:
 
 
 def _draw(folder: Path, bag: Path, rows: Sequence[Shown]) -> None:
-    from fisheye_svp_ros.bags import Bag
-    from fisheye_svp_ros.evaluation.demonstration import residual_fields
-    from fisheye_svp_ros.evaluation.residuals import has_residuals
-    from fisheye_svp_ros.lens import load_lens
-    from fisheye_svp_ros.reporting.plots import draw_comparison, draw_residual_fields
-    from fisheye_svp_ros.share import lens_path
+    from fisheye_svp_ros.io.bags import Bag
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.recording_residuals import has_residuals
+    from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.paper.demonstration import residual_fields
+    from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 
     fields = residual_fields(Bag(bag).records(has_residuals))
     lenses = {name: load_lens(lens_path(name)) for name in {field.lens for field in fields}}

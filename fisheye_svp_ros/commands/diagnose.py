@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.criticism.diagnosis import Diagnosis
-    from fisheye_svp_ros.criticism.known_truth import Compared
-    from fisheye_svp_ros.criticism.points import PointResiduals
-    from fisheye_svp_ros.lens import Lens
-    from fisheye_svp_ros.observations import Observations
+    from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+    from fisheye_svp_ros.diagnosis.known_truth import Compared
+    from fisheye_svp_ros.diagnosis.points import PointResiduals
+    from fisheye_svp_ros.optics.lens import Lens
+    from fisheye_svp_ros.scene.observations import Observations
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,14 +36,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
-    from fisheye_svp_ros.criticism.diagnosis import diagnose
-    from fisheye_svp_ros.criticism.inputs import poses_by_frame
-    from fisheye_svp_ros.criticism.known_truth import known_errors
-    from fisheye_svp_ros.criticism.model import intrinsic_names
-    from fisheye_svp_ros.lens import load_lens
-    from fisheye_svp_ros.readers import read_poses
+    from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+    from fisheye_svp_ros.diagnosis.inputs import poses_by_frame
+    from fisheye_svp_ros.diagnosis.known_truth import known_errors
+    from fisheye_svp_ros.diagnosis.model import intrinsic_names
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.readers import read_poses
+    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.progress import stages
-    from fisheye_svp_ros.share import lens_path
 
     lens = load_lens(lens_path(args.lens))
     free = args.free == 'intrinsics' or lens.calibration is not None
@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> None:
 
 def _read(path: str, lens: Lens) -> Observations:
     from fisheye_svp_ros.commands.notes import note_left_out
-    from fisheye_svp_ros.criticism.inputs import posable
-    from fisheye_svp_ros.readers import read_observations
+    from fisheye_svp_ros.diagnosis.inputs import posable
+    from fisheye_svp_ros.io.readers import read_observations
 
     observations, left_out = posable(read_observations(path), lens)
     note_left_out(left_out)
@@ -98,11 +98,11 @@ def _print(
 def _write(
     args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool
 ) -> None:
-    from fisheye_svp_ros.criticism.points import point_residuals
-    from fisheye_svp_ros.lens import save_lens
+    from fisheye_svp_ros.diagnosis.points import point_residuals
+    from fisheye_svp_ros.io.lens_files import save_lens
+    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
-    from fisheye_svp_ros.reporting.results import write_json
 
     folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
     truth = {name: compared._asdict() for name, compared in known.items()}
@@ -117,7 +117,7 @@ def _write(
 def _write_residuals(path: Path, points: PointResiduals, cameras: Sequence[str]) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.readers.table import write_table
+    from fisheye_svp_ros.io.csv_table import write_table
 
     named = {'camera': np.array(cameras)[points.camera]} if len(cameras) > 1 else {}
     write_table(path, {

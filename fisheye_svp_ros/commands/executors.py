@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from fisheye_svp_ros.errors import SweepError
-from fisheye_svp_ros.evaluation.sweep import InProcess
+from fisheye_svp_ros.study.sweep import InProcess
 
 _AHEAD = 3  # tasks under way for each worker: none waits for the next
 _PATIENCE = 10  # s for a scheduler to answer, and for its first worker

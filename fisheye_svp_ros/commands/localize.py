@@ -28,10 +28,10 @@ def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
     from fisheye_svp_ros.commands.notes import note_left_out
     from fisheye_svp_ros.effects.forward import ForwardModel
-    from fisheye_svp_ros.lens import load_lens
-    from fisheye_svp_ros.readers import read_observations
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.readers import read_observations
+    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.share import lens_path
     from fisheye_svp_ros.solve.measured import localize_measured
 
     model = ForwardModel(load_lens(lens_path(args.lens)))
@@ -76,9 +76,9 @@ def _print(measured: MeasuredPoses, source: str) -> None:
 def _write(folder: Path, model: ForwardModel, measured: MeasuredPoses) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.readers import write_poses
-    from fisheye_svp_ros.readers.table import write_table
-    from fisheye_svp_ros.reporting.results import write_json
+    from fisheye_svp_ros.io.csv_table import write_table
+    from fisheye_svp_ros.io.readers import write_poses
+    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.solve.measured import rms_px
 
     views, result = measured.views, measured.result

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.evaluation.paper_results import Results
+    from fisheye_svp_ros.paper.results import Results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +33,8 @@ def _report(folder: Path) -> None:
     import os
 
     from fisheye_svp_ros.commands.executors import local
-    from fisheye_svp_ros.evaluation.paper_results import compute, tasks
-    from fisheye_svp_ros.reporting.paper_report import write_report
+    from fisheye_svp_ros.paper.report import write_report
+    from fisheye_svp_ros.paper.results import compute, tasks
     from fisheye_svp_ros.reporting.progress import progress
 
     with local(os.cpu_count() or 1) as workers:
@@ -50,8 +50,8 @@ def _report(folder: Path) -> None:
 def _print(results: Results) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.evaluation.paper_claims import FAILS, HOLDS, IN_PART
-    from fisheye_svp_ros.evaluation.paper_tables import LENSES, agreeing
+    from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART
+    from fisheye_svp_ros.paper.tables import LENSES, agreeing
     from fisheye_svp_ros.reporting.tables import print_table
 
     tables = np.stack([results.svp[name].localization for name in LENSES])
@@ -78,20 +78,20 @@ def _search(folder: Path) -> None:
     import yaml
 
     from fisheye_svp_ros.commands.executors import local
-    from fisheye_svp_ros.evaluation.paper_family import (
+    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
+    from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.paper.family import (
         best_of,
         family_document,
         layout_document,
         lens_document,
         whole_directions,
     )
-    from fisheye_svp_ros.evaluation.paper_poses import calibration_range
-    from fisheye_svp_ros.evaluation.paper_search import STARTS, recover
-    from fisheye_svp_ros.evaluation.paper_tables import LENSES
-    from fisheye_svp_ros.files import write_text
-    from fisheye_svp_ros.lens import lens_from_dict, load_lens
+    from fisheye_svp_ros.paper.poses import calibration_range
+    from fisheye_svp_ros.paper.search import STARTS, recover
+    from fisheye_svp_ros.paper.tables import LENSES
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.share import lens_path
 
     fish180, fish214 = (load_lens(lens_path(name)) for name in LENSES)
     found = []

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.evaluation.residuals import ResidualSet
+    from fisheye_svp_ros.io.recording_residuals import ResidualSet
 
 _FIELDS = 4  # residual fields a lens
 _TABLES = ('.csv', '.parquet')
@@ -44,7 +44,7 @@ def _table_in(source: Path) -> Path | None:
 
 
 def _of_table(args: argparse.Namespace) -> list[Path]:
-    from fisheye_svp_ros.reporting.columns import read_columns
+    from fisheye_svp_ros.io.columns import read_columns
     from fisheye_svp_ros.reporting.sweep_plots import draw_table
 
     path = _table_in(args.source)
@@ -53,10 +53,10 @@ def _of_table(args: argparse.Namespace) -> list[Path]:
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:
-    from fisheye_svp_ros.bags import Bag
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.evaluation.recording import is_tabulated, tabulate
-    from fisheye_svp_ros.evaluation.residuals import has_residuals, residual_sets
+    from fisheye_svp_ros.io.bags import Bag
+    from fisheye_svp_ros.io.recording_residuals import has_residuals, residual_sets
+    from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
     from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 
     bag = Bag(args.source)
@@ -73,10 +73,10 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
 
 def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
     """Draw the residuals over the image, once a lens and range, where a scenario names these."""
-    from fisheye_svp_ros.evaluation.residuals import residual_field
-    from fisheye_svp_ros.lens import load_lens
-    from fisheye_svp_ros.reporting.plots import draw_residual_fields
-    from fisheye_svp_ros.share import lens_path
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.recording_residuals import residual_field
+    from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
 
     named: dict[Any, ResidualSet] = {}
     for one in found:
@@ -94,7 +94,7 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
 
 def _main_namespace(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
     """Return the rows of the namespace with most of them: others have other metrics."""
-    from fisheye_svp_ros.evaluation.recording import NAMESPACE
+    from fisheye_svp_ros.io.recording_table import NAMESPACE
 
     names = columns[NAMESPACE]
     most = max(set(names), key=names.count, default=None)

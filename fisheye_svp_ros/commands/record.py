@@ -36,13 +36,13 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _sweep(name: str, bag: Path) -> None:
-    from fisheye_svp_ros.bags import Bag
     from fisheye_svp_ros.commands.lock_step import record_sweep
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import BagError
+    from fisheye_svp_ros.io.bags import Bag
+    from fisheye_svp_ros.io.share import sweep_path
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.share import sweep_path
 
     path = sweep_path(name)
     plan = read_sweep(path)
@@ -56,9 +56,9 @@ def _sweep(name: str, bag: Path) -> None:
 
 
 def _record(args: argparse.Namespace) -> None:
-    from fisheye_svp_ros.bags import BagWriter
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.run import supply_rclpy
+    from fisheye_svp_ros.io.bags import BagWriter
 
     supply_rclpy()
     import rclpy

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.evaluation.sweep import Plan
-    from fisheye_svp_ros.reporting.columns import Parts
+    from fisheye_svp_ros.io.columns import Parts
+    from fisheye_svp_ros.study.sweep import Plan
 
 _LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
@@ -45,9 +45,9 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import ParameterError
-    from fisheye_svp_ros.evaluation.sweep import column_types, fingerprint, work
-    from fisheye_svp_ros.reporting.columns import Parts
-    from fisheye_svp_ros.share import sweep_path
+    from fisheye_svp_ros.io.columns import Parts
+    from fisheye_svp_ros.io.share import sweep_path
+    from fisheye_svp_ros.study.sweep import column_types, fingerprint, work
 
     path = sweep_path(str(args.file))
     plan = read_sweep(path)
@@ -78,9 +78,9 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 
     Return the engine for all of the sweep: the one that it was begun with.
     """
-    from fisheye_svp_ros import engines
     from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.files import write_text
+    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.optics import engines
 
     mark = parts.folder / _MARK
     if not mark.exists():
@@ -100,8 +100,8 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> None:
     from fisheye_svp_ros.commands.executors import dask, local
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.evaluation.sweep import solve_sweep, tasks
     from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.study.sweep import solve_sweep, tasks
 
     done = parts.numbers()
     remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
@@ -119,11 +119,11 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
-    from fisheye_svp_ros.evaluation.summary import summarise
-    from fisheye_svp_ros.evaluation.sweep import column_types
-    from fisheye_svp_ros.reporting.columns import read_column
-    from fisheye_svp_ros.reporting.results import write_json
+    from fisheye_svp_ros.io.columns import read_column
+    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.study.summary import summarise
+    from fisheye_svp_ros.study.sweep import column_types
 
     table = folder / 'sweep.parquet'
     metrics = [name for name, kind in column_types(plan).items()

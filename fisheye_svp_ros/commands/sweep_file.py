@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.evaluation.sweep import CAMERA, TABLES, Plan, plan_sweep
-from fisheye_svp_ros.parameters import SWEEP, rows
+from fisheye_svp_ros.io.parameters import SWEEP, rows
 from fisheye_svp_ros.standalone.arguments import Arguments, parse
+from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, plan_sweep
 
 
 def read_sweep(path: Path) -> Plan:

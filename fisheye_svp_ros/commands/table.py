@@ -19,10 +19,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Join the error topics by stamp, print what varies, write all of it."""
-    from fisheye_svp_ros.bags import Bag
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.errors import BagError
-    from fisheye_svp_ros.evaluation.recording import STAMP, is_tabulated, tabulate
+    from fisheye_svp_ros.io.bags import Bag
+    from fisheye_svp_ros.io.recording_table import STAMP, is_tabulated, tabulate
 
     bag = Bag(args.bag)
     columns = tabulate(bag.records(is_tabulated))
@@ -34,8 +34,8 @@ def run(args: argparse.Namespace) -> None:
                        '`fisheye-svp record` or `ros2 bag record`')
     _print(args.bag, columns)
     if args.output:
-        from fisheye_svp_ros.reporting.columns import write_columns
-        from fisheye_svp_ros.reporting.results import write_json
+        from fisheye_svp_ros.io.columns import write_columns
+        from fisheye_svp_ros.io.results import write_json
 
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'table.json', {

@@ -21,12 +21,12 @@ from typing import Any, ClassVar, NamedTuple, Self
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.boards import Board, find_boards
-from fisheye_svp_ros.camera import Incidence
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.optics.camera import Incidence
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.boards import Board, find_boards
+from fisheye_svp_ros.scene.observations import Views
 
 STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 

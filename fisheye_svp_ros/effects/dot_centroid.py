@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.camera import project
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
+from fisheye_svp_ros.optics.camera import project
 
 _RIM = 12  # points on the rim of the dot whose image is taken as a polygon
 _EQUAL = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon the disc's moments

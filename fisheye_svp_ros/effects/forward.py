@@ -8,18 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
-from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.camera import Image, LinearImage, Rays, back_project, project
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
 from fisheye_svp_ros.effects.ray_curves import SumOfHeights, SumOfShifts
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
-from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import Views, views_of
+from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays, back_project, project
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.observations import Views, views_of
 
 Term = tuple[Effect, Array]
 

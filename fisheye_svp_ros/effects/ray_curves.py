@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.curves import ImageHeight, ViewpointShift, invert_height
+from fisheye_svp_ros.optics.curves import ImageHeight, ViewpointShift, invert_height
 
 _GRID = 4097  # angles at which a sum of curves is looked at for where it turns back
 

@@ -9,8 +9,8 @@ from typing import ClassVar, Self
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.boards import Board
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
+from fisheye_svp_ros.scene.boards import Board
 
 # id, centre (3), axis a (3), axis b (3), size: what places a board in the target frame.
 BoardAxes = tuple[float, ...]

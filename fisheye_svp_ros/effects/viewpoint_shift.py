@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.curves import Gennery
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.optics.curves import Gennery
 
 
 @dataclass(frozen=True)

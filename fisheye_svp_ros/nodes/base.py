@@ -21,11 +21,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from fisheye_svp_ros import messages
-from fisheye_svp_ros.clouds import stamp_of
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.parameters import Row, changed, rows
-from fisheye_svp_ros.settings import Settings
+from fisheye_svp_ros.io.clouds import stamp_of
+from fisheye_svp_ros.io.parameters import Row, changed, rows
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.study.settings import Settings
 
 # All topics are reliable; deep enough for a burst of inputs while a solver is busy.
 RELIABLE = QoSProfile(depth=100)

@@ -12,14 +12,14 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
-from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.landmarks import Landmarks
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Finished
-from fisheye_svp_ros.observations import Observations
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.settings import CameraSettings
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.study.settings import CameraSettings
 
 WORLD = 'world'
 _LONG = 15.0  # s without an answer after which a set is published again

@@ -7,20 +7,20 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from fisheye_svp_ros import messages
-from fisheye_svp_ros.camera import incidence
-from fisheye_svp_ros.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.evaluation.errors import LOCALIZATION_METRICS, NO_POSE, localization_metrics
+from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.shapes import camera_shape
+from fisheye_svp_ros.nodes.markers import camera_shape
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
-from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.settings import SolverSettings
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS, NO_POSE, localization_metrics
+from fisheye_svp_ros.study.settings import SolverSettings
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
 _EXACT = 1e-6  # px; what fits better fits perfectly

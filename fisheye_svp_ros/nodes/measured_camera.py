@@ -11,17 +11,18 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.landmarks import Landmarks
-from fisheye_svp_ros.lens import Lens, load_lens
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.parameters import parameter
+from fisheye_svp_ros.io.readers import read_observations, read_poses
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes.base import run
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
-from fisheye_svp_ros.observations import Observations
-from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
-from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.readers import read_observations, read_poses
-from fisheye_svp_ros.settings import CameraSettings
-from fisheye_svp_ros.share import lens_path
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.study.settings import CameraSettings
 
 _NAMESPACE = re.compile('[A-Za-z_][A-Za-z0-9_]*')
 

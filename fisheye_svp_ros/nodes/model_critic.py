@@ -14,19 +14,20 @@ import numpy as np
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from fisheye_svp_ros import messages
-from fisheye_svp_ros.criticism.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.criticism.inputs import posable
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.lens import Lens, save_lens
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.parameters import parameter
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.seen import Seen, scenario_of, seen_in, table_of
+from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
-from fisheye_svp_ros.observations import STEREO, Observations
-from fisheye_svp_ros.parameters import parameter
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
-from fisheye_svp_ros.scenario import true_lens
-from fisheye_svp_ros.settings import SolverSettings
+from fisheye_svp_ros.scene.observations import STEREO, Observations
+from fisheye_svp_ros.simulate.scenario import true_lens
+from fisheye_svp_ros.study.settings import SolverSettings
 
 T = TypeVar('T')
 

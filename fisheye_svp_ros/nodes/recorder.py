@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from fisheye_svp_ros.bags import BagWriter
+from fisheye_svp_ros.io.bags import BagWriter
 
 _COUNTED = ('/image_points', '/result')
 _LATCHED = ('landmarks', 'camera_info', 'rig')

@@ -13,17 +13,18 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
-from fisheye_svp_ros import engines, messages
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
-from fisheye_svp_ros.messages import ImagePoints, LandmarkSet
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode
 from fisheye_svp_ros.nodes.join import StampJoin
-from fisheye_svp_ros.observations import STEREO, Views
+from fisheye_svp_ros.nodes.messages import ImagePoints, LandmarkSet
+from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scenario import model_of
-from fisheye_svp_ros.settings import SolverSettings
+from fisheye_svp_ros.scene.observations import STEREO, Views
+from fisheye_svp_ros.simulate.scenario import model_of
+from fisheye_svp_ros.study.settings import SolverSettings
 
 Items = Mapping[str, Any]
 

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
 
-from fisheye_svp_ros import messages
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.evaluation.errors import (
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
+from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
+from fisheye_svp_ros.scene.observations import STEREO, stereo_views
+from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
+from fisheye_svp_ros.study.metrics import (
     NO_RIG,
     STEREO_CALIBRATION_METRICS,
     stereo_calibration_metrics,
 )
-from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.seen import Seen, scenario_of, seen_in, table_of
-from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
-from fisheye_svp_ros.observations import STEREO, stereo_views
-from fisheye_svp_ros.settings import StereoCalibratorSettings
-from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
+from fisheye_svp_ros.study.settings import StereoCalibratorSettings
 
 
 class StereoCalibrator(SolverNode):

@@ -7,29 +7,29 @@ from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from fisheye_svp_ros import messages
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.clouds import LANDMARKS, structured
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
-from fisheye_svp_ros.evaluation.errors import NO_PAIR, STEREO_DEPTH_METRICS, stereo_depth_metrics
+from fisheye_svp_ros.io.clouds import LANDMARKS, structured
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
-from fisheye_svp_ros.nodes.shapes import camera_shape, epipolar_shapes
+from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
     known_points,
     true_rig,
 )
-from fisheye_svp_ros.observations import STEREO
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.settings import StereoDepthSettings
+from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.stereo_depth import (
     epipolar_curves,
     epipolar_offset,
     triangulate,
     triangulate_optimally,
 )
+from fisheye_svp_ros.study.metrics import NO_PAIR, STEREO_DEPTH_METRICS, stereo_depth_metrics
+from fisheye_svp_ros.study.settings import StereoDepthSettings
 
 
 class StereoDepth(SolverNode):

@@ -10,15 +10,15 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from visualization_msgs.msg import MarkerArray
 
-from fisheye_svp_ros import messages
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, sweep_of
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, rows_by_frame
-from fisheye_svp_ros.nodes.shapes import camera_shape, landmarks_shape, rays_shape
-from fisheye_svp_ros.observations import Observations
-from fisheye_svp_ros.opencv_model import kannala_brandt_equivalent
-from fisheye_svp_ros.parameters import SWEEP, Sweep, changed, sweep_of
-from fisheye_svp_ros.scenario import (
+from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
+from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.simulate.scenario import (
     Scenario,
     Simulation,
     camera_names,
@@ -26,7 +26,7 @@ from fisheye_svp_ros.scenario import (
     scalars,
     simulate_scenario,
 )
-from fisheye_svp_ros.settings import SyntheticCameraSettings
+from fisheye_svp_ros.study.settings import SyntheticCameraSettings
 
 _SAY_EVERY = 1.0  # s, how far the sweep is
 

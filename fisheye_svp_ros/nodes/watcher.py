@@ -11,8 +11,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-from fisheye_svp_ros import messages
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import RELIABLE
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'

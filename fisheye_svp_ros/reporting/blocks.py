@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jinja2
 
-from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.io.files import write_text
 
 
 class Heading(NamedTuple):

@@ -11,8 +11,8 @@ from matplotlib.colors import LogNorm
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.evaluation.budget import QUANTITIES, UNITS, Budget, Point
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
+from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 
 HEADER = ('error', 'SVP causes', 'noise causes', 'limit', 'unit', 'kept', 'nearest range',
           'largest spread')

@@ -13,9 +13,9 @@ from matplotlib.patches import Rectangle
 from scipy import stats
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.criticism.diagnosis import Diagnosis
-from fisheye_svp_ros.criticism.points import PointResiduals
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis.points import PointResiduals
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'

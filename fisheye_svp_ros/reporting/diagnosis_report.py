@@ -10,12 +10,12 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 
-from fisheye_svp_ros.criticism.diagnosis import Diagnosis
-from fisheye_svp_ros.criticism.known_truth import Compared
-from fisheye_svp_ros.criticism.points import PointResiduals
-from fisheye_svp_ros.criticism.selection import SIGNIFICANCE, Step
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis.known_truth import Compared
+from fisheye_svp_ros.diagnosis.points import PointResiduals
+from fisheye_svp_ros.diagnosis.selection import SIGNIFICANCE, Step
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.files import write_text
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.criticism.diagnosis import Cause, Diagnosis
-from fisheye_svp_ros.criticism.known_truth import Compared
+from fisheye_svp_ros.diagnosis.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import with_error
 from fisheye_svp_ros.reporting.target_map import board_maps

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fisheye_svp_ros.criticism.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, round_number
 from fisheye_svp_ros.reporting.plots import picture
 from fisheye_svp_ros.reporting.target_map import BoardMap

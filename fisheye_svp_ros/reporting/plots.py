@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
-from matplotlib.ticker import LogLocator
 
-from fisheye_svp_ros.evaluation.demonstration import Shown
-from fisheye_svp_ros.evaluation.residuals import ResidualField
-from fisheye_svp_ros.files import replacing
-from fisheye_svp_ros.lens import Lens
+from fisheye_svp_ros.io.files import replacing
 
 OURS, PUBLISHED, FAINT = '#1f5fa8', '#e07b28', '#b8bfc7'
 _STYLE: Any = {
@@ -35,11 +29,6 @@ _STYLE: Any = {
     'ytick.color': '#404850',
 }
 _LEGEND_COLUMNS = 4
-_TITLES = {
-    'localization': 'Localization: error along the axis',
-    'calibration': 'Stereo calibration: error of the left camera',
-    'depth': 'Stereo depth: mean error (Error3)',
-}
 
 
 @contextmanager
@@ -68,76 +57,3 @@ def legend_below(figure: Figure, *axes: Any) -> None:
     layout: Any = figure.get_layout_engine()
     layout.set(rect=(0.0, height, 1.0, 1.0 - height))
     figure.legend(list(entries.values()), list(entries), loc='lower center', ncols=columns)
-
-
-def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
-    """Draw the errors of the demo beside the published ones: a column a task, a row a lens."""
-    lenses = list(dict.fromkeys(row.lens for row in rows))
-    with picture(path, 11.0, 1.2 + 2.6 * len(lenses)) as figure:
-        axes = figure.subplots(len(lenses), len(_TITLES), squeeze=False)
-        for line, lens in zip(axes, lenses, strict=True):
-            for axis, (task, title) in zip(line, _TITLES.items(), strict=True):
-                mine = [row for row in rows if (row.lens, row.task) == (lens, task)]
-                _draw_errors(axis, mine)
-                axis.set_title(f'{title}\n{lens}' if lens == lenses[0] else lens, loc='left')
-                if lens == lenses[-1]:
-                    axis.set_xlabel('mm')
-        legend_below(figure, *axes[0])
-
-
-def _draw_errors(axis: Any, rows: Sequence[Shown]) -> None:
-    place = np.arange(len(rows))[::-1]
-    ours = 1e3 * np.array([row.error for row in rows])
-    low, high = 1e3 * np.array([row.published_error for row in rows]).T
-    if rows[0].task == 'depth':
-        axis.axvspan(low[0], high[0], color=PUBLISHED, alpha=0.15, linewidth=0,
-                     label='published range')
-        axis.set_xscale('log')
-        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter('{x:g}')
-        axis.xaxis.set_minor_formatter('')
-    else:
-        axis.hlines(place, ours, low, color=FAINT, linewidth=1.5)
-        axis.plot(low, place, 'o', color=PUBLISHED, label='published', fillstyle='none')
-        axis.axvline(0.0, color='#808890', linewidth=0.8)
-    axis.plot(ours, place, 'o', color=OURS, label='from the recording', markersize=5)
-    axis.set_yticks(place, [f'{row.where} {row.radius:g} m' for row in rows])
-    axis.grid(visible=False, axis='y')
-
-
-def draw_residual_fields(
-    fields: Sequence[ResidualField], lenses: Mapping[str, Lens], path: Path
-) -> None:
-    """Draw the residuals of localization over the image, magnified (figure 6): a row a lens."""
-    names = list(dict.fromkeys(field.lens for field in fields))
-    columns = max(sum(field.lens == name for field in fields) for name in names)
-    with picture(path, 3.4 * columns, 0.3 + 3.7 * len(names)) as figure:
-        axes = figure.subplots(len(names), columns, squeeze=False)
-        for line, name in zip(axes, names, strict=True):
-            mine = [field for field in fields if field.lens == name]
-            for axis, field in zip(line, mine, strict=False):
-                _draw_field(axis, field, lenses[name])
-
-
-def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
-    edge, _ = lens.image_height.value_and_slope(np.array(lens.max_incidence))
-    axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
-    size = np.linalg.norm(field.residual, axis=-1)
-    # The longest residual takes an eighth of the image, whatever it is.
-    factor = _round_down(lens.width / 8 / size.max())
-    axis.quiver(*field.uv.T, *(factor * field.residual.T), angles='xy', scale_units='xy', scale=1,
-                color=OURS, width=0.005)
-    axis.plot(*field.uv.T, 'o', markersize=3, color='#404850')
-    corner, margin = (-0.5, -0.5), 0.1 * lens.width
-    axis.add_patch(Rectangle(corner, lens.width, lens.height, fill=False, color=FAINT))
-    axis.set(xlim=(-margin, lens.width + margin), ylim=(lens.height + margin, -margin))
-    axis.set_aspect('equal')
-    axis.axis('off')
-    axis.set_title(f'{field.lens}, landmarks at {field.radius:g} m\n'
-                   f'residual {size.mean():.2g} px on average, x {factor:g}', loc='left')
-
-
-def _round_down(value: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
-    decade = 10.0 ** np.floor(np.log10(value))
-    return float(decade * max(step for step in (1, 2, 5) if step * decade <= value))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.evaluation.recording import STAMP
+from fisheye_svp_ros.io.recording_table import STAMP
 from fisheye_svp_ros.reporting.plots import picture
 
 _SHOWN = {

@@ -10,8 +10,10 @@ import numpy as np
 from matplotlib.colors import LogNorm
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.clouds import Points
-from fisheye_svp_ros.evaluation.dependence import (
+from fisheye_svp_ros.io.clouds import Points
+from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
+from fisheye_svp_ros.reporting.runs_plot import draw_runs
+from fisheye_svp_ros.study.dependence import (
     Table,
     curves,
     grid,
@@ -19,8 +21,6 @@ from fisheye_svp_ros.evaluation.dependence import (
     noise_spreads,
     swept_parameters,
 )
-from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
-from fisheye_svp_ros.reporting.runs_plot import draw_runs
 
 _COLOURS = 'viridis'
 _HUES, _LINES = 8, ('-', '--', ':', '-.')  # colours and lines that can be told apart

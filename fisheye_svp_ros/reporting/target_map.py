@@ -7,12 +7,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.boards import find_boards
-from fisheye_svp_ros.criticism.model import Linearised
+from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.forward import Term
-from fisheye_svp_ros.observations import views_of
 from fisheye_svp_ros.pose import cross_matrix, identity
+from fisheye_svp_ros.scene.boards import find_boards
+from fisheye_svp_ros.scene.observations import views_of
 
 
 class BoardMap(NamedTuple):

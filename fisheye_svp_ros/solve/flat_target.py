@@ -10,8 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.observations import Views
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize
 
 _FLAT = 0.1  # thickness of a target relative to its length

@@ -7,17 +7,16 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.optics.engines.stopping import (
+    MAX_ITERATIONS,
+    NOISE,
+    ROUNDING,
+    STEP_TOLERANCE,
+    STUCK,
+)
 
 Arrays = tuple[Array, ...]
 
-MAX_ITERATIONS = 60
-# A step that would move the whitened residuals by less than this (their 2-norm) is the last one;
-# so is one after which, as steps shrink, the next would be that small beside the residuals.
-STEP_TOLERANCE = 2e-9
-ROUNDING = 1e-13
-# Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
-NOISE = 1e-11
-STUCK = 1e12
 _LEAST = 1e-300  # what is divided by in place of 0
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 

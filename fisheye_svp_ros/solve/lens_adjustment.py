@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.camera import lens_columns
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.optics.camera import lens_columns
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import (
     ArrowEquations,
     arrow_covariance,

@@ -8,13 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.camera import back_project, incidence
-from fisheye_svp_ros.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
-from fisheye_svp_ros.lens import INTRINSICS, Lens, check_lens
-from fisheye_svp_ros.observations import Observations, Views
+from fisheye_svp_ros.optics.camera import back_project, incidence
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import (

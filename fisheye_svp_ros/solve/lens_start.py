@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.camera import back_project, project
-from fisheye_svp_ros.lens import Lens
-from fisheye_svp_ros.observations import Views, views_of
+from fisheye_svp_ros.optics.camera import back_project, project
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 
 # Incidence angles between which the farthest image corner is looked for, rad, and in how many

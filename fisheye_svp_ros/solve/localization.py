@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.engines.answers import Localization as Localization
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.least_squares import (
     Arrays,

@@ -9,7 +9,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
-from fisheye_svp_ros.observations import Observations, Views, group_views
+from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization
 

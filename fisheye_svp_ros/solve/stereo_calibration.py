@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros import engines
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.observations import Views
+from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, Solved, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals

@@ -12,8 +12,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews
-from fisheye_svp_ros.observations import Views, views_of
 from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import normal_equations
 

@@ -1,0 +1,395 @@
+"""The simulation under criticism: poses, rig, intrinsics and effects against one table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
+from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.optics.camera import lens_columns
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
+from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.scene.observations import Observations, Views, group_views
+from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
+from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.localization import localize
+
+
+@dataclass(frozen=True)
+class Data:
+    """A table in the batch forms that criticism needs.
+
+    views: S views of up to N points; frame_of, camera_of (S,): which frame (0..F-1) and camera
+    (0..C-1) a view belongs to; poses: true poses (F,) of the rig where they are known; displaced:
+    landmarks so far off in most of their views that they have to be tested together.
+    """
+
+    observations: Observations
+    views: Views
+    frame_of: Index
+    camera_of: Index
+    poses: Pose | None = None
+    displaced: tuple[int, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        return int(self.frame_of.max()) + 1
+
+    @property
+    def cameras(self) -> int:
+        return int(self.camera_of.max()) + 1
+
+    def blocks(self, values: Array) -> Array:
+        """Gather (S, N, 2, ...) by frame, (F, C * N * 2, ...), zero where a view is missing."""
+        shape = (self.frames, self.cameras, *values.shape[1:])
+        blocks = np.zeros(shape)
+        blocks[self.frame_of, self.camera_of] = values
+        rows = self.cameras * values.shape[1] * values.shape[2]
+        return blocks.reshape(self.frames, rows, *values.shape[3:])
+
+
+@dataclass(frozen=True)
+class State:
+    """A fit: poses (F,) of the rig's body, rig (C,) of the cameras in it, lens, effects."""
+
+    pose: Pose
+    rig: Pose
+    lens: Lens
+    terms: tuple[Term, ...]
+
+    def view_poses(self, data: Data) -> Pose:
+        """Return the camera's pose in each view (S,)."""
+        return self.pose.take(data.frame_of).compose(self.rig.take(data.camera_of))
+
+
+def prepare(observations: Observations, poses: dict[int, Pose] | None = None) -> Data:
+    """Group a table by view; sigma is 1 px where the table does not say.
+
+    poses: true poses by frame number; they are kept fixed in the fits.
+    """
+    views = group_views(observations)
+    numbers, frame_of = np.unique(views.frame, return_inverse=True)
+    _, camera_of = np.unique(views.camera, return_inverse=True)
+    known = None
+    if poses is not None:
+        chosen = [poses[int(number)] for number in numbers]
+        known = Pose(
+            np.stack([p.rotation for p in chosen]), np.stack([p.position for p in chosen])
+        )
+    return Data(observations, views, frame_of.reshape(-1), camera_of.reshape(-1), known)
+
+
+def intrinsic_names(lens: Lens) -> tuple[str, ...]:
+    """Return the intrinsics that a calibration frees: the four, and the height's coefficients."""
+    return (*INTRINSICS, *lens.image_height.coefficient_names)
+
+
+def start(data: Data, lens: Lens) -> State:
+    """Localize every view with the lens as it is; take the rig from the median of the frames.
+
+    Raises GeometryError, naming the frame, where a view has too few points.
+    """
+    model = ForwardModel(lens)
+    solved = localize(model, data.views).pose
+    pose = data.poses or _frame_poses(data, solved, identity(data.cameras))
+    rig = identity(data.cameras)
+    for camera in range(1, data.cameras):
+        mine = np.flatnonzero(data.camera_of == camera)
+        relative = pose.take(data.frame_of[mine]).inverse().compose(solved.take(mine))
+        middle = np.argsort(np.linalg.norm(relative.position, axis=1))[len(mine) // 2]
+        rig.rotation[camera] = relative.rotation[middle]
+        rig.position[camera] = relative.position[middle]
+    return State(pose, rig, replace(lens, effects={}), model.terms)
+
+
+def start_poses(data: Data, trained: State) -> State:
+    """Return a state fitted to other data with the poses of these frames; all else is kept."""
+    solved = localize(ForwardModel(trained.lens, trained.terms), data.views).pose
+    pose = data.poses or _frame_poses(data, solved, trained.rig)
+    return fit_poses(data, replace(trained, pose=pose))
+
+
+def _frame_poses(data: Data, solved: Pose, rig: Pose) -> Pose:
+    """Return frame poses (F,) from those of the views, from the first camera where it saw."""
+    body = solved.compose(rig.take(data.camera_of).inverse())
+    first = np.unique(data.frame_of, return_index=True)[1]
+    return body.take(first)
+
+
+class Linearised:
+    """A state's residuals and derivatives, whitened and gathered by frame.
+
+    residual (F, M), whitened, measured minus predicted; frame_columns (F, M, 6): by the pose of
+    the frame (zero where poses are known); shared_columns (F, M, K): by rig, free intrinsics and
+    the parameters of the effects, in this order.
+    """
+
+    def __init__(self, data: Data, state: State, free: Sequence[str]) -> None:
+        self.data, self.state = data, state
+        self.model = ForwardModel(state.lens, state.terms)
+        pose = state.view_poses(data)
+        self.linear: LinearViews = self.model.linearise(pose, data.views)
+        self.scene: Scene = self.model.scene(pose, data.views, self.linear)
+        self.weight = data.views.weight * noise_weight(state.terms, self.scene)
+        with np.errstate(invalid='ignore'):
+            offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
+        self.residual = data.blocks(offset * self.weight[..., None])
+        frame, rig = self._pose_columns(pose)
+        self.frame_columns = self.whitened(frame)
+        shared = [rig, lens_columns(self.model.lens, self.linear.image, list(free))]
+        shared += [
+            self.model.effect_columns(effect, self.scene, self.linear)
+            for effect, _ in state.terms if is_shared(effect)
+        ]
+        self.shared_columns = self.whitened(np.concatenate(shared, axis=-1))
+
+    @cached_property
+    def rows(self) -> Rows:
+        """What each row (F, M) belongs to."""
+        return Rows.of(self)
+
+    def whitened(self, columns: Array) -> Array:
+        """Gather columns (S, N, 2, P) as (F, M, P), whitened, zero for padding."""
+        weight = self.weight[..., None, None]
+        return self.data.blocks(np.where(weight > 0, columns * weight, 0.0))
+
+    def effect_columns(self, effect: Effect) -> Array:
+        """Whitened columns (F, M, P) by the parameters of one more effect."""
+        return self.whitened(self.model.effect_columns(effect, self.scene, self.linear))
+
+    def _pose_columns(self, pose: Pose) -> tuple[Array, Array]:
+        d_place, d_turn = self.linear.d_pose[..., :3], self.linear.d_pose[..., 3:]
+        # The frame turns about the rig's body: a camera off its origin also moves.
+        arm = pose.position - self.state.pose.position[self.data.frame_of]
+        lever = d_place @ -cross_matrix(arm)[:, None]
+        frame = np.concatenate([d_place, d_turn + lever], axis=-1)
+        if self.data.poses is not None:
+            frame = np.zeros_like(frame)
+        body = self.state.pose.rotation[self.data.frame_of][:, None]
+        rig = np.concatenate([d_place @ body, d_turn @ body], axis=-1)
+        mine = self.data.camera_of[:, None] == np.arange(1, self.data.cameras)
+        columns = rig[..., None, :] * mine[:, None, None, :, None]
+        return frame, columns.reshape(*rig.shape[:3], -1)
+
+
+class Rows(NamedTuple):
+    """Labels of the rows (F, M): used, landmark, camera, point (which observation of the frame).
+
+    survey (F, M): place among the landmarks that are free, -1 for none.
+    """
+
+    used: Mask
+    landmark: Index
+    survey: Index
+
+    @classmethod
+    def of(cls, linear: Linearised) -> Rows:
+        """Label the rows of a linearised state."""
+        data, both = linear.data, np.ones(2)
+        used = data.blocks((linear.weight > 0)[..., None] * both) > 0
+        landmark = data.blocks(data.views.landmark[..., None] * both).astype(np.int64)
+        free = survey_of(linear.state.terms)
+        survey = np.full(landmark.shape, -1) if free is None else free.slots(landmark)
+        return cls(used, landmark, np.where(used, survey, -1))
+
+
+def survey_of(terms: Sequence[Term]) -> LandmarkSurveyEffect | None:
+    """Return the effect that frees every landmark, if it is among the terms."""
+    for effect, _ in terms:
+        if isinstance(effect, LandmarkSurveyEffect) and effect.everywhere:
+            return effect
+    return None
+
+
+def is_shared(effect: Effect) -> bool:
+    """Whether an effect's parameters stand among the shared ones of a fit.
+
+    Not those of noise effects, and not a survey of all landmarks, which has blocks of its own.
+    """
+    everywhere = isinstance(effect, LandmarkSurveyEffect) and effect.everywhere
+    return effect.stage != 'noise' and not everywhere
+
+
+def on_target(linear: Linearised) -> Mask:
+    """Which shared columns (K,) belong to effects on the target."""
+    effects = [effect for effect, _ in linear.state.terms if is_shared(effect)]
+    mine = [effect.stage == 'target' for effect in effects for _ in effect.parameters]
+    mask = np.zeros(linear.shared_columns.shape[-1], dtype=bool)
+    mask[len(mask) - len(mine) :] = mine
+    return mask
+
+
+def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
+    """Return the factor (S, N) by which noise effects lower the weight of observations."""
+    scale: Array | float = 1.0
+    for effect, values in terms:
+        if isinstance(effect, NoiseEffect):
+            scale = scale / effect.noise_scale(scene, values)
+    return scale
+
+
+def fit(data: Data, state: State, free: Sequence[str]) -> State:
+    """Refit poses, rig, free intrinsics and effect values together (maximum likelihood).
+
+    The frames are the blocks of one arrow; with all landmarks free, the landmarks are.
+    """
+    problem: _Fit = _Fit(data, state, free)
+    iterations = 30
+    if survey_of(state.terms) is not None:
+        # Free landmarks leave the target's own place open: after a few steps only that moves.
+        problem, iterations = _SurveyFit(data, state, free), 6
+    return problem.unpack(levenberg_marquardt(problem, problem.pack(state), iterations).state)
+
+
+def fit_poses(data: Data, state: State) -> State:
+    """Refit the poses of the frames alone."""
+    problem = _Fit(data, state, (), poses_only=True)
+    return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
+
+
+class _Fit:
+    """One arrow system: frames are the blocks; rig, intrinsics and effects are shared."""
+
+    def __init__(
+        self, data: Data, template: State, free: Sequence[str], poses_only: bool = False
+    ) -> None:
+        self._data, self._template, self._free = data, template, tuple(free)
+        self._poses_only = poses_only
+
+    def pack(self, state: State) -> Arrays:
+        lens = [state.lens.parameters[name] for name in self._free]
+        values = [v for effect, v in state.terms if is_shared(effect)]
+        survey = [v for effect, v in self._own_terms(state)]
+        parts = (*state.pose, *state.rig, np.concatenate([np.array(lens), *values]))
+        return tuple(array[None] for array in (*parts, np.concatenate([np.zeros(0), *survey])))
+
+    def unpack(self, packed: Arrays) -> State:
+        rotation, position, rig_rotation, rig_position, shared, own = (a[0] for a in packed)
+        count = len(self._free)
+        lens = self._template.lens.with_parameters(self._free, list(shared[:count]))
+        solved: dict[str, Array] = {}
+        both = [term for term in self._template.terms if is_shared(term[0])]
+        for parts, values in ((both, shared[count:]), (self._own_terms(self._template), own)):
+            for effect, known in parts:
+                solved[effect.name] = values[: len(known)]
+                values = values[len(known) :]
+        terms = [(effect, solved[effect.name]) for effect, _ in self._template.terms]
+        rig = Pose(rig_rotation, rig_position)
+        return State(Pose(rotation, position), rig, lens, tuple(terms))
+
+    def _own_terms(self, state: State) -> list[Term]:
+        """Return the terms outside the shared parameters: the survey first, then noise."""
+        own = [term for term in state.terms if not is_shared(term[0])]
+        return sorted(own, key=lambda term: isinstance(term[0], NoiseEffect))
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        if not len(index):
+            return np.zeros(0), ()
+        linear = Linearised(self._data, self.unpack(state), self._free)
+        # A column of zeros leaves its parameter where it is.
+        shared = linear.shared_columns * (0.0 if self._poses_only else 1.0)
+        return _equations(linear.residual, linear.frame_columns, shared)
+
+    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+        return arrow_step(normal, damping)
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        block, change = step
+        return self._moved(state, block, change, np.zeros_like(state[5]))
+
+    def _moved(self, state: Arrays, frame: Array, shared: Array, own: Array) -> Arrays:
+        rotation, position, rig_rotation, rig_position, values, survey = state
+        cameras = 6 * (self._data.cameras - 1)
+        move = np.zeros((len(shared), self._data.cameras, 6))
+        move[:, 1:] = shared[:, :cameras].reshape(len(shared), -1, 6)
+        return (
+            *Pose(rotation, position).retract(frame),
+            *Pose(rig_rotation, rig_position).retract(move),
+            values + shared[:, cameras:],
+            survey + own,
+        )
+
+
+class _SurveyFit(_Fit):
+    """The same with every landmark free: landmarks are the blocks, poses join what is shared."""
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        if not len(index):
+            return np.zeros(0), ()
+        linear = Linearised(self._data, self.unpack(state), self._free)
+        place = linear.whitened(linear.linear.d_target)
+        group = landmark_groups(linear.rows.landmark, linear.rows.used)
+        slot = gather(linear.rows.survey[..., None].astype(float), group)[:, :1].astype(int)
+        block = np.where(slot >= 0, gather(place, group), 0.0)
+        # Other effects on the target are contained in free landmarks: they stay as they were.
+        shared = linear.shared_columns * ~on_target(linear)
+        others = np.concatenate([dense_frames(linear.frame_columns), shared], axis=-1)
+        self._slots = slot[:, 0, 0]
+        residual = gather(linear.residual[..., None], group)[..., 0]
+        return _equations(residual, block, gather(others, group))
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        block, change = step
+        frames = 6 * self._data.frames
+        own = np.zeros_like(state[5])
+        free = self._slots >= 0
+        # The survey's values stand first; what follows belongs to noise effects and stays.
+        places = 3 * self._slots[free][:, None] + np.arange(3)
+        own[:, places] = block[:, free]
+        frame = change[:, :frames].reshape(1, -1, 6)
+        return self._moved(state, frame, change[:, frames:], own)
+
+
+def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arrays]:
+    """Return cost (1,) and arrow of rows (V, M) with columns (V, M, B) and (V, M, K)."""
+    cost = float((residual**2).sum())
+    if not np.isfinite(cost):
+        residual, block, shared = (np.zeros_like(a) for a in (residual, block, shared))
+        cost = np.inf
+    flat = flat_rows(shared)
+    transposed = np.ascontiguousarray(np.swapaxes(block, -1, -2))
+    equations = ArrowEquations(
+        (transposed @ block)[None],
+        (transposed @ shared)[None],
+        (flat.T @ flat)[None],
+        -(transposed @ residual[..., None])[None, ..., 0],
+        -(flat.T @ residual.ravel())[None],
+    )
+    return np.array([cost]), tuple(equations)
+
+
+def landmark_groups(landmark: Index, used: Mask) -> Index:
+    """Return the flat rows (L, m) of each landmark, padded with the number of rows (a blank)."""
+    flat = np.flatnonzero(used)
+    ids, group, counts = np.unique(landmark.ravel()[flat], return_inverse=True, return_counts=True)
+    order = np.argsort(group, kind='stable')
+    rank = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows = np.full((len(ids), counts.max()), used.size)
+    rows[group[order], rank] = flat[order]
+    return rows
+
+
+def gather(columns: Array, group: Index) -> Array:
+    """Return columns (F, M, P) by group, (L, m, P), zero for padding."""
+    flat = flat_rows(columns)
+    return np.concatenate([flat, np.zeros_like(flat[:1])])[group]
+
+
+def flat_rows(columns: Array) -> Array:
+    """Return columns (..., P) as (rows, P), also where P is 0."""
+    return columns.reshape(int(np.prod(columns.shape[:-1])), columns.shape[-1])
+
+
+def dense_frames(columns: Array) -> Array:
+    """Return columns by single frames (F, M, 6) as (F, M, 6 F), zero in all other frames."""
+    frames, rows, width = columns.shape
+    dense = np.zeros((frames, rows, frames, width))
+    dense[np.arange(frames), :, np.arange(frames)] = columns
+    return dense.reshape(frames, rows, -1)

@@ -1,0 +1,148 @@
+"""Causes that move no prediction: wrong ids, quantisation, noise that grows with the angle."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize, stats
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.diagnosis.projection import Nuisance
+from fisheye_svp_ros.diagnosis.structure import standardised_squares
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.localization import localize
+
+_GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
+_GATE = 6.0  # and within which it belongs to another one
+_SUSPECT = 6.0  # below this no point is worth a robust fit
+_FADE = 2.0
+_MEDIAN = 1.1774  # of the norm of two standard normal coordinates
+_ROUNDS = 8
+
+
+class Gross(NamedTuple):
+    """Gross errors of a table: outlying rows of it, and which of them fit another landmark."""
+
+    rows: Index
+    swapped: Mask
+
+
+class NoiseCause(NamedTuple):
+    """A cause without a pattern: value, standard error, p-value."""
+
+    value: float
+    stderr: float
+    p_value: float
+
+
+def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
+    """Return the data without gross errors and with `displaced`, and what the errors were.
+
+    Every view is localized with weights that fade for points far from their prediction (Cauchy),
+    on the scale of the median residual of that view or of all, whichever is larger: a view that
+    a model error bends as a whole holds no gross error, nor does a landmark that is off in most
+    of its views.
+    """
+    model = ForwardModel(state.lens, state.terms)
+    views, pose = data.views, state.view_poses(data)
+    scale, offset = _scale(views, _offset(model, pose, views))
+    if np.nanmax(offset / scale) > _SUSPECT:
+        for _ in range(_ROUNDS):
+            fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
+            weight = np.where(views.used, views.weight * fading, 0.0)
+            pose = localize(model, views._replace(weight=weight), pose).pose
+            scale, offset = _scale(views, _offset(model, pose, views))
+    of_landmark = _scale_of_landmark(views, offset)
+    far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark))
+    displaced = np.unique(views.landmark[views.used & (of_landmark > _GROSS * scale)])
+    swapped = _fits_another(model, pose, views, far, _GATE * float(np.median(scale)))
+    rows = views.row[far]
+    order = np.argsort(rows)
+    clean = views._replace(
+        weight=np.where(far, 0.0, views.weight), row=np.where(far, -1, views.row)
+    )
+    found = replace(data, views=clean, displaced=tuple(displaced.tolist()))
+    return found, Gross(rows[order], swapped[far][order])
+
+
+def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
+    """Distances (S, N) of the points from their predictions, px; NaN for padding."""
+    distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
+    return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
+
+
+def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
+    """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
+    median = np.nanmedian(offset, axis=1, keepdims=True)
+    return np.maximum(median, np.nanmedian(offset)) / _MEDIAN, offset
+
+
+def _scale_of_landmark(views: Views, offset: Array) -> Array:
+    """Robust standard deviations (S, N) of a coordinate, one a landmark."""
+    scale = np.zeros_like(offset)
+    for landmark in np.unique(views.landmark[views.used]):
+        mine = views.used & (views.landmark == landmark)
+        scale[mine] = np.median(offset[mine]) / _MEDIAN
+    return scale
+
+
+def quantisation_step(uv: Array) -> float:
+    """Return the largest step of which all coordinates (M, 2) are multiples, px; 0 for none."""
+    values = np.unique(uv.ravel())
+    gaps = np.diff(values)
+    if len(values) < 8 or not len(gaps):
+        return 0.0
+    step = float(gaps[gaps > 1e-9].min(initial=np.inf))
+    offsets = (values - values[0]) / step
+    return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
+
+
+def noise_growth(linear: Linearised, nuisance: Nuisance) -> NoiseCause:
+    """Fit sigma(theta) = sigma0 exp(growth theta^2) to the residuals (likelihood-ratio test)."""
+    used = linear.rows.used
+    e2 = standardised_squares(linear, nuisance)[used]
+    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[used]
+    z = theta**2 - (theta**2).mean()
+
+    def deviance(growth: float) -> float:
+        # With z centred the mean of log sigma does not change: only the scale is profiled out.
+        return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
+
+    best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
+    gain = deviance(0.0) - float(best.fun)
+    stderr = 1 / np.sqrt(2 * float((z**2).sum()))
+    return NoiseCause(float(best.x), float(stderr), float(stats.chi2.sf(max(gain, 0.0), 1)))
+
+
+def with_noise_growth(state: State, growth: float) -> State:
+    """Return the state with weights for noise that grows with the angle."""
+    term = (NoiseVsAngleEffect(), np.array([growth]))
+    return replace(state, terms=(*state.terms, term))
+
+
+def _fits_another(
+    model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
+) -> Mask:
+    """Which far points (S, N) lie where another landmark of the table is predicted."""
+    ids, first = np.unique(views.landmark[views.used], return_index=True)
+    points = views.points[views.used][first]
+    swapped = np.zeros_like(far)
+    for view in np.flatnonzero(far.any(axis=1)):
+        single = views.take(slice(view, view + 1))._replace(
+            points=points[None], board=np.zeros((1, len(ids)), dtype=np.int64),
+            landmark=ids[None], t=np.full((1, len(ids)), np.nan),
+            uv=np.zeros((1, len(ids), 2)), row=np.arange(len(ids))[None],
+        )
+        here = pose.take(slice(view, view + 1))
+        seen = model.linearise(here, single).uv[0]
+        for point in np.flatnonzero(far[view]):
+            other = ids != views.landmark[view, point]
+            off = np.linalg.norm(seen - views.uv[view, point], axis=-1)
+            swapped[view, point] = bool(np.nanmin(np.where(other, off, np.inf)) < gate)
+    return swapped

@@ -1,1 +1,0 @@
-"""What the approximation costs: numbers only."""

@@ -1,0 +1,133 @@
+"""CSV tables with a header: columns as numbers, with errors that name file, line and column."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.files import write_text
+
+
+class Table:
+    """The cells of a CSV file by column, in any column order."""
+
+    def __init__(self, path: Path, required: Sequence[str]) -> None:
+        """Read the file; raises ObservationError unless all required columns are there."""
+        self.path = path
+        self._lines: list[int] = []
+        rows = []
+        try:
+            with path.open(newline='', encoding='utf-8-sig') as stream:
+                reader = csv.reader(stream)
+                self._header = [name.strip() for name in next(reader, [])]
+                self._check_header(required)
+                for row in reader:
+                    if not row:
+                        continue
+                    if len(row) != len(self._header):
+                        raise ObservationError(
+                            f'{path}, line {reader.line_num}: {len(row)} fields where the header '
+                            f'has {len(self._header)}'
+                        )
+                    rows.append(row)
+                    self._lines.append(reader.line_num)
+        except OSError as cause:
+            raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
+        except (UnicodeDecodeError, csv.Error) as cause:
+            raise ObservationError(f'{path}: not a CSV file in UTF-8 ({cause})') from cause
+        if not rows:
+            raise ObservationError(f'{path}: no row below the header; at least one is needed')
+        self._columns = dict(zip(self._header, zip(*rows, strict=True), strict=True))
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._header
+
+    def text(self, name: str) -> tuple[str, ...]:
+        """Return the cells of a column."""
+        return self._columns[name]
+
+    def numbers(self, *names: str) -> Array:
+        """Return columns as finite numbers, (N, len(names))."""
+        return np.stack([self._numbers(name) for name in names], axis=-1)
+
+    def whole(self, name: str) -> Index:
+        """Return a column of whole numbers (N,), 0 or above."""
+        values = self._numbers(name)
+        bad = (values != np.floor(values)) | (values < 0) | (values > 2**53)
+        self.refuse(bad, name, 'a whole number from 0 up')
+        return values.astype(np.int64)
+
+    def refuse(self, bad: Sequence[bool] | Mask, name: str, needed: str) -> None:
+        """Raise ObservationError for the first row that is bad: what the column needs there."""
+        rows = np.flatnonzero(bad)
+        if rows.size:
+            cell = self._columns[name][rows[0]]
+            raise ObservationError(
+                f'{self.path}, line {self.line(rows[0])}: {name} is {cell!r}; {needed} is needed'
+            )
+
+    def line(self, row: int) -> int:
+        """Return the line of the file on which a row ends."""
+        return self._lines[row]
+
+    def refuse_repeats(self, keys: Array | Index, what: str) -> None:
+        """Raise ObservationError where two rows have the same key (N, K)."""
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        again = np.flatnonzero(first[inverse.reshape(-1)] != np.arange(len(keys)))
+        if again.size:
+            before = self.line(first[inverse.reshape(-1)[again[0]]])
+            raise ObservationError(
+                f'{self.path}, line {self.line(again[0])}: the same {what} as in line {before}; '
+                'remove one of them'
+            )
+
+    def _check_header(self, required: Sequence[str]) -> None:
+        wanted = ','.join(required)
+        if not any(self._header):
+            raise ObservationError(f'{self.path}: it is empty; a header with {wanted} is needed')
+        for name in required:
+            if name not in self._header:
+                raise ObservationError(
+                    f'{self.path}: column {name!r} is missing from its header; needed are {wanted}'
+                )
+        twice = [name for name in self._header if name and self._header.count(name) > 1]
+        if twice:
+            raise ObservationError(f'{self.path}: its header has {twice[0]!r} twice')
+
+    def _numbers(self, name: str) -> Array:
+        cells = self._columns[name]
+        try:
+            values = np.array(cells, dtype=float)
+        except ValueError:
+            self.refuse([not _is_number(cell) for cell in cells], name, 'a number')
+            raise
+        self.refuse(~np.isfinite(values), name, 'a finite number')
+        return values
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def write_table(path: str | Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write columns (N,) as CSV; numbers read back to the same bits.
+
+    Raises OutputError where the file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator='\n')
+    writer.writerow(columns)
+    writer.writerows(zip(*(values.tolist() for values in columns.values()), strict=True))
+    write_text(path, text.getvalue())

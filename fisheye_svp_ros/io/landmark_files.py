@@ -1,0 +1,55 @@
+"""Landmarks from files: Kita's environment, and landmarks as CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.files import read_yaml
+from fisheye_svp_ros.io.share import config_path
+from fisheye_svp_ros.scene.landmarks import SPREADS, Landmarks, check_landmarks
+
+
+def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:
+    """Return Kita's environment: `spread` whole, inner or outer, `radius` in m (section 3).
+
+    layout: YAML with the `directions` of the landmarks, default `config/environments/kita.yaml`.
+    Directions are given by incidence angle and azimuth around -z, degrees.
+    Raises ObservationError for an unknown spread or an impossible radius.
+    """
+    if spread not in SPREADS:
+        known = ', '.join(SPREADS)
+        raise ObservationError(f'environment {spread!r} is unknown; known are {known}')
+    if not (np.isfinite(radius) and radius > 0):
+        raise ObservationError(f'environment radius is {radius} m; it must be above 0')
+    path = config_path('environments/kita.yaml') if layout is None else Path(layout)
+    document = read_yaml(path, ObservationError)
+    try:
+        groups = {name: np.array(document[name], dtype=float) for name in ('inner', 'outer')}
+        counts = [len(groups['inner']), len(groups['outer'])]
+        incidence, azimuth = np.radians(np.concatenate(list(groups.values()))).T
+    except (KeyError, ValueError, IndexError, TypeError) as cause:
+        raise ObservationError(
+            f'{path}: inner and outer must each be a list of [incidence_deg, azimuth_deg]'
+        ) from cause
+    directions = np.stack([
+        np.sin(incidence) * np.cos(azimuth),
+        np.sin(incidence) * np.sin(azimuth),
+        -np.cos(incidence),
+    ], axis=-1)
+    chosen = np.repeat([spread in ('whole', 'inner'), spread in ('whole', 'outer')], counts)
+    landmarks = Landmarks(np.flatnonzero(chosen), radius * directions[chosen])
+    return check_landmarks(landmarks, str(path))
+
+
+def load_landmarks(path: str | Path) -> Landmarks:
+    """Read landmarks from a CSV with the columns landmark, x, y, z (m).
+
+    Raises ObservationError naming file, line and column.
+    """
+    table = Table(Path(path), ('landmark', 'x', 'y', 'z'))
+    landmarks = Landmarks(table.whole('landmark'), table.numbers('x', 'y', 'z'))
+    return check_landmarks(landmarks, str(path))

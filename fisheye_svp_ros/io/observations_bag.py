@@ -1,0 +1,93 @@
+"""Observations from the project's own recordings: landmarks and image points joined by stamp."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.clouds import IMAGE_POINTS, LANDMARKS, Points, stamp_of, unpack
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+_CLOUD = 'sensor_msgs/msg/PointCloud2'
+_NAMES = ('landmarks', 'image_points')
+
+
+class _Set(NamedTuple):
+    stamp: int
+    camera: str
+    points: Points
+
+
+def read(path: str | Path) -> Observations:
+    """Read a recording; a frame is a stamp, a camera the namespace of its image points.
+
+    t is the stamp, s.  Raises BagError for a recording that cannot be read and
+    ObservationError, naming the topic, where it does not hold one world's observations.
+    """
+    bag = Bag(path)
+    landmarks: dict[int, Landmarks] = {}
+    worlds: set[str] = set()
+    sets: list[_Set] = []
+    for record in bag.records(_is_wanted):
+        stamp = stamp_of(record.message)
+        namespace, _, name = record.topic.rpartition('/')
+        where = f'{path}, {record.topic}'
+        if name == 'landmarks':
+            worlds.add(namespace)
+            cloud = unpack(record.message, LANDMARKS, where)
+            xyz = np.stack([cloud[axis] for axis in 'xyz'], axis=-1)
+            landmarks[stamp] = Landmarks(cloud['landmark'].astype(np.int64), xyz)
+        else:
+            sets.append(_Set(stamp, namespace, unpack(record.message, IMAGE_POINTS, where)))
+    if len(worlds) != 1 or not sets:
+        found = ', '.join(sorted(worlds)) or 'none'
+        raise ObservationError(
+            f'{path}: observations need image_points and landmarks of one namespace; landmarks '
+            f'are in: {found}'
+        )
+    return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
+
+
+def _table(
+    sets: list[_Set], landmarks: dict[int, Landmarks], world: str, source: str
+) -> Observations:
+    stamps = sorted({one.stamp for one in sets})
+    frames = {stamp: frame for frame, stamp in enumerate(stamps)}
+    cameras = tuple(dict.fromkeys(one.camera.removeprefix(world).lstrip('/') for one in sets))
+    counts = [len(one.points) for one in sets]
+    ids = np.concatenate([one.points['landmark'] for one in sets]).astype(np.int64)
+    uv = [np.stack([one.points['u'], one.points['v']], axis=-1) for one in sets]
+    names = [cameras.index(one.camera.removeprefix(world).lstrip('/')) for one in sets]
+    return make_observations(
+        np.repeat([frames[one.stamp] for one in sets], counts),
+        ids,
+        np.concatenate(uv),
+        np.concatenate([_places(one, landmarks, source) for one in sets]),
+        camera=np.repeat(names, counts),
+        t=np.repeat([one.stamp / 1e9 for one in sets], counts),
+        cameras=cameras,
+        source=source,
+    )
+
+
+def _places(one: _Set, landmarks: dict[int, Landmarks], source: str) -> Any:
+    """Return the landmarks (N, 3) of a set: those of its stamp, or the latest before it."""
+    known = sorted(landmarks)
+    place = max(bisect_right(known, one.stamp) - 1, 0)
+    points, found = landmarks[known[place]].lookup(one.points['landmark'].astype(np.int64))
+    if not found.all():
+        missing = one.points['landmark'][~found][0]
+        raise ObservationError(
+            f'{source}: landmark {missing} of {one.camera}/image_points is not in the landmarks'
+        )
+    return points
+
+
+def _is_wanted(topic: str, typename: str) -> bool:
+    return topic.rpartition('/')[2] in _NAMES and typename == _CLOUD

@@ -1,0 +1,69 @@
+"""Observations as CSV: frame,landmark,u,v,x,y,z and, optional, camera,board,t,sigma."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.csv_table import Table, write_table
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+REQUIRED = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
+
+
+def read(path: str | Path) -> Observations:
+    """Read a table of observations; columns in any order, further columns ignored.
+
+    Raises ObservationError, naming file, line and column.
+    """
+    table = Table(Path(path), REQUIRED)
+    frame, landmark = table.whole('frame'), table.whole('landmark')
+    names = table.text('camera') if 'camera' in table else ('',) * len(frame)
+    cameras = tuple(dict.fromkeys(names))
+    camera = np.array([cameras.index(name) for name in names], dtype=np.int64)
+    table.refuse_repeats(
+        np.stack([frame, camera, landmark], axis=-1), 'frame, camera and landmark'
+    )
+    sigma = table.numbers('sigma')[:, 0] if 'sigma' in table else None
+    if sigma is not None:
+        table.refuse(sigma <= 0, 'sigma', 'a number above 0')
+    return make_observations(
+        frame,
+        landmark,
+        table.numbers('u', 'v'),
+        table.numbers('x', 'y', 'z'),
+        camera=camera,
+        board=table.whole('board') if 'board' in table else None,
+        t=table.numbers('t')[:, 0] if 't' in table else None,
+        sigma=sigma,
+        cameras=cameras,
+        source=str(path),
+    )
+
+
+def write_observations(path: str | Path, observations: Observations) -> None:
+    """Write observations so that `read` gives the same table; optional columns where known.
+
+    Raises ObservationError where t or sigma is known for some rows only, OutputError where the
+    file cannot be written.
+    """
+    table = observations
+    columns: dict[str, NDArray[Any]] = {
+        'frame': table.frame, 'landmark': table.landmark, 'u': table.uv[:, 0], 'v': table.uv[:, 1],
+        'x': table.xyz[:, 0], 'y': table.xyz[:, 1], 'z': table.xyz[:, 2],
+    }
+    if table.cameras != ('',):
+        columns['camera'] = np.array(table.cameras)[table.camera]
+    if table.board.any():
+        columns['board'] = table.board
+    for name, values in (('t', table.t), ('sigma', table.sigma)):
+        known = np.isfinite(values)
+        if known.any() and not known.all():
+            raise ObservationError(f'{table.source}: {name} is known for some rows only')
+        if known.any():
+            columns[name] = values
+    write_table(path, columns)

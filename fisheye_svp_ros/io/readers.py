@@ -1,0 +1,60 @@
+"""Readers: files of measured or simulated image points to one table of observations.
+
+A new reader is one module with `read(path) -> Observations` and one line in READERS.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.observations_csv import write_observations
+from fisheye_svp_ros.io.poses_csv import FramePoses, read_poses, write_poses
+from fisheye_svp_ros.scene.observations import Observations
+
+__all__ = [
+    'READERS', 'FramePoses', 'Reader', 'read_observations', 'read_poses', 'write_observations',
+    'write_poses',
+]
+
+
+class Reader(NamedTuple):
+    """One form of observations: its name for people, how to tell it, the module that reads it."""
+
+    form: str
+    recognises: Callable[[Path], bool]
+    module: str
+
+
+def _holds(pattern: str) -> Callable[[Path], bool]:
+    return lambda path: path.is_dir() and any(path.glob(pattern))
+
+
+READERS = (
+    Reader('a .csv file', lambda path: path.suffix == '.csv', 'observations_csv'),
+    Reader('an .orpc file', lambda path: path.suffix == '.orpc', 'orpc'),
+    Reader('a folder of .orpc files', _holds('*.orpc'), 'orpc'),
+    Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap', 'observations_bag'),
+    Reader('a folder of one', _holds('*.mcap'), 'observations_bag'),
+)
+
+
+def read_observations(path: str | Path) -> Observations:
+    """Read observations in whichever form they come: a CSV file, a folder of ORPC files.
+
+    Raises ObservationError, naming file, line and field, for anything missing or malformed.
+    """
+    given = Path(path)
+    for reader in READERS:
+        if reader.recognises(given):
+            read: Callable[[Path], Observations] = import_module(
+                f'fisheye_svp_ros.io.{reader.module}'
+            ).read
+            return read(given)
+    if not given.exists():
+        raise ObservationError(f'{path}: there is no such file or folder; check the path')
+    forms = ', '.join(reader.form for reader in READERS)
+    raise ObservationError(f'{path}: not observations in a known form; these are {forms}')

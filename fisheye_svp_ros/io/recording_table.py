@@ -1,0 +1,89 @@
+"""A recording as a table: one row an input stamp, with its scenario and every metric."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+from fisheye_svp_ros.io.clouds import stamp_of
+
+STAMP = 'stamp_ns'
+NAMESPACE = 'namespace'
+
+
+class _Record(Protocol):
+    @property
+    def topic(self) -> str:
+        """Full name of the topic."""
+
+    @property
+    def message(self) -> Any:
+        """A DiagnosticArray."""
+
+
+Columns = dict[str, list[Any]]
+
+
+def is_tabulated(topic: str, typename: str) -> bool:
+    """Say whether a topic contributes to the table."""
+    name = topic.rpartition('/')[2]
+    return name in ('scenario', 'result') and typename == 'diagnostic_msgs/msg/DiagnosticArray'
+
+
+def tabulate(records: Iterable[_Record]) -> Columns:
+    """Join scenarios and results by stamp: columns of equal length, None where nothing is known.
+
+    Metrics carry the name of the node, below the namespace of its scenario, before theirs.  Rows
+    are in the order of namespace and stamp.
+    """
+    tags: dict[tuple[str, int], dict[str, str]] = {}
+    results: list[tuple[str, int, dict[str, str]]] = []
+    for record in records:
+        base, _, name = record.topic.rpartition('/')
+        stamp = stamp_of(record.message)
+        values = {pair.key: pair.value for status in record.message.status
+                  for pair in status.values}
+        if name == 'scenario':
+            tags[base, stamp] = values
+        else:
+            level = max((_level(status.level) for status in record.message.status), default=0)
+            note = '; '.join(status.message for status in record.message.status)
+            results.append((base, stamp, {**values, **({'note': note} if level else {})}))
+    bases = {base for base, _ in tags}
+    rows = {key: dict(values) for key, values in tags.items()}
+    for node, stamp, values in results:
+        base = _base_of(node, bases)
+        prefix = node.removeprefix(f'{base}/')
+        row = rows.setdefault((base, stamp), {})
+        row.update({f'{prefix}.{key}': value for key, value in values.items()})
+    return _columns(rows)
+
+
+def _base_of(node: str, bases: set[str]) -> str:
+    """Return the namespace of the scenario a node belongs to: the longest that holds it."""
+    holding = [base for base in bases if node.startswith(f'{base}/')]
+    return max(holding, key=len, default=node.rpartition('/')[0])
+
+
+def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
+    order = sorted(rows)
+    names = dict.fromkeys(name for key in order for name in rows[key])
+    columns: Columns = {NAMESPACE: [base or '/' for base, _ in order],
+                        STAMP: [stamp for _, stamp in order]}
+    for name in names:
+        columns[name] = _typed([rows[key].get(name) for key in order])
+    return columns
+
+
+def _typed(cells: list[str | None]) -> list[Any]:
+    """Return whole numbers or numbers where every cell is one; the text otherwise."""
+    for kind in (int, float):
+        try:
+            return [None if cell is None else kind(cell) for cell in cells]
+        except ValueError:
+            continue
+    return cells
+
+
+def _level(level: Any) -> int:
+    return level[0] if isinstance(level, bytes) else int(level)

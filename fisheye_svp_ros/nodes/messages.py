@@ -1,0 +1,237 @@
+"""Arrays to and from ROS messages; the only file that knows both.
+
+Stamps are whole nanoseconds.  What reads a message raises ObservationError, in one line that
+names the topic and the field, for anything that cannot be used.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import (
+    Point,
+    PoseStamped,
+    PoseWithCovariance,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+    Vector3,
+    Vector3Stamped,
+)
+from geometry_msgs.msg import Pose as PoseMessage
+from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from std_msgs.msg import ColorRGBA, Float64, Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.clouds import (
+    DATATYPES,
+    IMAGE_POINTS,
+    LANDMARKS,
+    Points,
+    structured,
+    unpack,
+)
+from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
+from fisheye_svp_ros.scene.landmarks import Landmarks
+
+_NS = 10**9
+_NUMBERS = {code: number for number, code in DATATYPES.items()}
+
+
+class LandmarkSet(NamedTuple):
+    """Landmarks and the frame_id of the world they stand in."""
+
+    landmarks: Landmarks
+    frame: str
+
+
+class ImagePoints(NamedTuple):
+    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id."""
+
+    landmark: Index
+    uv: Array
+    frame: str
+
+
+class Segments(NamedTuple):
+    """Lines or balls to draw: points (N, 3), m (pairs for lines); colour r, g, b, a; size, m."""
+
+    name: str
+    points: Array
+    colour: tuple[float, float, float, float]
+    size: float
+    lines: bool = True
+
+
+def time_message(stamp: int) -> Any:
+    """Return builtin_interfaces/Time of nanoseconds."""
+    sec, nanosec = divmod(stamp, _NS)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def header(stamp: int, frame: str = '') -> Any:
+    """Return std_msgs/Header."""
+    return Header(stamp=time_message(stamp), frame_id=frame)
+
+
+def cloud_message(points: Points, stamp: int, frame: str) -> Any:
+    """Return sensor_msgs/PointCloud2 of a structured array (N,)."""
+    fields = []
+    for name in points.dtype.names or ():
+        kind, offset = points.dtype.fields[name][:2]  # type: ignore[index]
+        number = _NUMBERS[kind.str[1:]]
+        fields.append(PointField(name=name, offset=offset, datatype=number, count=1))
+    step = points.dtype.itemsize
+    message = PointCloud2(header=header(stamp, frame), height=1, width=len(points), fields=fields)
+    message.is_bigendian, message.is_dense = False, True
+    message.point_step, message.row_step = step, step * len(points)
+    message.data = array('B', points.tobytes())
+    return message
+
+
+def landmarks_message(landmarks: Landmarks, stamp: int, frame: str) -> Any:
+    """Return landmarks as PointCloud2: landmark, x, y, z (m)."""
+    return cloud_message(structured(LANDMARKS, landmarks.ids, *landmarks.points.T), stamp, frame)
+
+
+def read_landmarks(message: Any, topic: str = 'landmarks') -> LandmarkSet:
+    """Return the landmarks of a PointCloud2."""
+    points = unpack(message, LANDMARKS, topic)
+    if not len(points):
+        raise ObservationError(f'{topic}: no landmark in it; at least one is needed')
+    xyz = np.stack([points[axis] for axis in 'xyz'], axis=-1)
+    landmarks = Landmarks(points['landmark'].astype(np.int64), xyz)
+    return LandmarkSet(landmarks, str(message.header.frame_id))
+
+
+def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> Any:
+    """Return image points as PointCloud2: landmark, u, v (px)."""
+    return cloud_message(structured(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
+
+
+def read_image_points(message: Any, topic: str = 'image_points') -> ImagePoints:
+    """Return the image points of a PointCloud2."""
+    points = unpack(message, IMAGE_POINTS, topic)
+    uv = np.array([points['u'], points['v']]).T
+    return ImagePoints(points['landmark'].astype(np.int64), uv, str(message.header.frame_id))
+
+
+def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
+    """Return CameraInfo as an SVP user has it: `equidistant` (Kannala-Brandt), k1 to k4."""
+    svp = kannala_brandt_equivalent(lens)
+    k = [svp.fx, 0.0, svp.cx, 0.0, svp.fy, svp.cy, 0.0, 0.0, 1.0]
+    message = CameraInfo(header=header(stamp, frame), width=lens.width, height=lens.height)
+    message.distortion_model = 'equidistant'
+    message.d = list(svp.image_height.coefficients)
+    message.k = k
+    message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    message.p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return message
+
+
+def pose_message(pose: Pose, stamp: int, frame: str) -> Any:
+    """Return PoseStamped of one pose."""
+    return PoseStamped(header=header(stamp, frame), pose=_pose(pose))
+
+
+def pose_with_covariance_message(pose: Pose, covariance: Array, stamp: int, frame: str) -> Any:
+    """Return PoseWithCovarianceStamped; covariance (6, 6), m and rad, in the order of ROS."""
+    inner = PoseWithCovariance(pose=_pose(pose), covariance=covariance.ravel().tolist())
+    return PoseWithCovarianceStamped(header=header(stamp, frame), pose=inner)
+
+
+def read_pose(message: Any, topic: str = 'true_pose') -> Pose:
+    """Return the pose of a PoseStamped."""
+    return _checked_pose(message.pose.position, message.pose.orientation, topic)
+
+
+def transform_message(pose: Pose, stamp: int, frame: str, child: str) -> Any:
+    """Return TransformStamped of the pose of `child` in `frame`."""
+    message = TransformStamped(header=header(stamp, frame), child_frame_id=child)
+    message.transform.translation = _vector(Vector3, pose.position)
+    message.transform.rotation = _quaternion(pose)
+    return message
+
+
+def read_transform(message: Any, topic: str = 'rig') -> Pose:
+    """Return the pose of a TransformStamped's child in its frame."""
+    return _checked_pose(message.transform.translation, message.transform.rotation, topic)
+
+
+def vector_message(vector: Array, stamp: int, frame: str) -> Any:
+    """Return Vector3Stamped of (3,)."""
+    return Vector3Stamped(header=header(stamp, frame), vector=_vector(Vector3, vector))
+
+
+def number_message(value: float) -> Any:
+    """Return std_msgs/Float64."""
+    return Float64(data=float(value))
+
+
+def key_values_message(
+    name: str, values: Mapping[str, object], stamp: int, text: str = '', warn: bool = False
+) -> Any:
+    """Return a DiagnosticArray with one status; numbers are written so that they read back."""
+    level = DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
+    pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
+    status = DiagnosticStatus(level=level, name=name, message=text, values=pairs)
+    return DiagnosticArray(header=header(stamp), status=[status])
+
+
+def read_key_values(message: Any, topic: str = 'scenario') -> dict[str, str]:
+    """Return the key/values of a DiagnosticArray's only status."""
+    if len(message.status) != 1:
+        raise ObservationError(f'{topic}: {len(message.status)} statuses in it; one is needed')
+    return {pair.key: pair.value for pair in message.status[0].values}
+
+
+def markers_message(shapes: Iterable[Segments], stamp: int, frame: str) -> Any:
+    """Return a MarkerArray with one marker a shape."""
+    markers = []
+    for shape in shapes:
+        marker = Marker(header=header(stamp, frame), ns=shape.name)
+        marker.type = Marker.LINE_LIST if shape.lines else Marker.SPHERE_LIST
+        marker.action = Marker.ADD
+        marker.scale = _vector(Vector3, np.full(3, shape.size))
+        red, green, blue, alpha = shape.colour
+        marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
+        marker.points = [_vector(Point, point) for point in shape.points]
+        markers.append(marker)
+    return MarkerArray(markers=markers)
+
+
+def _pose(pose: Pose) -> Any:
+    return PoseMessage(position=_vector(Point, pose.position), orientation=_quaternion(pose))
+
+
+def _quaternion(pose: Pose) -> Any:
+    x, y, z, w = quaternion_from_rotation(pose.rotation).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _vector(kind: Any, values: Array) -> Any:
+    x, y, z = values.tolist()
+    return kind(x=x, y=y, z=z)
+
+
+def _checked_pose(position: Any, orientation: Any, topic: str) -> Pose:
+    place = np.array([position.x, position.y, position.z], dtype=float)
+    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
+    if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
+        raise ObservationError(f'{topic}: the pose holds a value that is not a finite number')
+    if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
+        raise ObservationError(f'{topic}: the orientation is not a unit quaternion')
+    return Pose(rotation_from_quaternion(quaternion), place)
+
+
+def _text(value: object) -> str:
+    return repr(float(value)) if isinstance(value, float) else str(value)

@@ -1,0 +1,62 @@
+"""Sets of image points, collected by the nodes that solve for many of them at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.solver import Items, known_points
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+# What tells the sets of one scenario from each other; all else tells scenarios apart.
+_WITHIN_SCENARIO = ('set', 'frame')
+
+
+class Seen(NamedTuple):
+    """What the cameras see in one set; every array has N rows (camera: which of them)."""
+
+    stamp: int
+    landmark: Index
+    uv: Array
+    xyz: Array
+    camera: Index
+
+
+def seen_in(
+    stamp: int, landmarks: messages.LandmarkSet, items: Items, cameras: Sequence[str]
+) -> Seen:
+    """Return one set of cameras given by namespace, each with its slash.
+
+    Raises ObservationError for an unknown landmark.
+    """
+    sets = [items[f'{camera}image_points'] for camera in cameras]
+    return Seen(
+        stamp,
+        np.concatenate([seen.landmark for seen in sets]),
+        np.concatenate([seen.uv for seen in sets]),
+        np.concatenate([known_points(landmarks, seen) for seen in sets]),
+        np.repeat(np.arange(len(sets)), [len(seen.landmark) for seen in sets]),
+    )
+
+
+def table_of(window: Sequence[Seen], cameras: Sequence[str]) -> Observations:
+    """Return sets as a table, one frame a set; t is the stamp, s."""
+    landmark, uv, xyz, camera = (
+        np.concatenate(arrays) for arrays in list(zip(*window, strict=True))[1:]
+    )
+    counts = [len(seen.landmark) for seen in window]
+    return make_observations(
+        np.repeat(np.arange(len(window)), counts), landmark, uv, xyz, camera=camera,
+        t=np.repeat([seen.stamp / 1e9 for seen in window], counts),
+        cameras=tuple(camera.rstrip('/') for camera in cameras), source='image_points',
+    )
+
+
+def scenario_of(items: Items) -> frozenset[tuple[str, str]]:
+    """Return what the sets of one scenario have in common."""
+    scenario: dict[str, str] = items.get('scenario', {})
+    return frozenset((k, v) for k, v in scenario.items() if k not in _WITHIN_SCENARIO)

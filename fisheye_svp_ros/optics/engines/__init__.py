@@ -1,0 +1,124 @@
+"""The engines that the projection and its solvers run on, and which of them does.
+
+NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
+compile, which only long work pays back: what begins such work says so (`settle`).  Anything else
+runs on NumPy, and gives the same to the last digit whatever was compiled before.
+FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from importlib.util import find_spec
+from types import ModuleType
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics.engines import cache, numpy_engine
+from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+
+ENGINES = ('auto', 'numpy', 'numba')
+VARIABLE = 'FISHEYE_SVP_ENGINE'
+LOADING = 4_000_000  # points that the reference projects while Numba loads what it has compiled
+_COMPILING = 400_000_000  # while it compiles
+
+
+def use(name: str) -> None:
+    """Settle the engine of this process, and of processes it starts: one of ENGINES.
+
+    Raises ParameterError for another name, or for one that is not installed.
+    """
+    global _engine
+    _engine = _named(name)
+    os.environ[VARIABLE] = name
+
+
+def settle(points: float) -> str:
+    """Take Numba for work about so many points if that pays; return the engine in use.
+
+    Does nothing where the engine is settled already, or where Numba cannot be had.
+    """
+    if os.environ.get(VARIABLE, 'auto') == 'auto' and find_spec('numba') is not None:
+        with suppress(ParameterError):
+            if points >= (LOADING if cache.filled() else _COMPILING):
+                use('numba')
+    return 'numpy' if _engine is numpy_engine else 'numba'
+
+
+def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
+    """Return where points (M, 3), m, in the camera frame meet the lens."""
+    return numpy_engine.incidence(lens, points, limited)
+
+
+def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
+    """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
+    uv, valid = _engine.project(lens, points, limited)
+    return uv, valid
+
+
+def linearise_views(
+    lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
+) -> tuple[Array, Mask, Array]:
+    """Return image points (S, N, 2) of points (S, N, 3) in the world, validity, derivatives.
+
+    rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
+    by the small changes of `pose.Pose.retract`, px/m and px/rad.
+    """
+    uv, valid, d_pose = _engine.linearise_views(lens, rotation, position, points, limited)
+    return uv, valid, d_pose
+
+
+def pose_equations(
+    lens: Lens, rotation: Array, position: Array, seen: Seen
+) -> tuple[Array, Array, Array]:
+    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses.
+
+    rotation (S, 3, 3), position (S, 3): cameras in the world.  A point without an image costs
+    infinity, unless its weight is 0.
+    """
+    return numpy_engine.pose_equations(lens, rotation, position, seen)
+
+
+def localize(
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose
+) -> tuple[Localization, int] | None:
+    """Solve single poses from starts (S,), if the engine can do so by itself.
+
+    row (S, N): below 0 for padding; minimum: usable points that a view must have.  Returns also
+    how many have not converged, which are left to the solver.
+    """
+    found: tuple[Localization, int] | None = _engine.localize(lens, seen, row, minimum, start)
+    return found
+
+
+def adjust_rigs(
+    lenses: tuple[Lens, Lens], seen: tuple[Seen, Seen], state: tuple[Array, ...]
+) -> Rigs | None:
+    """Solve S stereo rigs of V views each from their starts, if the engine can do so by itself.
+
+    lenses, seen: of the left and right cameras, S * V views; state: rotation (S, V, 3, 3) and
+    position (S, V, 3) of the right camera, (S, 3, 3) and (S, 3) of the left one in the right one.
+    """
+    rigs: Rigs | None = _engine.adjust_rigs(lenses, seen, state)
+    return rigs
+
+
+def _named(name: str) -> ModuleType:
+    if name not in ENGINES:
+        raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
+    if name != 'numba':
+        return numpy_engine
+    try:
+        from fisheye_svp_ros.optics.engines import numba_engine
+    except ImportError as cause:  # also where Numba does not go with this NumPy
+        raise ParameterError(
+            f'the engine numba cannot be loaded: {cause}; pip install -U fisheye_svp_ros[fast]'
+        ) from cause
+    cache.mark_filled()
+    return numba_engine
+
+
+_engine = _named(os.environ.get(VARIABLE, 'auto'))

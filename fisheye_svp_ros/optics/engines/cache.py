@@ -1,0 +1,40 @@
+"""Where compiled code is kept from one start to the next."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+_SOURCES = (
+    'optics/formulas.py', 'optics/rays.py', 'optics/engines/kernels.py',
+    'optics/engines/adjustment.py', 'optics/engines/entries.py', 'optics/engines/stopping.py',
+)
+
+
+@cache
+def folder() -> Path:
+    """Return the folder for these sources, this Numba, this Python and this kind of machine."""
+    package = Path(__file__).parents[2]
+    told = [version('numba'), platform.python_version(), platform.machine(), platform.node()]
+    digest = hashlib.sha256('\n'.join(told).encode())
+    for name in _SOURCES:
+        digest.update((package / name).read_bytes())
+    root = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+    return Path(root) / 'fisheye_svp_ros' / digest.hexdigest()[:16]
+
+
+def filled() -> bool:
+    """Say whether all of it has been compiled before."""
+    return (folder() / 'complete').exists()
+
+
+@cache
+def mark_filled() -> None:
+    """Remember that all of it has been compiled, where that can be kept."""
+    with suppress(OSError):
+        (folder() / 'complete').touch()

@@ -1,0 +1,207 @@
+"""What Python calls of the compiled engine: each compiled once and kept in the cache."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import config, njit, types
+
+from fisheye_svp_ros.optics.engines import cache
+from fisheye_svp_ros.optics.engines.adjustment import (
+    copy,
+    minimise,
+    normal_of,
+    pose_of,
+    workspace,
+)
+from fisheye_svp_ros.optics.engines.kernels import (
+    BARE,
+    BEHIND,
+    INVALID,
+    LEFT,
+    OPTIONS,
+    ROW,
+    ROWS,
+    SCRATCH,
+    SINGULAR,
+    STATE,
+    VALID,
+    B,
+    U,
+    V,
+    X,
+    Y,
+    Z,
+    derivatives,
+    factor,
+    image,
+    load,
+    meet,
+    substitute,
+)
+
+_DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the reference
+
+
+@njit(**BARE)
+def _take(w, n, points):
+    """Put points in the camera frame into their rows."""
+    for i in range(n):
+        w[X + i], w[Y + i], w[Z + i] = points[i, 0], points[i, 1], points[i, 2]
+
+
+@njit(**BARE)
+def _write(w, n, uv, state):
+    for i in range(n):
+        uv[i, 0] = w[U + i] if w[STATE + i] == VALID else np.nan
+        uv[i, 1] = w[V + i] if w[STATE + i] == VALID else np.nan
+        state[i] = w[STATE + i]
+
+
+@njit(**BARE)
+def _inverse(hessian, lower, out):
+    """Write the inverse of an information (6, 6); return whether it is determined."""
+    trace = 0.0
+    if not factor(hessian, SINGULAR, lower):
+        return False
+    out[:] = 0.0
+    for k in range(6):
+        out[k, k] = 1.0
+        substitute(lower, out[k])
+        trace += out[k, k] * hessian[k, k]
+    return trace < _DETERMINED
+
+
+@njit(**BARE)
+def _residual(w, points, uv, row, lens, pose, out):
+    """Write measured minus predicted, nan for padding; return whether all could be done."""
+    for start in range(0, len(points), B):
+        n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
+        load(w, n, points[start:], *pose)
+        meet(w, n, lens, BEHIND)
+        image(w, n, lens)
+        left, off = 0, out[start:]
+        for i in range(n):
+            left += (rows[i] >= 0) & (w[STATE + i] == LEFT)
+            seen = (rows[i] >= 0) & (w[STATE + i] != INVALID)
+            off[i, 0] = measured[i, 0] - w[U + i] if seen else np.nan
+            off[i, 1] = measured[i, 1] - w[V + i] if seen else np.nan
+        if left:
+            return False
+    return True
+
+
+def _in(dimensions: int, kind: Any = types.float64) -> types.Array:
+    return types.Array(kind, dimensions, 'C', readonly=True)
+
+
+def _out(dimensions: int, kind: Any = types.float64) -> types.Array:
+    return types.Array(kind, dimensions, 'C')
+
+
+def _entry(result: Any, *arguments: Any) -> Any:
+    """Compile for these types only, and keep it in the engine's own folder."""
+
+    def compiled(function: Any) -> Any:
+        before, config.CACHE_DIR = config.CACHE_DIR, str(cache.folder())
+        try:
+            return njit(result(*arguments), cache=True, nogil=True, **OPTIONS)(function)
+        finally:
+            config.CACHE_DIR = before
+
+    return compiled
+
+
+_LENS = (_in(1), types.float64)
+
+
+@_entry(types.void, _in(2), *_LENS, _out(2), _out(1))
+def project(points, lens, edge, uv, state):
+    """Write image points (M, 2) and states (M)."""
+    w = np.empty(SCRATCH)
+    for start in range(0, len(points), B):
+        n = min(B, len(points) - start)
+        _take(w, n, points[start:])
+        meet(w, n, lens, edge)
+        image(w, n, lens)
+        _write(w, n, uv[start:], state[start:])
+
+
+@_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
+def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
+    """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""
+    w = np.empty(SCRATCH)
+    for s in range(len(points)):
+        r = rotation[s]
+        for start in range(0, points.shape[1], B):
+            n = min(B, points.shape[1] - start)
+            load(w, n, points[s, start:], r, position[s])
+            meet(w, n, lens, edge)
+            image(w, n, lens)
+            derivatives(w, n, lens)
+            _write(w, n, uv[s, start:], state[s, start:])
+            for row in range(4):
+                # By place and by turn, of u and of v; the camera moves, not the point.
+                at = ROW + (row // 2) * ROWS + (row % 2) * 3 * B
+                x, y, z = w[at:at + B], w[at + B:at + 2 * B], w[at + 2 * B:at + 3 * B]
+                sign = 1.0 if row % 2 else -1.0
+                for k in range(3):
+                    a, b, c = sign * r[k, 0], sign * r[k, 1], sign * r[k, 2]
+                    out = d_pose[s, row // 2, 3 * (row % 2) + k, start:]
+                    for i in range(n):
+                        out[i] = a * x[i] + b * y[i] + c * z[i]
+
+
+_SEEN = (_in(3), _in(3), _in(2))
+
+
+@_entry(types.int64, _in(1), types.int64, *_SEEN, _in(2, types.int64), _out(3), _out(2), _out(3),
+        _out(3), _out(1), _out(1, types.boolean), _out(1, types.int64))
+def localize(lens, minimum, points, uv, weight, row, rotation, position, covariance, residual,
+             cost, solved, iterations):
+    """Move S poses to their minima; return how many are left to the reference."""
+    w, work, left = np.empty(SCRATCH), workspace(1), 0
+    states, normals, lower = work[0], work[1], work[4]
+    for s in range(len(points)):
+        usable, solved[s] = 0, False
+        for i in range(weight.shape[1]):
+            usable += weight[s, i] > 0.0
+        if usable >= minimum:
+            pose = pose_of(states[0, 0])
+            copy(rotation[s], pose[0])
+            copy(position[s], pose[1])
+            seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
+            cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work)
+            pose = pose_of(states[at, 0])
+            copy(pose[0], rotation[s])
+            copy(pose[1], position[s])
+            solved[s] = (
+                ended == 1
+                and _inverse(normal_of(normals[known, 0])[0], lower, covariance[s])
+                and _residual(w, points[s], uv[s], row[s], lens, pose, residual[s])
+            )
+        left += not solved[s]
+    return left
+
+
+@_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(4), _out(1),
+        _out(1, types.int64))
+def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, state,
+                normal, cost, iterations):
+    """Move S rigs of V views to their minima; return how many are left to the reference.
+
+    state (S, V + 1, 4, 3); normal (S, V + 1, 13, 6): see `adjustment`.
+    """
+    views, left = state.shape[1] - 1, 0
+    w, work = np.empty(SCRATCH), workspace(views)
+    for s in range(len(state)):
+        mine = slice(s * views, (s + 1) * views)
+        copy(state[s], work[0][0])
+        cost[s], iterations[s], ended, at, known = minimise(
+            w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
+            (points[mine], uv[mine], weight[mine], lens), 2, work)
+        copy(work[0][at], state[s])
+        copy(work[1][known], normal[s])
+        left += ended < 1
+    return left

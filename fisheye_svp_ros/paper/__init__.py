@@ -1,0 +1,1 @@
+"""Kita's evaluation of the SVP approximation, from its numbers to its report."""

@@ -1,0 +1,134 @@
+"""What the demo shows: the paper's scenarios, out of a recording, beside the published numbers."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.errors import BagError
+from fisheye_svp_ros.io.recording_residuals import ResidualField, residual_field, residual_sets
+from fisheye_svp_ros.io.recording_table import NAMESPACE, Columns
+from fisheye_svp_ros.paper.evaluation import RIGHT_CAMERA_Z
+from fisheye_svp_ros.paper.tables import (
+    CALIBRATION,
+    ERROR2_RANGE,
+    ERROR3_RANGE,
+    LENSES,
+    LOCALIZATION,
+    STYLE_NAMES,
+)
+from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+
+# Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
+DEPTH_POSES = [
+    [0.0, 0.0, RIGHT_CAMERA_Z.get(lens, 0.0), 1.0, 0.0, 0.0, 0.0] for lens in LENSES
+]
+_MM, _DEGREE = 1e-3, np.radians(1.0)
+
+
+class Task(NamedTuple):
+    """One of the paper's three evaluations: namespace, what is swept beside lens and radius."""
+
+    name: str
+    swept: str
+    values: Sequence[str]
+    node: str
+    error: str
+    pixels: str
+
+
+TASKS = (
+    Task('localization', 'environment', SPREADS, 'localizer', 'position_error_z_m',
+         'mean_residual_px'),
+    Task('calibration', 'style', STYLE_NAMES, 'stereo_calibrator', 'position_error_m',
+         'mean_residual_px'),
+    Task('depth', 'style', STYLE_NAMES, 'stereo_depth', 'error3_m', 'error2_px'),
+)
+
+
+class Shown(NamedTuple):
+    """One row of the demo; m, rad, px; published: (lowest, highest), NaN where there is none.
+
+    error: of the position along the axis (localization), of the left camera (calibration), of
+    points (depth: Error3); pixels: mean residual, or Error2.
+    """
+
+    task: str
+    lens: str
+    radius: float
+    where: str
+    error: float
+    axis_error: float
+    pixels: float
+    published_error: tuple[float, float]
+    published_axis_error: float
+    published_pixels: tuple[float, float]
+
+
+def shown(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[Shown]:
+    """Return the rows of the demo from the table of its recording.
+
+    Raises BagError where a scenario is missing or stands there twice.
+    """
+    found: dict[tuple[str, str, float, str], dict[str, Any]] = {}
+    for cells in zip(*columns.values(), strict=True):
+        row = dict(zip(columns, cells, strict=True))
+        task = next((t for t in TASKS if row[NAMESPACE] == f'/{t.name}'), None)
+        if task is None or not _is_shown(task, row):
+            continue
+        key = task.name, row['lens'], row['radius'], row[task.swept]
+        if key in found:
+            raise BagError(f'scenario {key} was recorded twice')
+        found[key] = row
+    rows = []
+    for lens, task, radius in itertools.product(lenses, TASKS, radii):
+        for where in task.values:
+            if (task.name, lens, radius, where) not in found:
+                raise BagError(f'no result of {task.node} for {lens}, {where}, {radius} m; see '
+                               'the logs beside the recording')
+            rows.append(_row(task, lens, radius, where, found[task.name, lens, radius, where]))
+    return rows
+
+
+def residual_fields(records: Iterable[Any], spread: str = 'whole') -> list[ResidualField]:
+    """Return the residuals of every localization with landmarks of a spread (figure 6)."""
+    return [
+        residual_field(one) for one in residual_sets(records)
+        if one.tags.get('environment') == spread
+    ]
+
+
+def _is_shown(task: Task, row: dict[str, Any]) -> bool:
+    if task.name == 'depth':
+        return bool(row['set'] == LENSES.index(row['lens']))
+    return bool(row['set'] == row['sets'] - 1)
+
+
+def _row(task: Task, lens: str, radius: float, where: str, row: dict[str, Any]) -> Shown:
+    def metric(name: str) -> float:
+        value = row.get(f'{task.node}.{name}')
+        return np.nan if value is None else float(value)
+
+    error, axis, pixels = _published(task, lens, radius, where)
+    return Shown(
+        task.name, lens, radius, where, metric(task.error), metric('axis_error_rad'),
+        metric(task.pixels), error, axis, pixels
+    )
+
+
+def _published(
+    task: Task, lens: str, radius: float, where: str
+) -> tuple[tuple[float, float], float, tuple[float, float]]:
+    """Return error, m, axis error, rad, and px; for depth the paper gives ranges."""
+    if task.name == 'depth':
+        lowest, highest = ERROR3_RANGE[lens]
+        return (lowest * _MM, highest * _MM), np.nan, ERROR2_RANGE[lens]
+    table = LOCALIZATION if task.name == 'localization' else CALIBRATION
+    x, y, z, axis, residual = table[
+        LENSES.index(lens), RADII.index(radius), task.values.index(where)
+    ]
+    error = z if task.name == 'localization' else np.sqrt(x * x + y * y + z * z)
+    return (error * _MM,) * 2, float(axis * _DEGREE), (float(residual),) * 2

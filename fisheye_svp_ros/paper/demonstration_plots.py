@@ -1,0 +1,95 @@
+"""Pictures of the demonstration: its errors beside the published ones, its residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.patches import Circle, Rectangle
+from matplotlib.ticker import LogLocator
+
+from fisheye_svp_ros.io.recording_residuals import ResidualField
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.paper.demonstration import Shown
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
+
+_TITLES = {
+    'localization': 'Localization: error along the axis',
+    'calibration': 'Stereo calibration: error of the left camera',
+    'depth': 'Stereo depth: mean error (Error3)',
+}
+
+
+def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
+    """Draw the errors of the demo beside the published ones: a column a task, a row a lens."""
+    lenses = list(dict.fromkeys(row.lens for row in rows))
+    with picture(path, 11.0, 1.2 + 2.6 * len(lenses)) as figure:
+        axes = figure.subplots(len(lenses), len(_TITLES), squeeze=False)
+        for line, lens in zip(axes, lenses, strict=True):
+            for axis, (task, title) in zip(line, _TITLES.items(), strict=True):
+                mine = [row for row in rows if (row.lens, row.task) == (lens, task)]
+                _draw_errors(axis, mine)
+                axis.set_title(f'{title}\n{lens}' if lens == lenses[0] else lens, loc='left')
+                if lens == lenses[-1]:
+                    axis.set_xlabel('mm')
+        legend_below(figure, *axes[0])
+
+
+def _draw_errors(axis: Any, rows: Sequence[Shown]) -> None:
+    place = np.arange(len(rows))[::-1]
+    ours = 1e3 * np.array([row.error for row in rows])
+    low, high = 1e3 * np.array([row.published_error for row in rows]).T
+    if rows[0].task == 'depth':
+        axis.axvspan(low[0], high[0], color=PUBLISHED, alpha=0.15, linewidth=0,
+                     label='published range')
+        axis.set_xscale('log')
+        axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axis.xaxis.set_major_formatter('{x:g}')
+        axis.xaxis.set_minor_formatter('')
+    else:
+        axis.hlines(place, ours, low, color=FAINT, linewidth=1.5)
+        axis.plot(low, place, 'o', color=PUBLISHED, label='published', fillstyle='none')
+        axis.axvline(0.0, color='#808890', linewidth=0.8)
+    axis.plot(ours, place, 'o', color=OURS, label='from the recording', markersize=5)
+    axis.set_yticks(place, [f'{row.where} {row.radius:g} m' for row in rows])
+    axis.grid(visible=False, axis='y')
+
+
+def draw_residual_fields(
+    fields: Sequence[ResidualField], lenses: Mapping[str, Lens], path: Path
+) -> None:
+    """Draw the residuals of localization over the image, magnified (figure 6): a row a lens."""
+    names = list(dict.fromkeys(field.lens for field in fields))
+    columns = max(sum(field.lens == name for field in fields) for name in names)
+    with picture(path, 3.4 * columns, 0.3 + 3.7 * len(names)) as figure:
+        axes = figure.subplots(len(names), columns, squeeze=False)
+        for line, name in zip(axes, names, strict=True):
+            mine = [field for field in fields if field.lens == name]
+            for axis, field in zip(line, mine, strict=False):
+                _draw_field(axis, field, lenses[name])
+
+
+def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
+    edge, _ = lens.image_height.value_and_slope(np.array(lens.max_incidence))
+    axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
+    size = np.linalg.norm(field.residual, axis=-1)
+    # The longest residual takes an eighth of the image, whatever it is.
+    factor = _round_down(lens.width / 8 / size.max())
+    axis.quiver(*field.uv.T, *(factor * field.residual.T), angles='xy', scale_units='xy', scale=1,
+                color=OURS, width=0.005)
+    axis.plot(*field.uv.T, 'o', markersize=3, color='#404850')
+    corner, margin = (-0.5, -0.5), 0.1 * lens.width
+    axis.add_patch(Rectangle(corner, lens.width, lens.height, fill=False, color=FAINT))
+    axis.set(xlim=(-margin, lens.width + margin), ylim=(lens.height + margin, -margin))
+    axis.set_aspect('equal')
+    axis.axis('off')
+    axis.set_title(f'{field.lens}, landmarks at {field.radius:g} m\n'
+                   f'residual {size.mean():.2g} px on average, x {factor:g}', loc='left')
+
+
+def _round_down(value: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(decade * max(step for step in (1, 2, 5) if step * decade <= value))

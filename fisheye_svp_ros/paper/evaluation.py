@@ -1,0 +1,233 @@
+"""Kita's evaluation: self-localization, stereo calibration and stereo measurement, numbers only.
+
+Image points come from one lens, the solver is given another, by default the same one without its
+viewpoint shift.  Rows of tables are (x, y, z, axis, residual) in mm, mm, mm, degree and px, as the
+paper prints them, in the paper's frames (x right, y up, camera gazing along -z).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.paper.tables import CAPTIONS, PANELS, STYLE_NAMES
+from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose
+from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
+from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
+from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
+from fisheye_svp_ros.study.metrics import (
+    Metrics,
+    localization_metrics,
+    stereo_calibration_metrics,
+    stereo_depth_metrics,
+)
+
+# Section 5: where along z the right camera stands, m; Fish214 alone is moved.
+RIGHT_CAMERA_Z = {'fish214': -0.1}
+
+
+class Localized(NamedTuple):
+    """E environments localized.  rows (E, 5); solved; views: what was seen of the landmarks."""
+
+    rows: Array
+    solved: Localization
+    views: Views
+
+
+class Measured(NamedTuple):
+    """Stereo measurement of N landmarks, NaN where a camera does not see one (section 5).
+
+    uv_left, uv_right (N, 2), px; foot (N, 2), px: nearest point of the epipolar curve; distance,
+    vertical (N,), px: to the curve, and to it in the same column; true, measured (N, 3), m, world.
+    """
+
+    uv_left: Array
+    uv_right: Array
+    foot: Array
+    distance: Array
+    vertical: Array
+    true: Array
+    measured: Array
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Error2 in both readings and Error3, see `errors.stereo_depth_metrics`."""
+        found = stereo_depth_metrics(
+            self.distance[None], self.vertical[None], self.measured[None], self.true[None]
+        )
+        return {name: float(value[0]) for name, value in found.items()}
+
+
+class Evaluation(NamedTuple):
+    """All of the paper's numbers for one lens and one solver.
+
+    localization, calibration (3 radii, 3 spreads or styles, 5): tables 1 and 3, or 2 and 4;
+    localized: one a spread; measured: one a panel of figure 9 or 10, in the order of PANELS.
+    """
+
+    lens: Lens
+    localization: Array
+    calibration: Array
+    localized: tuple[Localized, ...]
+    measured: tuple[Measured, ...]
+
+    def panels(self, metric: str) -> Array:
+        """Return a stereo depth metric of the nine panels, (9,)."""
+        return np.array([measured.metrics[metric] for measured in self.measured])
+
+
+def shift_at(lens: Lens, theta: Array) -> Array:
+    """Return the viewpoint shift at incidence angles (T,), rad, m; 0 for an SVP lens."""
+    shift = lens.viewpoint_shift
+    if shift is None:
+        return np.zeros_like(theta)
+    return shift.value_and_slope(theta, np.tan(theta / 2))[0]
+
+
+def landmarks_at(spread: str, radius: float) -> Array:
+    """Return the landmarks (N, 3) of an environment, m."""
+    return radius * _directions(spread)
+
+
+@cache
+def _directions(spread: str) -> Array:
+    return environment(spread, 1.0).points
+
+
+def evaluate(lens: Lens, solver: Lens | None = None) -> Evaluation:
+    """Evaluate a lens with a solver that believes another one, by default the SVP lens."""
+    localized = localize_spreads(lens, solver)
+    return Evaluation(
+        lens,
+        np.stack([spread.rows for spread in localized], axis=1),
+        calibrate_rigs(lens, solver)[0],
+        localized,
+        tuple(measure(lens, radius, style, solver) for radius, style in PANELS),
+    )
+
+
+def localize_environments(
+    lens: Lens, points: Array, solver: Lens | None = None, start: Pose | None = None
+) -> Localized:
+    """Localize the paper's camera among landmarks (E, N, 3), m (section 3).
+
+    start (E,): poses to start from, the true one by default.
+    """
+    true = paper_pose(len(points))
+    blank = views_of(points, np.zeros((*points.shape[:2], 2)))
+    views = views_of(points, ForwardModel(lens).predict(true, blank).uv)
+    model = ForwardModel(lens.svp() if solver is None else solver)
+    solved = localize(model, views, true if start is None else start)
+    metrics = localization_metrics(solved.pose, solved.residual, true)
+    return Localized(_rows(metrics), solved, views)
+
+
+def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[Localized, ...]:
+    """Localize at the three radii, one result a spread: Whole, Inner, Outer."""
+    return tuple(
+        localize_environments(
+            lens, np.stack([landmarks_at(spread, radius) for radius in RADII]), solver
+        )
+        for spread in SPREADS
+    )
+
+
+def calibrate_rigs(
+    lens: Lens, solver: Lens | None = None, poses: Pose | None = None,
+    directions: Array | None = None,
+) -> tuple[Array, StereoCalibration]:
+    """Return table 3 or 4, rows (3 radii, 3 styles, 5), and the nine solved systems (section 4).
+
+    poses (V,): of the right camera in the world, `rig.calibration_poses` by default; directions
+    (N, 3), unit: of the landmarks, Whole by default.
+    """
+    directions = landmarks_at('whole', 1.0) if directions is None else directions
+    right = calibration_poses() if poses is None else poses
+    systems = [(radius, rig(style)) for radius in RADII for style in STYLE_NAMES]
+    views: list[list[Views]] = [[], []]
+    model = ForwardModel(lens)
+    for radius, left_in_right in systems:
+        points = radius * directions
+        for seen, pose in zip(views, (right.compose(_spread(left_in_right, right)), right),
+                              strict=True):
+            blank = views_of(points, np.zeros((len(right.position), len(points), 2)))
+            seen.append(views_of(points, model.predict(pose, blank).uv))
+    left_views, right_views = (_joined(seen) for seen in views)
+    known = ForwardModel(lens.svp() if solver is None else solver)
+    solved = calibrate_stereo(known, known, left_views, right_views, len(systems))
+    true = Pose(*(np.stack(parts) for parts in zip(*(r for _, r in systems), strict=True)))
+    metrics = stereo_calibration_metrics(
+        solved.rig, solved.left_residual, solved.right_residual, true
+    )
+    table = _rows(metrics)
+    table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
+    return table.reshape(len(RADII), len(STYLE_NAMES), -1), solved
+
+
+def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measured:
+    """Measure the Whole landmarks with a rig that is known (section 5, figures 9 and 10)."""
+    home = paper_pose(1)
+    ahead = np.array([0.0, 0.0, RIGHT_CAMERA_Z.get(lens.name, 0.0)])
+    right = Pose(home.rotation, home.position + ahead)
+    left_in_right = rig(style)
+    points = landmarks_at('whole', radius)
+    blank = views_of(points, np.zeros((1, len(points), 2)))
+    model = ForwardModel(lens)
+    uv_right = model.predict(right, blank).uv[0]
+    uv_left = model.predict(right.compose(_spread(left_in_right, right)), blank).uv[0]
+    both = np.isfinite(uv_left + uv_right).all(axis=-1)
+    known = ForwardModel(lens.svp() if solver is None else solver)
+    offset = epipolar_offset(known, known, left_in_right, uv_left[both], uv_right[both])
+    points_in_right = triangulate(known, known, left_in_right, uv_left[both], uv_right[both])
+    filled = [_filled(both, part) for part in (*offset, points_in_right.points)]
+    distance, vertical, foot, solved = filled
+    measured = solved @ right.rotation[0].T + right.position[0]
+    return Measured(uv_left, uv_right, foot, distance, vertical, points, measured)
+
+
+def captions_of(lens: str, error2: Array, error3: Array) -> dict[int, tuple[float, float]]:
+    """Find which panel (index in PANELS) each printed caption belongs to.
+
+    error2 (9,), px, and error3 (9,), mm: ours.  The text of the paper kept five captions of nine
+    panels, in printed order; of the orders that agree with that the nearest one in log is taken.
+    """
+    printed = np.array(CAPTIONS[lens])
+    off = np.log(printed[:, None, :] / np.stack([error2, error3], axis=-1)) ** 2
+    off = off.sum(axis=-1)
+    best = min(
+        combinations(range(len(PANELS)), len(printed)),
+        key=lambda panels: float(off[range(len(printed)), panels].sum()),
+    )
+    return {panel: CAPTIONS[lens][i] for i, panel in enumerate(best)}
+
+
+def _rows(metrics: Metrics) -> Array:
+    """Return rows (E, 5) in the paper's units."""
+    position = [1000 * metrics[f'position_error_{axis}_m'] for axis in 'xyz']
+    return np.column_stack([
+        *position, np.degrees(metrics['axis_error_rad']), metrics['mean_residual_px']
+    ])
+
+
+def _spread(one: Pose, like: Pose) -> Pose:
+    return Pose(*(np.broadcast_to(a, b.shape) for a, b in zip(one, like, strict=True)))
+
+
+def _joined(views: list[Views]) -> Views:
+    return Views(*(np.concatenate(arrays) for arrays in zip(*views, strict=True)))
+
+
+def _filled(rows: Mask, values: Array) -> Array:
+    whole = np.full((len(rows), *values.shape[1:]), np.nan)
+    whole[rows] = values
+    return whole

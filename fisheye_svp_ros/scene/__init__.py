@@ -1,0 +1,1 @@
+"""What there is to be seen, and the table of what was seen."""

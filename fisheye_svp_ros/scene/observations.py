@@ -1,0 +1,219 @@
+"""The table of measured or simulated image points, and its batch form for the solvers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.scene.landmarks import Landmarks
+
+
+@dataclass(frozen=True)
+class Observations:
+    """One row an image point; every array has N rows, in the order of the source.
+
+    frame, landmark, board: whole numbers; camera: index into `cameras`; uv (N, 2), px;
+    xyz (N, 3): the landmark as the user believes it to be, m, in the target frame;
+    t: s and sigma: px, NaN where unknown; source names where the rows came from.
+    """
+
+    frame: Index
+    landmark: Index
+    uv: Array
+    xyz: Array
+    camera: Index
+    board: Index
+    t: Array
+    sigma: Array
+    cameras: tuple[str, ...] = ('',)
+    source: str = 'observations'
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def take(self, index: Index | Mask) -> Observations:
+        """Return some of the rows."""
+        rows = {
+            f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _SHARED
+        }
+        return replace(self, **rows)
+
+    @property
+    def frames(self) -> Index:
+        """The frame numbers, ascending, each once."""
+        return np.unique(self.frame)
+
+    def landmarks(self) -> Landmarks:
+        """Return the landmarks that the rows mention, each once.
+
+        Raises ObservationError where two rows disagree on a landmark's place.
+        """
+        ids, first, inverse = np.unique(self.landmark, return_index=True, return_inverse=True)
+        off = np.abs(self.xyz - self.xyz[first][inverse]).max(axis=-1) > 1e-9
+        if np.any(off):
+            raise ObservationError(
+                f'{self.source}: landmark {self.landmark[off][0]} is said to be in two places; '
+                'x, y, z belong to a target frame that stands still'
+            )
+        return Landmarks(ids, self.xyz[first])
+
+
+STEREO = ('left', 'right')
+_SHARED = ('cameras', 'source')
+
+
+def make_observations(
+    frame: Index,
+    landmark: Index,
+    uv: Array,
+    xyz: Array,
+    *,
+    camera: Index | None = None,
+    board: Index | None = None,
+    t: Array | None = None,
+    sigma: Array | None = None,
+    cameras: tuple[str, ...] = ('',),
+    source: str = 'observations',
+) -> Observations:
+    """Build a table from its columns, with the optional ones filled in."""
+    count = len(frame)
+    zeros = np.zeros(count, dtype=np.int64)
+    unknown = np.full(count, np.nan)
+    return Observations(
+        np.asarray(frame, dtype=np.int64),
+        np.asarray(landmark, dtype=np.int64),
+        np.asarray(uv, dtype=float).reshape(count, 2),
+        np.asarray(xyz, dtype=float).reshape(count, 3),
+        zeros if camera is None else np.asarray(camera, dtype=np.int64),
+        zeros if board is None else np.asarray(board, dtype=np.int64),
+        unknown if t is None else np.asarray(t, dtype=float),
+        unknown if sigma is None else np.asarray(sigma, dtype=float),
+        cameras,
+        source,
+    )
+
+
+class Views(NamedTuple):
+    """Observations in batch form: S views (one frame of one camera) of up to N points.
+
+    points (S, N, 3), m; uv (S, N, 2), px; weight (S, N): 1 / sigma, 0 for padding; landmark,
+    board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding.
+    """
+
+    points: Array
+    uv: Array
+    weight: Array
+    landmark: Index
+    board: Index
+    t: Array
+    frame: Index
+    camera: Index
+    row: Index
+
+    def take(self, index: Any) -> Views:
+        """Return some of the views."""
+        return Views(*(array[index] for array in self))
+
+    @property
+    def seen(self) -> tuple[Array, Array, Array]:
+        """What solvers look at: points, image points, weights."""
+        return self.points, self.uv, self.weight
+
+    @property
+    def used(self) -> Mask:
+        """Which entries (S, N) are observations and not padding."""
+        return self.row >= 0
+
+
+def group_views(observations: Observations, default_sigma: float = 1.0) -> Views:
+    """Group a table into views, ordered by frame and camera; sigma where unknown is the default.
+
+    Raises ObservationError for an empty table.
+    """
+    if not len(observations):
+        raise ObservationError(f'{observations.source}: it holds no observation')
+    keys = np.stack([observations.frame, observations.camera], axis=-1)
+    groups, view, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    view = view.reshape(-1)
+    order = np.argsort(view, kind='stable')
+    slot = np.empty(len(view), dtype=np.int64)
+    slot[order] = np.arange(len(view)) - np.repeat(np.cumsum(counts) - counts, counts)
+    shape = (len(groups), int(counts.max()))
+    row = np.full(shape, -1, dtype=np.int64)
+    row[view, slot] = np.arange(len(view))
+    return _views(observations, row, groups[:, 0], groups[:, 1], default_sigma)
+
+
+def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tuple[Views, Views]:
+    """Return the views of the cameras left and right with the same frames and the same slots.
+
+    Frame s and slot n mean the same frame and landmark in both; what one camera lacks is padding.
+    Raises ObservationError for a missing camera or a landmark that stands twice in a view.
+    """
+    missing = [name for name in STEREO if name not in observations.cameras]
+    if missing or not len(observations):
+        held = ', '.join(observations.cameras) if len(observations) else 'no observation'
+        raise ObservationError(
+            f'{observations.source}: the cameras left and right are needed; it holds {held}'
+        )
+    frames, frame = np.unique(observations.frame, return_inverse=True)
+    landmarks, slot = np.unique(observations.landmark, return_inverse=True)
+    pair = []
+    for camera in map(observations.cameras.index, STEREO):
+        mine = np.flatnonzero(observations.camera == camera)
+        row = np.full((len(frames), len(landmarks)), -1, dtype=np.int64)
+        row[frame[mine], slot[mine]] = mine
+        twice = mine[row[frame[mine], slot[mine]] != mine]
+        if twice.size:
+            raise ObservationError(
+                f'{observations.source}: landmark {observations.landmark[twice[0]]} stands twice '
+                f'in frame {observations.frame[twice[0]]} of one camera'
+            )
+        cameras = np.full(len(frames), camera)
+        pair.append(_views(observations, row, frames, cameras, default_sigma))
+    return pair[0], pair[1]
+
+
+def _views(
+    observations: Observations, row: Index, frame: Index, camera: Index, default_sigma: float
+) -> Views:
+    used = row >= 0
+    sigma = np.where(np.isnan(observations.sigma), default_sigma, observations.sigma)
+    return Views(
+        points=observations.xyz[row],  # padding repeats a landmark: no point at the camera
+        uv=np.where(used[..., None], observations.uv[row], 0.0),
+        weight=np.where(used, 1 / sigma[row], 0.0),
+        landmark=np.where(used, observations.landmark[row], -1),
+        board=np.where(used, observations.board[row], 0),
+        t=np.where(used, observations.t[row], np.nan),
+        frame=frame,
+        camera=camera,
+        row=row,
+    )
+
+
+def views_of(points: Array, uv: Array, weight: Array | None = None) -> Views:
+    """Wrap plain arrays as views: points (N, 3) or (S, N, 3), m; uv (S, N, 2), px, NaN = unseen.
+
+    weight: 1 / sigma (S, N), 1/px; 1 where left out.
+    """
+    shape = uv.shape[:2]
+    seen: Mask = np.asarray(np.isfinite(uv).all(axis=-1))
+    unit = np.ones(shape) if weight is None else weight
+    flat = np.arange(seen.size, dtype=np.int64).reshape(shape)
+    zeros = np.zeros(shape, dtype=np.int64)
+    return Views(
+        points=np.broadcast_to(points, (*shape, 3)),
+        uv=np.where(seen[..., None], uv, 0.0),
+        weight=np.where(seen, unit, 0.0),
+        landmark=np.broadcast_to(np.arange(shape[1]), shape),
+        board=zeros,
+        t=np.full(shape, np.nan),
+        frame=np.arange(shape[0]),
+        camera=np.zeros(shape[0], dtype=np.int64),
+        row=np.where(seen, flat, -1),
+    )

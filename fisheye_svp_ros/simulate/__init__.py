@@ -1,0 +1,1 @@
+"""Scenarios and the observations that a camera would make of them."""

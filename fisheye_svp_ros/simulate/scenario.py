@@ -1,0 +1,228 @@
+"""One simulated scenario: the table of its parameters, and what they stand for.
+
+The synthetic camera and the offline sweep read the same table, so they compute the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.parameters import Sweep, changed, parameter, rows
+from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import (
+    Pose,
+    rotation_from_quaternion,
+    rotation_from_vector,
+    vector_from_rotation,
+)
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import STEREO, Observations
+from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, rig_from_angle
+from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+
+MONO = 'mono'
+CALIBRATION = 'calibration'
+# Sweeping one of these may name a file that cannot be read: found out before anything runs.
+_READ_FILES = ('lens', 'environment', 'poses_file')
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Parameters of a scenario; all but `poses` can be swept."""
+
+    lens: str = parameter('fish214', 'Lens: a file, or a name in config/lenses')
+    shift_scale: float = parameter(
+        1.0, 'Factor on the viewpoint shift of the lens; 0 makes it an SVP lens', span=(0.0, 100.0)
+    )
+    environment: str = parameter(
+        'whole', 'Landmarks: whole, inner or outer, or a CSV with landmark, x, y, z'
+    )
+    radius: float = parameter(
+        2.0, 'Distance of the landmarks of whole, inner and outer', 'm', (1e-3, 1e6)
+    )
+    style: str = parameter(
+        MONO, 'One camera, or a stereo rig with the cameras left and right',
+        choices=(MONO, *STYLES)
+    )
+    baseline: float = parameter(BASELINE, 'Distance of the two cameras', 'm', (1e-6, 1e3))
+    vergence: float = parameter(
+        0.0, 'Further inward turn of the left camera, beyond that of the style', 'rad',
+        (-1.6, 1.6)
+    )
+    poses: tuple[float, ...] = parameter(
+        (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
+        'x, y, z, qx, qy, qz, qw of the camera (right camera of a rig) in the world, one pose '
+        'after the other', 'm'
+    )
+    poses_file: str = parameter(
+        '', 'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from'
+    )
+    trajectory_steps: int = parameter(
+        0, '0: jump from pose to pose; n: move smoothly, in n steps from each pose to the next',
+        span=(0, 1_000_000)
+    )
+    noise_px: float = parameter(
+        0.0, 'Standard deviation of the noise of image points', 'px', (0.0, 1e3)
+    )
+    seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
+
+
+SCALARS = tuple(row.name for row in rows(Scenario) if not isinstance(row.default, tuple))
+
+
+class Simulation(NamedTuple):
+    """What the cameras of a scenario see.
+
+    observations: one frame a set; poses: of each camera in the world, (P,), one a set, in the
+    order of `observations.cameras`; rig: the left camera in the right one, None for one camera.
+    """
+
+    lens: Lens
+    landmarks: Landmarks
+    observations: Observations
+    poses: tuple[Pose, ...]
+    rig: Pose | None
+
+
+def simulate_scenario(scenario: Scenario, number: int = 0, repetition: int = 0) -> Simulation:
+    """Simulate all sets of a scenario.
+
+    number: of the scenario in its sweep; repetition: of the sweep; each draws noise of its own.
+    Raises FisheyeSvpError for a lens, landmarks or poses that
+    cannot be used.
+    """
+    lens = true_lens(scenario.lens, scenario.shift_scale)
+    landmarks, rig, poses = (
+        scenario_landmarks(scenario), scenario_rig(scenario), scenario_poses(scenario)
+    )
+    model, sigma = ForwardModel(lens), scenario.noise_px
+    rng = noise_generator(scenario.seed, number, repetition)
+    if rig is None:
+        seen = simulate(model, landmarks, poses, sigma, rng)
+        return Simulation(lens, landmarks, seen, (poses,), None)
+    seen = simulate_stereo(model, model, landmarks, rig, poses, sigma, rng)
+    return Simulation(lens, landmarks, seen, (poses.compose(rig), poses), rig)
+
+
+def noise_generator(seed: int, number: int, repetition: int = 0) -> np.random.Generator:
+    """Return the source of a scenario's noise: its own for each scenario and repetition."""
+    return np.random.default_rng([seed, number, repetition])
+
+
+def check_sweep(base: Scenario, sweep: Sweep) -> None:
+    """Raise FisheyeSvpError where a sweep names a lens, landmarks or poses that are unusable."""
+    for name in _READ_FILES:
+        for value in sweep.lists.get(name, ()):
+            simulate_scenario(changed(base, {name: value}))
+    simulate_scenario(changed(base, sweep.point(0)))
+
+
+def scalars(scenario: Scenario) -> dict[str, Any]:
+    """Return the parameters of a scenario that are single values, as `scenario` tells them."""
+    return {name: getattr(scenario, name) for name in SCALARS}
+
+
+def camera_names(style: str) -> tuple[str, ...]:
+    """Return the names of the cameras that a style has."""
+    return ('',) if style == MONO else STEREO
+
+
+def true_lens(lens: str, shift_scale: float = 1.0) -> Lens:
+    """Return the lens of a scenario, its viewpoint shift scaled."""
+    path = lens_path(lens)
+    return _true_lens(path, _version(path), shift_scale)
+
+
+@lru_cache(maxsize=64)
+def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
+    loaded = load_lens(path)
+    shift = loaded.viewpoint_shift
+    if shift is None or shift_scale == 1.0:
+        return loaded
+    if shift_scale == 0.0:
+        return loaded.svp()
+    # Every shift is linear in its lengths; the refractive index is not one of them.
+    lengths = [name for name in shift.coefficient_names if name != 'refractive_index']
+    values = loaded.parameters
+    return loaded.with_parameters(lengths, [shift_scale * values[name] for name in lengths])
+
+
+def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:
+    """Return the forward model of a lens given by file or name.
+
+    Raises LensError where there is none.
+    """
+    loaded = true_lens(lens, shift_scale)
+    return ForwardModel(loaded.svp() if svp else loaded)
+
+
+def scenario_landmarks(scenario: Scenario) -> Landmarks:
+    """Return the landmarks of a scenario, m, in the world."""
+    path = Path(scenario.environment)
+    return _landmarks(scenario.environment, _version(path), scenario.radius)
+
+
+@lru_cache(maxsize=64)
+def _landmarks(name: str, version: int, radius: float) -> Landmarks:
+    return load_landmarks(name) if name.endswith('.csv') else environment(name, radius)
+
+
+def _version(path: Path) -> int:
+    """Return what changes with a file, so that nothing stale is kept; 0 where there is none."""
+    return path.stat().st_mtime_ns if path.is_file() else 0
+
+
+def scenario_rig(scenario: Scenario) -> Pose | None:
+    """Return the left camera in the right one; None for a single camera."""
+    if scenario.style == MONO:
+        return None
+    return rig_from_angle(STYLES[scenario.style] + scenario.vergence, scenario.baseline)
+
+
+def scenario_poses(scenario: Scenario) -> Pose:
+    """Return the poses (P,) of the (right) camera in the world, one a set."""
+    if scenario.poses_file == CALIBRATION:
+        poses = calibration_poses(scenario.baseline)
+    elif scenario.poses_file:
+        poses = read_poses(scenario.poses_file).pose
+    else:
+        poses = _listed_poses(scenario.poses)
+    return _smooth(poses, scenario.trajectory_steps) if scenario.trajectory_steps else poses
+
+
+def _listed_poses(numbers: tuple[float, ...]) -> Pose:
+    if not numbers or len(numbers) % 7:
+        raise ParameterError(f'poses holds {len(numbers)} numbers; seven a pose are needed')
+    table = np.array(numbers).reshape(-1, 7)
+    norm = np.linalg.norm(table[:, 3:], axis=1)
+    if np.any(np.abs(norm - 1) > 1e-3):
+        bad = int(np.argmax(np.abs(norm - 1)))
+        raise ParameterError(f'poses: the quaternion of pose {bad} has norm {norm[bad]:g}, not 1')
+    return Pose(rotation_from_quaternion(table[:, 3:]), table[:, :3])
+
+
+def _smooth(poses: Pose, steps: int) -> Pose:
+    """Insert poses between neighbours: straight lines, turns about a fixed axis."""
+    if len(poses.position) < 2:
+        return poses
+    before, after = poses.take(slice(None, -1)), poses.take(slice(1, None))
+    part = np.arange(steps)[:, None] / steps
+    turn = vector_from_rotation(after.rotation @ np.swapaxes(before.rotation, -1, -2))
+    rotation = rotation_from_vector(part * turn[:, None]) @ before.rotation[:, None]
+    position = before.position[:, None] + part * (after.position - before.position)[:, None]
+    last = poses.take(slice(-1, None))
+    return Pose(
+        np.concatenate([rotation.reshape(-1, 3, 3), last.rotation]),
+        np.concatenate([position.reshape(-1, 3), last.position]),
+    )

@@ -1,0 +1,139 @@
+"""Simulation: landmarks, poses, a lens and its effects to the observations a camera would give."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import (
+    STEREO,
+    Observations,
+    Views,
+    make_observations,
+    views_of,
+)
+
+
+def simulate(
+    model: ForwardModel,
+    landmarks: Landmarks,
+    poses: Pose,
+    sigma: float,
+    rng: np.random.Generator,
+    *,
+    t: Array | None = None,
+    board: Index | None = None,
+) -> Observations:
+    """Return the image points of landmarks (N,) from poses (S,) of the camera in the world.
+
+    sigma: of Gaussian noise on u and on v, px, before the model's effects act on it; t (S,): time
+    of each frame, s; board (N,): the rigid piece of the target that carries each landmark.  Frames
+    count from 0; what lies outside the field of view or the image, or has no ray through the
+    lens, is absent.
+    Raises ParameterError for a sigma below 0.
+    """
+    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
+    seen = recorded(model, predicted(model, poses, views), sigma, rng)
+    return _table(seen[:, None], landmarks, sigma, t, board, ('',))
+
+
+def simulate_stereo(
+    left: ForwardModel,
+    right: ForwardModel,
+    landmarks: Landmarks,
+    rig: Pose,
+    poses: Pose,
+    sigma: float,
+    rng: np.random.Generator,
+    *,
+    t: Array | None = None,
+    board: Index | None = None,
+) -> Observations:
+    """Return the image points in both cameras of a rig, as `simulate` does, in one table.
+
+    rig: left camera in the right one; poses (S,) of the right camera in the world.
+    """
+    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
+    seen = [
+        recorded(model, predicted(model, place, views._replace(camera=views.camera + camera)),
+                 sigma, rng)
+        for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
+    ]
+    return _table(np.stack(seen, axis=1), landmarks, sigma, t, board, STEREO)
+
+
+class Predicted(NamedTuple):
+    """Image points (S, N, 2), px, without noise; scale: factor (S, N, 1) on the noise."""
+
+    uv: Array
+    scale: Array
+
+
+def blank_views(
+    ids: Index, points: Array, count: int, t: Array | None = None, board: Index | None = None
+) -> Views:
+    """Return `count` views to be filled of landmarks (N,) or (S, N) at points (..., N, 3), m."""
+    shape = (count, ids.shape[-1])
+    return views_of(points, np.zeros((*shape, 2)))._replace(
+        landmark=np.broadcast_to(ids, shape),
+        board=np.broadcast_to(0 if board is None else board, shape),
+        t=np.broadcast_to(np.nan if t is None else t[:, None], shape),
+    )
+
+
+def predicted(model: ForwardModel, poses: Pose, views: Views) -> Predicted:
+    """Return what a camera at poses (S,) sees of views (S, N) before the noise."""
+    return Predicted(model.predict(poses, views).uv, _noise_scale(model, poses, views))
+
+
+def recorded(
+    model: ForwardModel, seen: Predicted, sigma: float, rng: np.random.Generator
+) -> Array:
+    """Return image points (S, N, 2), px, with noise; NaN where there is none."""
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
+    uv = seen.uv + sigma * seen.scale * rng.standard_normal(seen.uv.shape)
+    uv = np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
+    for effect, values in model.noise_terms:
+        uv = effect.recorded(uv, values, rng)
+    return uv
+
+
+def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array:
+    if not model.noise_terms:
+        return np.ones((*views.uv.shape[:2], 1))
+    scene = model.scene(poses, views, model.linearise(poses, views))
+    return np.broadcast_to(model.noise_scale(scene), views.uv.shape[:2])[..., None]
+
+
+def _inside(lens: Lens, uv: Array) -> Array:
+    size = np.array([lens.width, lens.height])
+    inside: Array = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1)
+    return inside
+
+
+def _table(
+    seen: Array, landmarks: Landmarks, sigma: float, t: Array | None, board: Index | None,
+    cameras: tuple[str, ...],
+) -> Observations:
+    """Make the table of image points (S, C, N, 2) in the order of frame, camera, landmark."""
+    frame, camera, slot = np.nonzero(np.isfinite(seen).all(axis=-1))
+    return make_observations(
+        frame,
+        landmarks.ids[slot],
+        seen[frame, camera, slot],
+        landmarks.points[slot],
+        camera=camera,
+        board=None if board is None else board[slot],
+        t=None if t is None else t[frame],
+        sigma=np.full(len(frame), sigma) if sigma else None,
+        cameras=cameras,
+        source='simulation',
+    )

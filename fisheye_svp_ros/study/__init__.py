@@ -1,0 +1,1 @@
+"""Metrics, sweeps and error budgets: numbers only."""

@@ -1,0 +1,260 @@
+"""May the viewpoint shift be neglected?  What SVP costs by range and by spread of the landmarks.
+
+A lens looks at landmarks that are spread evenly over a cap of directions about its axis, all at
+one range, alone (localization) and as a stereo rig (epipolar lines and depth).  Beside every SVP
+error stands what image noise alone causes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import LensError, ParameterError
+from fisheye_svp_ros.optics.camera import unique_range
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
+from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.stereo_depth import (
+    epipolar_offset,
+    triangulate,
+    triangulate_optimally,
+)
+
+QUANTITIES = ('position', 'axis', 'residual', 'epipolar', 'depth')
+UNITS = {'position': 'm', 'axis': 'rad', 'residual': 'px', 'epipolar': 'px', 'depth': 'm'}
+_LANDMARKS = 48
+_SMALLEST_SPREAD = np.radians(15.0)
+_EDGE = np.radians(1.0)  # how far inside the field of view the widest spread ends
+_NEAREST, _FARTHEST = 0.05, 20.0  # m
+_BASELINES = (1e-3, _FARTHEST)  # m
+_CLEAR = 1.5  # unique ranges of the lens that the nearest range keeps
+
+
+class Setup(NamedTuple):
+    """What a user has: lens; rig (left camera in the right one); noise of u and of v, px."""
+
+    lens: Lens
+    rig: Pose
+    noise: float
+
+
+class Budget(NamedTuple):
+    """SVP errors and what noise causes, by quantity: arrays (A spreads, R ranges), SI and px.
+
+    spreads (A,): largest incidence angle of the landmarks, rad; ranges (R,), m.  position: of the
+    camera; axis: of its viewing axis; residual: mean, px; epipolar: mean distance to the epipolar
+    curve; depth: mean 3-D distance of stereo points.  NaN where nothing can be solved.
+    """
+
+    spreads: Array
+    ranges: Array
+    error: dict[str, Array]
+    noise: dict[str, Array]
+
+
+class Point(NamedTuple):
+    """One quantity where the user works: error and noise there; limit; whether SVP keeps it.
+
+    nearest_range: from which on SVP keeps the limit at this spread, m; largest_spread: the largest
+    at which it keeps it at this range, rad; NaN where it does so nowhere.
+    """
+
+    quantity: str
+    error: float
+    noise: float
+    limit: float
+    kept: bool
+    nearest_range: float
+    largest_spread: float
+
+
+def widest_spread(lens: Lens) -> float:
+    """Return the largest spread of landmarks that a budget covers, rad."""
+    return float(lens.max_incidence - _EDGE)
+
+
+def nearest_range(lens: Lens) -> float:
+    """Return the nearest range that a budget covers, m."""
+    return max(_NEAREST, _CLEAR * unique_range(lens))
+
+
+def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
+    """Tabulate errors and noise over spreads and ranges.
+
+    Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise and
+    for a baseline with which nothing could be measured.
+    """
+    lens = setup.lens
+    if lens.viewpoint_shift is None:
+        raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it')
+    if not (np.isfinite(setup.noise) and setup.noise > 0):
+        raise ParameterError(f'noise is {setup.noise} px; it must be above 0')
+    baseline = float(np.linalg.norm(setup.rig.position))
+    if not _BASELINES[0] <= baseline <= _BASELINES[1]:
+        raise ParameterError(f'baseline is {baseline:.4g} m; a budget covers {_BASELINES[0]:g} to '
+                             f'{_BASELINES[1]:g} m')
+    angle = np.linspace(_SMALLEST_SPREAD, widest_spread(lens), spreads)
+    distance = np.geomspace(nearest_range(lens), _FARTHEST, ranges)
+    points = distance[:, None, None] * _caps(angle)[:, None]
+    shape = (spreads, ranges)
+    flat = points.reshape(-1, _LANDMARKS, 3)
+    rows = [*_localized(setup, flat), *_measured(setup, flat)]
+    error, noise = (
+        {name: row[i].reshape(shape) for name, row in zip(QUANTITIES, rows, strict=True)}
+        for i in range(2)
+    )
+    return Budget(angle, distance, error, noise)
+
+
+def at_point(
+    budget: Budget, spread: float, working_range: float, limits: dict[str, float | None]
+) -> list[Point]:
+    """Answer for landmarks within `spread`, rad, from `working_range`, m, on.
+
+    limits: by quantity, in SI and px; None: what noise alone causes there.
+    Raises ParameterError for a spread or range outside the budget and for an impossible limit.
+    """
+    _check(np.degrees(spread), np.degrees(budget.spreads), 'spread', 'degrees')
+    _check(working_range, budget.ranges, 'range', 'm')
+    found = []
+    for quantity in QUANTITIES:
+        limit = limits.get(quantity)
+        if limit is not None and not (np.isfinite(limit) and limit > 0):
+            raise ParameterError(
+                f'limit of {quantity} is {limit:.4g} {UNITS[quantity]}; it must be above 0'
+            )
+        error, noise = budget.error[quantity], budget.noise[quantity]
+        allowed = noise if limit is None else np.full_like(noise, limit)
+        # The excess in log is linear where both follow powers of the range.
+        with np.errstate(divide='ignore'):
+            excess = np.log(error / allowed)
+        by_range = _along(budget.spreads, excess, spread)
+        by_spread = _along(np.log(budget.ranges), excess.T, np.log(working_range))
+        here = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
+        found.append(Point(
+            quantity,
+            _value(budget, error, spread, working_range),
+            _value(budget, noise, spread, working_range),
+            _value(budget, allowed, spread, working_range),
+            bool(here <= 0),
+            float(np.exp(_kept_from(np.log(budget.ranges), by_range))),
+            _largest_kept(budget.spreads, by_spread),
+        ))
+    return found
+
+
+def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
+    """Return error and noise (S,) of position, axis and residual for caps (S, N, 3)."""
+    true = identity(len(points))
+    seen = ForwardModel(setup.lens).predict(true, _blank(points)).uv
+    solved = localize(ForwardModel(setup.lens.svp()), views_of(points, seen), true)
+    variance = setup.noise**2 * np.diagonal(solved.covariance, axis1=-2, axis2=-1)
+    # A Gaussian in the plane has this mean norm for a deviation of 1 in each direction.
+    mean_norm = np.sqrt(np.pi / 2) * setup.noise
+    return [
+        (np.linalg.norm(solved.pose.position, axis=-1), np.sqrt(variance[:, :3].sum(axis=-1))),
+        (axis_angle_between(solved.pose, true), np.sqrt(variance[:, 3:5].sum(axis=-1))),
+        (_known_mean(np.linalg.norm(solved.residual, axis=-1)), np.full(len(points), mean_norm)),
+    ]
+
+
+def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
+    """Return error and noise (S,) of epipolar distance and depth for caps (S, N, 3)."""
+    true, svp = ForwardModel(setup.lens), ForwardModel(setup.lens.svp())
+    right = true.predict(identity(len(points)), _blank(points)).uv
+    left_pose = Pose(*(np.broadcast_to(a, (len(points), *a.shape)) for a in setup.rig))
+    left = true.predict(left_pose, _blank(points)).uv
+    both: Mask = np.asarray(np.isfinite(left + right).all(axis=-1))
+    pairs = (svp, svp, setup.rig, left[both], right[both])
+    offset = epipolar_offset(*pairs)
+    solved = triangulate(*pairs).points
+    true_pairs = (true, true, setup.rig, left[both], right[both])
+    spread = triangulate_optimally(*true_pairs, setup.noise).covariance
+    per_pair = [
+        offset.distance,
+        np.linalg.norm(solved - points[both], axis=-1),
+        np.sqrt(np.trace(spread, axis1=-2, axis2=-1)),
+    ]
+    epipolar, depth, depth_noise = (_mean_by_cap(both, values) for values in per_pair)
+    # Noise of the left point across the curve and of the right point that moves the curve.
+    epipolar_noise = np.full(len(points), 2 / np.sqrt(np.pi) * setup.noise)
+    return [(epipolar, epipolar_noise), (depth, depth_noise)]
+
+
+def _caps(angles: Array) -> Array:
+    """Return unit directions (A, N, 3), even over caps of half angle (A,) about z (Fibonacci)."""
+    index = np.arange(_LANDMARKS)
+    azimuth = index * np.pi * (3 - np.sqrt(5))
+    cosine = 1 - (index + 0.5) / _LANDMARKS * (1 - np.cos(angles[:, None]))
+    # The last ring is put on the rim, so that the spread is what it says.
+    cosine = 1 - (1 - cosine) * (1 - np.cos(angles[:, None])) / (1 - cosine[:, -1:])
+    sine = np.sqrt(1 - cosine**2)
+    return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
+
+
+def _blank(points: Array) -> Views:
+    return views_of(points, np.zeros((*points.shape[:2], 2)))
+
+
+def _mean_by_cap(both: Mask, values: Array) -> Array:
+    whole = np.full(both.shape, np.nan)
+    whole[both] = values
+    return _known_mean(whole)
+
+
+def _known_mean(values: Array) -> Array:
+    """Return the mean over the last axis of what is known; NaN where nothing is."""
+    known = np.isfinite(values)
+    count = known.sum(axis=-1)
+    total = np.where(known, values, 0.0).sum(axis=-1)
+    mean: Array = np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return mean
+
+
+def _along(places: Array, table: Array, place: float) -> Array:
+    """Interpolate the rows of a table (P, K) at a place among `places` (P,)."""
+    return np.array([np.interp(place, places, column) for column in table.T])
+
+
+def _value(budget: Budget, table: Array, spread: float, working_range: float) -> float:
+    with np.errstate(divide='ignore'):
+        by_range = _along(budget.spreads, np.log(table), spread)
+    logs = np.log(budget.ranges)
+    return float(np.exp(np.interp(np.log(working_range), logs, by_range)))
+
+
+def _kept_from(places: Array, excess: Array) -> float:
+    """Return the place from which on an excess stays at or below 0; NaN for nowhere."""
+    above = np.flatnonzero(~(excess <= 0))
+    if not above.size:
+        return float(places[0])
+    return _crossing(places, excess, above[-1]) if above[-1] < len(places) - 1 else float('nan')
+
+
+def _largest_kept(places: Array, excess: Array) -> float:
+    """Return the last place where an excess is at or below 0; NaN for nowhere."""
+    kept = np.flatnonzero(excess <= 0)
+    if not kept.size:
+        return float('nan')
+    return _crossing(places, excess, kept[-1]) if kept[-1] < len(places) - 1 else places[-1].item()
+
+
+def _crossing(places: Array, excess: Array, i: int) -> float:
+    """Return where the excess is 0 between places i and i + 1; on the kept side where unknown."""
+    one, two = excess[i:i + 2]
+    if not np.isfinite(one - two):
+        return float(places[i + 1] if two <= 0 else places[i])
+    return float(places[i] + one / (one - two) * (places[i + 1] - places[i]))
+
+
+def _check(value: float, places: Array, name: str, unit: str) -> None:
+    if not places[0] - 1e-9 <= value <= places[-1] + 1e-9:
+        raise ParameterError(
+            f'{name} is {value:.4g} {unit}; this lens and budget allow {places[0]:.4g} to '
+            f'{places[-1]:.4g} {unit}'
+        )

@@ -1,0 +1,140 @@
+"""What errors depend on: the columns of a table, grouped by what was swept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.simulate.scenario import SCALARS
+
+Table = Mapping[str, Sequence[Any]]
+
+_REPEATS = ('seed',)  # differ so that the noise does
+_BAND = (5.0, 95.0)  # percent
+
+
+class Curve(NamedTuple):
+    """An error over values x (X,) of a parameter: median, low and high (5 and 95 %), (X,).
+
+    key: the values of the parameters that tell this curve from the others.
+    """
+
+    key: tuple[Any, ...]
+    x: list[Any]
+    median: Array
+    low: Array
+    high: Array
+
+
+class Grid(NamedTuple):
+    """The median (Y, X) of an error over values of two parameters, NaN where there is none."""
+
+    x: list[Any]
+    y: list[Any]
+    median: Array
+
+
+class Spread(NamedTuple):
+    """Residuals beside their noise: ratio (K,) of rms to sigma, and the density noise predicts.
+
+    at, density (M,): of that ratio where nothing but noise is in the image points.
+    """
+
+    label: str
+    ratio: Array
+    at: Array
+    density: Array
+
+
+def swept_parameters(table: Table) -> list[str]:
+    """Return the parameters that differ between rows, but for those that only redraw noise."""
+    return [name for name in SCALARS
+            if name in table and name not in _REPEATS and len(set(table[name])) > 1]
+
+
+def is_number(table: Table, name: str) -> bool:
+    """Say whether a column holds numbers."""
+    return all(isinstance(value, int | float) for value in table[name])
+
+
+def curves(table: Table, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
+    """Return an error over parameter x, a curve a combination of the parameters `by`."""
+    values, places = _numbers(table, metric), _slots(table, x)
+    groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
+    for name in by:
+        groups = {
+            (*key, value): np.intersect1d(rows, mine)
+            for key, rows in groups.items() for value, mine in _slots(table, name).items()
+        }
+    found = []
+    for key, rows in groups.items():
+        cells = [values[np.intersect1d(rows, place)] for place in places.values()]
+        low, middle, high = np.array([
+            np.percentile(cell, (_BAND[0], 50.0, _BAND[1])) if len(cell) else [np.nan] * 3
+            for cell in (cell[np.isfinite(cell)] for cell in cells)
+        ]).T
+        found.append(Curve(key, list(places), middle, low, high))
+    return found
+
+
+def grid(table: Table, metric: str, x: str, y: str) -> Grid:
+    """Return the median of the magnitude of an error over two parameters."""
+    values, columns, lines = np.abs(_numbers(table, metric)), _slots(table, x), _slots(table, y)
+    median = np.full((len(lines), len(columns)), np.nan)
+    for i, line in enumerate(lines.values()):
+        for j, column in enumerate(columns.values()):
+            cell = values[np.intersect1d(line, column)]
+            if np.isfinite(cell).any():
+                median[i, j] = np.nanmedian(cell)
+    return Grid(list(columns), list(lines), median)
+
+
+def noise_spreads(table: Table, by: str | None) -> list[Spread]:
+    """Return the residuals of localizations beside what their noise alone would leave.
+
+    N image points of noise sigma in u and in v leave, after a pose is fitted to them, a sum of
+    squares of sigma^2 chi^2 with 2 N - 6 degrees of freedom.
+    """
+    sigma, rms = _numbers(table, 'noise_px'), _numbers(table, 'localizer.rms_px')
+    points = _numbers(table, 'localizer.points')
+    groups = _slots(table, by) if by else {'': np.arange(len(rms))}
+    found = []
+    for label, rows in groups.items():
+        kept = rows[(sigma[rows] > 0) & np.isfinite(rms[rows])]
+        if len(kept):
+            ratio = rms[kept] / sigma[kept]
+            at = np.linspace(0.0, max(2.5, min(1.1 * ratio.max(), 20.0)), 400)
+            counts, share = np.unique(points[kept], return_counts=True)
+            # The ratio r is sqrt(chi^2 / N): density of chi^2 at N r^2, times 2 N r.
+            density = sum(
+                part / len(kept) * chi2.pdf(n * at**2, 2 * n - 6) * 2 * n * at
+                for n, part in zip(counts, share, strict=True)
+            )
+            name = f'{by} {_text(label)}' if by else ''
+            found.append(Spread(name, ratio, at, np.asarray(density)))
+    return found
+
+
+def _numbers(table: Table, name: str) -> Array:
+    """Return a column, NaN = empty; of calibrations only those from all sets of a scenario."""
+    cells = np.array([np.nan if v is None else v for v in table[name]], dtype=float)
+    if name.startswith('stereo_calibrator.'):
+        cells[np.add(table['set'], 1) != table['sets']] = np.nan
+    return cells
+
+
+def _slots(table: Table, name: str) -> dict[Any, Any]:
+    """Return the rows of each value of a column: numbers ascend, names are as they come."""
+    cells = table[name]
+    values = dict.fromkeys(cells)
+    order = sorted(values) if is_number(table, name) else list(values)
+    column = np.array(cells, dtype=object)
+    return {value: np.flatnonzero(column == value) for value in order}
+
+
+def _text(value: Any) -> str:
+    return f'{value:g}' if isinstance(value, float) else str(value)

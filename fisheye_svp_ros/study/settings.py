@@ -1,0 +1,77 @@
+"""The parameter tables of the nodes of a sweep; the offline sweep reads the same."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fisheye_svp_ros.io.parameters import parameter
+from fisheye_svp_ros.simulate.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Parameters that every node has."""
+
+    wait_for_subscribers: int = parameter(
+        0, 'Hold back what this node has to tell until so many listen to its image points (a '
+        'camera) or results (a solver), so that nobody misses the first', span=(0, 1000)
+    )
+
+
+@dataclass(frozen=True)
+class CameraSettings(Settings):
+    """Parameters of every camera."""
+
+    rate: float = parameter(10.0, 'Sets a second', 'Hz', (1e-3, 1e4))
+    repeat: bool = parameter(True, 'Start over after the last set; otherwise the node ends')
+    lock_step: str = parameter(
+        '', 'Result topics, separated by blanks: each set waits until all of them have answered '
+        'the one before; then `rate` does not count. Empty: do not wait'
+    )
+
+
+@dataclass(frozen=True)
+class SyntheticCameraSettings(CameraSettings, Scenario):
+    """Parameters of the synthetic camera."""
+
+
+@dataclass(frozen=True)
+class SolverSettings(Settings):
+    """Parameters of every node that solves."""
+
+    lens: str = parameter(
+        '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
+        '`scenario` names'
+    )
+    svp: bool = parameter(True, 'Solve with the single-viewpoint approximation of the lens')
+    sigma_px: float = parameter(
+        1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
+    )
+    patience: float = parameter(
+        2.0, 'How long image points wait for what shares their stamp on other topics', 's',
+        (0.0, 3600.0)
+    )
+
+
+@dataclass(frozen=True)
+class StereoCalibratorSettings(SolverSettings):
+    """Parameters of the stereo calibrator."""
+
+    views: int = parameter(
+        10, 'Calibrate from this many of the last sets of a scenario, or as many as there are',
+        span=(1, 1000)
+    )
+
+
+@dataclass(frozen=True)
+class StereoDepthSettings(SolverSettings):
+    """Parameters of stereo depth."""
+
+    rig: str = parameter(
+        'true', 'The rig to measure with: the true one, or the latest on the topic `rig`, as the '
+        'stereo calibrator publishes it', choices=('true', 'topic')
+    )
+    optimal: bool = parameter(
+        False, 'Find the point of least reprojection error rather than the one halfway between '
+        'the two rays'
+    )

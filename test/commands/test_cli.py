@@ -1,0 +1,278 @@
+"""The command line as a user meets it: results, exit codes, one line of error."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.targets import plane, poses_around
+
+from fisheye_svp_ros import cli, commands
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.readers import read_poses, write_observations
+from fisheye_svp_ros.optics.curves import Equidistant
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.simulate.simulation import simulate
+
+ROOT = Path(__file__).resolve().parents[2]
+OV_PLANE = ROOT.parent / 'shared' / 'data' / 'ov_plane'
+LENS = Lens('made', 1280, 960, 700.0, 700.0, 650.0, 470.0, Equidistant(), 1.1)
+
+
+@pytest.fixture(scope='module')
+def scene(tmp_path_factory):
+    """Return a folder with observations.csv, lens.yaml and the true poses."""
+    folder = tmp_path_factory.mktemp('scene')
+    rng = np.random.default_rng(4)
+    poses = poses_around(plane(), 6, rng, widest=0.5)
+    table = simulate(ForwardModel(LENS), plane(), poses, 0.1, rng)
+    write_observations(folder / 'given.csv', table)
+    table = replace(table, sigma=np.full(len(table), np.nan))
+    write_observations(folder / 'observations.csv', table)
+    few = (table.frame != 2) | (table.landmark < 3)
+    write_observations(folder / 'poor.csv', table.take(few & (table.frame != 3)))
+    save_lens(LENS, folder / 'lens.yaml')
+    return folder, poses, table
+
+
+def process(*arguments, **options):
+    """Start the command line in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, '-m', 'fisheye_svp_ros.cli', *map(str, arguments)], cwd=ROOT,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+    )
+
+
+def refused(capsys, *arguments):
+    """Run a command that must be refused; return its one line."""
+    try:
+        code = cli.main([*map(str, arguments)])
+    except SystemExit as end:
+        code = end.code
+    out, err = capsys.readouterr()
+    assert code == 2
+    assert out == ''
+    assert err.startswith('fisheye-svp: ')
+    assert err.count('\n') == 1
+    return err
+
+
+class TestLocalize:
+    @pytest.fixture(scope='class')
+    @classmethod
+    def output(cls, scene, tmp_path_factory):
+        folder, _, _ = scene
+        out = tmp_path_factory.mktemp('out') / 'new' / 'localize'
+        arguments = [folder / 'observations.csv', '--lens', folder / 'lens.yaml', '-o', out]
+        assert cli.main(['localize', *map(str, arguments)]) == 0
+        return out
+
+    def test_figures(self, output, scene):
+        figures = json.loads((output / 'localize.json').read_text())
+        assert figures['frames'] == 6
+        assert figures['observations'] == len(scene[2])
+        assert figures['rms_px'] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+        assert figures['sigma_px'] == pytest.approx(0.1, rel=0.1)
+        assert figures['left_out'] == []
+
+    def test_poses_are_the_true_ones_within_their_covariance(self, output, scene):
+        frame, pose = read_poses(output / 'poses.csv')
+        np.testing.assert_array_equal(frame, np.arange(6))
+        table = Table(output / 'covariance.csv', ['frame'])
+        axes = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+        covariance = table.numbers(*(f'{a}_{b}' for a in axes for b in axes)).reshape(-1, 6, 6)
+        off = pose.difference(scene[1])
+        nees = np.einsum('si,sij,sj->s', off, np.linalg.inv(covariance), off)
+        assert nees.mean() == pytest.approx(6, abs=4 * np.sqrt(12 / 6))
+
+    def test_residuals_are_those_of_the_poses(self, output, scene):
+        table = Table(output / 'residuals.csv', ['frame', 'landmark'])
+        np.testing.assert_array_equal(table.whole('landmark'), scene[2].landmark)
+        du, dv, theta, distance = table.numbers('du', 'dv', 'theta', 'range').T
+        rms = json.loads((output / 'localize.json').read_text())['rms_px']
+        assert np.sqrt(np.mean(du**2 + dv**2)) == pytest.approx(rms)
+        _, pose = read_poses(output / 'poses.csv')
+        points = scene[2].xyz - pose.position[scene[2].frame]
+        np.testing.assert_allclose(distance, np.linalg.norm(points, axis=1), rtol=1e-12)
+        axis = pose.rotation[scene[2].frame][:, :, 2]
+        np.testing.assert_allclose(
+            np.cos(theta), np.sum(points * axis, axis=1) / distance, atol=1e-9
+        )
+
+    def test_table_for_people(self, scene, capsys):
+        folder, _, table = scene
+        lens = str(folder / 'lens.yaml')
+        assert cli.main(['localize', str(folder / 'observations.csv'), '--lens', lens]) == 0
+        out, err = capsys.readouterr()
+        assert f'{len(table)} points in 6 frames' in out
+        assert 'estimated from the residuals' in out
+        assert err == ''
+        assert cli.main(['localize', str(folder / 'given.csv'), '--lens', lens]) == 0
+        assert 'the sigma that the observations bring' in capsys.readouterr().out
+
+    def test_frames_that_cannot_be_posed_are_named(self, scene, capsys, tmp_path):
+        folder, _, _ = scene
+        arguments = [folder / 'poor.csv', '--lens', folder / 'lens.yaml', '-o', tmp_path]
+        assert cli.main(['localize', *map(str, arguments)]) == 0
+        assert 'note: left out' in capsys.readouterr().err
+        figures = json.loads((tmp_path / 'localize.json').read_text())
+        assert figures['left_out'] == [2]
+        assert figures['frames'] == 4
+
+    def test_a_lens_by_name(self, scene, capsys):
+        folder, _, _ = scene
+        assert cli.main(['localize', str(folder / 'observations.csv'), '--lens', 'fish214']) == 0
+        assert 'rms' in capsys.readouterr().out
+
+    def test_bad_input(self, scene, capsys, tmp_path):
+        folder, _, _ = scene
+        observations, lens = folder / 'observations.csv', folder / 'lens.yaml'
+        assert '--lens' in refused(capsys, 'localize', observations)
+        assert 'nolens.yaml' in refused(capsys, 'localize', observations, '--lens', 'nolens')
+        assert 'no such file' in refused(capsys, 'localize', tmp_path / 'x', '--lens', lens)
+
+    def test_an_impossible_place_to_write(self, scene, capsys, tmp_path):
+        folder, _, _ = scene
+        (tmp_path / 'file').write_text('')
+        arguments = [folder / 'observations.csv', '--lens', folder / 'lens.yaml']
+        code = cli.main(['localize', *map(str, arguments), '-o', str(tmp_path / 'file' / 'out')])
+        assert code == 2
+        assert 'cannot be written' in capsys.readouterr().err
+
+
+class TestCalibrate:
+    def test_writes_the_lens_and_its_covariance(self, scene, capsys, tmp_path):
+        folder, _, table = scene
+        observations, out = str(folder / 'observations.csv'), tmp_path / 'new' / 'mine.yaml'
+        assert cli.main([
+            'calibrate', observations, '--model', 'equidistant', '--image-size', '1280x960',
+            '--free', 'f,cx,cy', '-o', str(out),
+        ]) == 0
+        shown, err = capsys.readouterr()
+        assert f'{len(table)} points in 6 frames' in shown
+        assert err == ''
+        lens = load_lens(out)
+        assert lens.name == 'mine'
+        assert lens.calibration == {
+            'rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1), 'observations': len(table),
+            'frames': 6, 'source': observations,
+        }
+        document = json.loads(out.with_suffix('.calibrate.json').read_text())
+        assert document['sigma_px'] == pytest.approx(0.1, rel=0.1)
+        found = np.array(list(document['parameters'].values()))
+        assert list(document['parameters']) == ['f', 'cx', 'cy']
+        off = found - (LENS.fx, LENS.cx, LENS.cy)
+        assert off @ np.linalg.solve(document['covariance'], off) < 30
+
+    def test_prints_without_writing(self, scene, capsys, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        folder, _, _ = scene
+        assert cli.main([
+            'calibrate', str(folder / 'observations.csv'), '--model', 'kannala_brandt',
+            '--image-size', '1280x960',
+        ]) == 0
+        assert 'k4' in capsys.readouterr().out
+        assert list(tmp_path.iterdir()) == []
+
+    def test_bad_input(self, scene, capsys, tmp_path):
+        folder, _, _ = scene
+        observations = folder / 'observations.csv'
+        base = ('calibrate', observations, '--model', 'equidistant')
+        assert '--model' in refused(capsys, *base[:2], '--image-size', '9x9')
+        assert 'pinhole' in refused(capsys, *base[:3], 'pinhole', '--image-size', '9x9')
+        for size in ('1280', '1280x', '0x960', '1280x960x3', '-1x5', '12.5x9', 'large'):
+            assert 'form 1280x800' in refused(capsys, *base, f'--image-size={size}')
+        assert 'check the image size' in refused(capsys, *base, '--image-size', '640x480')
+        sized = (*base, '--image-size', '1280x960')
+        assert "no parameter 'k1'" in refused(capsys, *sized, '--free', 'f,k1')
+        assert 's0 cannot be told' in refused(capsys, *sized, '--free', 'f,s0')
+        out = tmp_path / 'lens.yaml'
+        refused(capsys, *sized, '--free', 'f,s0', '-o', out)
+        assert not out.exists()
+
+
+class TestCommandLine:
+    def test_every_command_has_a_module_and_a_help(self, capsys):
+        for name in cli.COMMANDS:
+            with pytest.raises(SystemExit) as end:
+                cli.main([name, '--help'])
+            assert end.value.code == 0
+            assert f'usage: fisheye-svp {name}' in capsys.readouterr().out
+        modules = {path.stem for path in Path(commands.__file__).parent.glob('*.py')}
+        assert set(cli.COMMANDS) <= modules
+
+    def test_bad_command(self, capsys):
+        assert 'COMMAND' in refused(capsys)
+        assert "'fly'" in refused(capsys, 'fly')
+        assert '--fast' in refused(capsys, 'localize', 'x', '--lens', 'y', '--fast')
+
+    def test_help_imports_nothing_heavy(self):
+        code = (
+            'import sys\nfrom fisheye_svp_ros.cli import main\n'
+            'try:\n    main(["--help"])\nexcept SystemExit:\n    pass\n'
+            'print(sorted({"numpy", "rich", "cv2", "scipy", "yaml", "matplotlib"}'
+            ' & set(sys.modules)))'
+        )
+        run = subprocess.run(
+            [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert run.stdout.splitlines()[-1] == '[]'
+        for name in cli.COMMANDS:
+            assert name in run.stdout
+
+    def test_interrupt_is_silent(self, scene):
+        folder, _, _ = scene
+        fifo = folder / 'slow.csv'
+        os.mkfifo(fifo)
+        running = process('localize', fifo, '--lens', folder / 'lens.yaml')
+        writer = None
+        while writer is None and running.poll() is None:
+            try:
+                writer = os.open(fifo, os.O_WRONLY | os.O_NONBLOCK)
+            except OSError:  # the command does not wait for observations yet
+                time.sleep(0.01)
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=60)
+        os.close(writer)
+        assert (running.returncode, out, err) == (130, '', '')
+
+    def test_broken_pipe_is_silent(self, scene):
+        folder, _, _ = scene
+        running = process(
+            'localize', folder / 'observations.csv', '--lens', folder / 'lens.yaml'
+        )
+        running.stdout.close()
+        err = running.stderr.read()
+        running.wait(timeout=60)
+        running.stderr.close()
+        assert err == ''
+        assert running.returncode != 0
+
+    def test_error_of_a_process(self, scene):
+        folder, _, _ = scene
+        running = process('localize', folder / 'none.csv', '--lens', folder / 'lens.yaml')
+        out, err = running.communicate(timeout=60)
+        assert running.returncode == 2
+        assert out == ''
+        assert err.startswith('fisheye-svp: ') and err.count('\n') == 1
+
+
+@pytest.mark.skipif(not OV_PLANE.exists(), reason='the measured data are not here')
+def test_measured_data(tmp_path):
+    lens = tmp_path / 'lens.yaml'
+    assert cli.main([
+        'calibrate', str(OV_PLANE / 'train.csv'), '--model', 'kannala_brandt',
+        '--image-size', '1280x800', '-o', str(lens),
+    ]) == 0
+    assert load_lens(lens).calibration['rms_px'] <= 0.482
+    test = str(OV_PLANE / 'test.csv')
+    assert cli.main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
+    assert json.loads((tmp_path / 'localize.json').read_text())['rms_px'] <= 0.475

@@ -1,0 +1,277 @@
+"""`fisheye-svp diagnose` as a user meets it: verdict, files, report."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.targets import plane, poses_around
+
+from fisheye_svp_ros import cli
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
+from fisheye_svp_ros.diagnosis.model import Linearised
+from fisheye_svp_ros.diagnosis.points import point_residuals
+from fisheye_svp_ros.diagnosis.structure import Structure
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
+from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.readers import write_observations, write_poses
+from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
+from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, verdict_sentences
+from fisheye_svp_ros.reporting.target_map import board_maps
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+
+# Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
+LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 2.0)
+SHIFT = {'viewpoint_shift': {'order': 1, 'parameters': {'e0': 0.002}}}
+FRAMES = 14
+
+
+def landmarks():
+    """Return 40 landmarks at 0.2 to 0.6 m from the middle."""
+    rng = np.random.default_rng(8)
+    direction = rng.normal(size=(40, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return Landmarks(np.arange(40), direction * rng.uniform(0.2, 0.6, (40, 1)))
+
+
+def seen(effects, seed=3, frames=FRAMES):
+    """Return observations and poses of a camera with hidden effects."""
+    rng = np.random.default_rng(seed)
+    poses = poses_around(landmarks(), frames, rng, widest=1.4, distance=(0.8, 1.3), tilt=60)
+    model = ForwardModel(replace(LENS, effects=effects))
+    table = simulate(model, landmarks(), poses, 0.05, rng, t=np.arange(frames) / 10)
+    return replace(table, sigma=np.full(len(table), np.nan)), poses
+
+
+@pytest.fixture(scope='module')
+def scene(tmp_path_factory):
+    """Return a folder with the data of a camera whose viewpoint moves, and of one without."""
+    folder = tmp_path_factory.mktemp('scene')
+    table, poses = seen(SHIFT)
+    write_observations(folder / 'shift.csv', table)
+    write_poses(folder / 'poses.csv', np.arange(FRAMES), poses)
+    write_poses(folder / 'few.csv', np.arange(3), poses.take(slice(3)))
+    poor = (table.frame != 2) | (table.landmark < 3)
+    write_observations(folder / 'poor.csv', table.take(poor))
+    write_observations(folder / 'test.csv', seen(SHIFT, seed=4, frames=6)[0])
+    write_observations(folder / 'clean.csv', seen({})[0])
+    save_lens(LENS, folder / 'lens.yaml')
+    return folder
+
+
+@pytest.fixture(scope='module')
+def output(scene):
+    """Run the command once; return the folder of its results."""
+    out = scene / 'new' / 'out'
+    assert run('shift.csv', scene, '-o', out) == 0
+    return out
+
+
+def run(name, scene, *more):
+    arguments = ['diagnose', scene / name, '--lens', scene / 'lens.yaml', *more]
+    return cli.main([*map(str, arguments)])
+
+
+def document(folder):
+    def refuse(word):
+        raise ValueError(f'{word} is no JSON')
+
+    return json.loads((folder / 'diagnosis.json').read_text(), parse_constant=refuse)
+
+
+class TestFiles:
+    def test_diagnosis_has_the_agreed_keys(self, output):
+        found = document(output)
+        assert found['verdict'] == 'explained'
+        assert found['frames'] == FRAMES
+        assert found['noise_px'] == pytest.approx(0.05, rel=0.1)
+        fit = {'rms_px', 'heldout_rms_px', 'chi2_per_dof'}
+        assert set(found['base']) == set(found['extended']) == fit
+        cause, = found['causes']
+        assert {'effect', 'parameters', 'p_value', 'heldout_rms_px', 'gain',
+                'indistinguishable_from', 'to_separate'} <= set(cause)
+        assert cause['effect'] == 'viewpoint_shift'
+        e0 = cause['parameters']['e0']
+        assert e0['unit'] == 'm'
+        assert e0['value'] == pytest.approx(0.002, abs=5 * e0['stderr'])
+        assert isinstance(found['remaining']['structure'], list)
+        assert {tuple(entry) for entry in found['untestable']} == {('effect', 'why')}
+        assert found['extended']['heldout_rms_px'] < 0.9 * found['base']['heldout_rms_px']
+
+    def test_the_extended_lens_solves_better(self, scene, output, tmp_path):
+        lens = load_lens(output / 'extended_lens.yaml')
+        assert list(lens.effects) == ['viewpoint_shift']
+        figures = []
+        for path in (scene / 'lens.yaml', output / 'extended_lens.yaml'):
+            assert cli.main(['localize', str(scene / 'shift.csv'), '--lens', str(path),
+                             '-o', str(tmp_path)]) == 0
+            figures.append(json.loads((tmp_path / 'localize.json').read_text())['rms_px'])
+        found = document(output)
+        assert figures[0] == pytest.approx(found['base']['rms_px'], rel=1e-3)
+        assert figures[1] == pytest.approx(found['extended']['rms_px'], rel=1e-3)
+
+    def test_residuals_of_every_point(self, scene, output):
+        table = Table(output / 'residuals.csv', ['frame', 'landmark', 'u', 'v', 'theta', 'range'])
+        given = Table(scene / 'shift.csv', ['frame', 'landmark', 'u', 'v'])
+        np.testing.assert_array_equal(table.numbers('frame', 'landmark', 'u', 'v'),
+                                      given.numbers('frame', 'landmark', 'u', 'v'))
+        assert not table.whole('outlier').any()
+        found = document(output)
+        for side, fit in (('before', 'base'), ('after', 'extended')):
+            squares = (table.numbers(f'du_{side}', f'dv_{side}') ** 2).sum(axis=1)
+            assert np.sqrt(squares.mean()) == pytest.approx(found[fit]['rms_px'])
+        theta, distance = table.numbers('theta', 'range').T
+        assert theta.min() > 0 and np.pi / 2 < theta.max() < 2.0
+        assert distance.min() > 0.05 and distance.max() < 2.0
+
+    def test_the_report_is_one_page(self, output):
+        page = (output / 'report.html').read_text(encoding='utf-8')
+        sources = re.findall(r'(?:src|href)="([^"]{1,30})', page)
+        assert sources and all(s.startswith(('data:image/png;base64,', '#')) for s in sources)
+        assert '@import' not in page and '<script' not in page
+        for word in ('Explained', 'viewpoint_shift', 'mm', 'extended_lens.yaml', 'untestable'):
+            assert word in page
+        pictures = {path.stem for path in output.glob('*.png')}
+        assert pictures == {'field', 'theta', 'range', 'landmark', 'frame', 'phase', 'histogram',
+                            'evidence'}
+        assert all(path.read_bytes().startswith(b'\x89PNG') for path in output.glob('*.png'))
+        assert not [path for path in output.iterdir() if path.name.startswith('.')]
+
+
+class TestTerminal:
+    def test_known_poses(self, scene, capsys):
+        assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 0
+        out, err = capsys.readouterr()
+        assert err == ''
+        said = re.search(r'the position error goes from ([\d.]+) mm to ([\d.]+) mm',
+                         ' '.join(out.split()))
+        assert float(said[2]) < 0.5 * float(said[1])
+
+    def test_held_out_file(self, scene, capsys, tmp_path):
+        assert run('shift.csv', scene, '--held-out', scene / 'test.csv') == 0
+        assert 'viewpoint_shift' in capsys.readouterr().out
+
+    def test_nothing_wrong(self, scene, capsys):
+        assert run('clean.csv', scene) == 0
+        out = ' '.join(capsys.readouterr().out.split())
+        assert out.startswith('Adequate')
+        assert 'Keep the lens as it is; these data could not test' in out
+
+    def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
+        assert run('poor.csv', scene) == 0
+        out, err = capsys.readouterr()
+        assert 'left out' in err and 'frames 2' in err
+        assert f'in {FRAMES - 1} frames' in out
+
+    @pytest.mark.parametrize(('more', 'said'), [
+        (['--poses', 'few.csv'], 'frame 3 of'),
+        (['--poses', 'lens.yaml'], "column 'frame' is missing"),
+        (['--held-out', 'nothing.csv'], 'nothing.csv'),
+        (['--lens', 'nothing.yaml'], 'nothing.yaml'),
+    ])
+    def test_bad_input(self, scene, capsys, more, said):
+        assert run('shift.csv', scene, more[0], scene / more[1]) == 2
+        out, err = capsys.readouterr()
+        assert out == '' and err.startswith('fisheye-svp: ') and err.count('\n') == 1
+        assert said in err
+
+
+class TestWords:
+    @pytest.fixture(scope='class')
+    @classmethod
+    def found(cls):
+        return diagnose(seen(SHIFT)[0], LENS)
+
+    def test_three_sentences(self, found):
+        wrong, gained, following = verdict_sentences(found)
+        assert re.search(r'\(viewpoint_shift: e0 = [12]\.\d+ ± 0\.\d+ mm; p < 1e-12\)', wrong)
+        assert 'of the error above the noise' in gained
+        assert following.startswith('Solve with extended_lens.yaml')
+
+    def test_a_class_is_named_with_what_would_separate_it(self, found):
+        cause = replace(found.causes[0], indistinguishable_from=['flat_port', 'radial_profile'],
+                        to_separate='go nearer; or farther')
+        wrong, _, following = verdict_sentences(replace(found, causes=[cause]))
+        assert 'viewpoint_shift, or as well flat_port or radial_profile' in wrong
+        assert 'to tell viewpoint_shift from flat_port and radial_profile: go nearer, or' in (
+            following)
+
+    def test_unexplained(self, found):
+        left = [Structure('outliers', 0.0, 0.5), Structure('theta', 1e-9, 0.1),
+                Structure('range', 1e-9, 0.3)]
+        wrong, gained, following = verdict_sentences(
+            replace(found, verdict='unexplained', causes=[], remaining=left))
+        assert 'depend on the distance of the landmark and the incidence angle' in wrong
+        assert 'a few points lie far off' in wrong
+        assert 'no extension improved on it' in gained
+        assert following.startswith('Look for the reason')
+
+    def test_errors_against_the_truth_go_or_stay(self, found):
+        _, gained, _ = verdict_sentences(found, {
+            'position_error_m': Compared(0.002, 0.001, 0.5, 0.3, 0.6),
+            'depth_error_m': Compared(0.0021, 0.002, 0.05, -0.1, 0.2),
+        })
+        assert 'the position error goes from 2 mm to 1 mm' in gained
+        assert 'the stereo error stays at 2 mm' in gained
+
+    def test_many_causes_are_counted(self, found):
+        wrong, *_ = verdict_sentences(replace(found, causes=5 * found.causes))
+        assert wrong.count('viewpoint_shift') == 3
+        assert 'and for 2 more reasons in the table' in wrong
+
+    def test_parameters_that_the_data_leave_open_are_not_shown(self, found):
+        entry = {'value': 0.1, 'stderr': 1e20, 'unit': '1'}
+        cause = replace(found.causes[0], parameters={
+            **found.causes[0].parameters, 'open': entry,
+            'nothing': {'value': 0.0, 'stderr': float('nan'), 'unit': '1'}})
+        row, = cause_rows(replace(found, causes=[cause]))
+        assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
+
+
+def test_a_single_frame_is_drawn(tmp_path):
+    table, _ = seen({})
+    found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
+    points = point_residuals(found.before, found.after)
+    for name, draw, arguments in residual_pictures(Shown.of(found, points)):
+        draw(tmp_path / f'{name}.png', *arguments)
+    assert len(list(tmp_path.glob('*.png'))) == 7
+
+
+def test_the_bow_of_a_board_is_measured_between_its_extremes():
+    rng = np.random.default_rng(1)
+    board = plane()
+    poses = poses_around(board, 6, rng, widest=0.5)
+    found = diagnose(simulate(ForwardModel(LENS), board, poses, 0.1, rng), LENS)
+    effect = TargetShapeEffect.candidates(found.after.scene)[0]
+    bow = np.array([0.002, 0.0, 0.0])
+    state = replace(found.after.state, terms=((effect, bow),))
+    one, = board_maps(Linearised(found.after.data, state, ()), ('target_shape',))
+    assert len(one.height) == len(board.ids)
+    x = one.place[:, 0] / np.abs(one.place[:, 0]).max()
+    expected = 0.002 * x**2
+    np.testing.assert_allclose(one.height, expected - expected.mean(), atol=1e-9)
+    assert one.peak_to_valley == pytest.approx(0.002)
+    np.testing.assert_allclose(one.slide, 0, atol=1e-12)
+
+
+def test_the_depth_of_a_rig_gains_too():
+    rng = np.random.default_rng(5)
+    model = ForwardModel(replace(LENS, effects=SHIFT))
+    rig = Pose(rotation_from_vector(np.array([0.0, 0.1, 0.0])), np.array([-0.15, 0.0, 0.0]))
+    poses = poses_around(landmarks(), 8, rng, widest=1.2, distance=(0.8, 1.3), tilt=60)
+    table = simulate_stereo(model, model, landmarks(), rig, poses, 0.05, rng)
+    found = diagnose(table, LENS)
+    assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
+    known = known_errors(found.before, found.after, ())
+    assert set(known) == {'depth_error_m'}
+    depth = known['depth_error_m']
+    assert 0 < depth.extended < depth.base
+    assert depth.low <= depth.gain <= depth.high

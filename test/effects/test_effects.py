@@ -1,0 +1,160 @@
+"""Every effect: its columns, its YAML, its physics where an exact answer is at hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import lens, scene
+
+from fisheye_svp_ros.effects.base import Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.curves import FlatPort
+
+DESIGN_NAMES = {
+    'viewpoint_shift', 'radial_profile', 'focal_length', 'principal_point', 'aspect', 'skew',
+    'decentering', 'sensor_tilt', 'flat_port', 'focal_drift', 'session_step', 'landmark_survey',
+    'landmark_scale', 'target_shape', 'board_pose', 'dot_centroid', 'detector_bias',
+    'rolling_shutter', 'stereo_time_offset', 'rig_flex', 'wrong_ids', 'quantisation',
+    'noise_vs_angle',
+}
+
+
+@pytest.fixture(scope='module', params=['fish214', 'fish180'])
+def linearised(request):
+    """Return a model, its views from two cameras, and the scene that effects look at."""
+    rng = np.random.default_rng(4)
+    pose, views = scene(rng, cameras=2, frames=8)
+    model = ForwardModel(lens(request.param), ())
+    linear = model.linearise(pose, views)
+    return model, pose, views, linear, model.scene(pose, views, linear)
+
+
+def forms(name, scene_):
+    try:
+        several = CATALOGUE[name].candidates(scene_)
+    except Untestable as why:
+        pytest.skip(str(why))
+    return [several[0], several[-1]]
+
+
+def test_catalogue_holds_the_names_of_the_design():
+    assert set(CATALOGUE) == DESIGN_NAMES
+
+
+@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+def test_words_say_what_to_look_for_and_what_to_do(name):
+    kind = CATALOGUE[name]
+    assert kind.signature and kind.confused_with and kind.to_separate
+
+
+@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+def test_columns_are_the_derivatives_of_the_prediction(name, linearised):
+    model, pose, views, linear, scene_ = linearised
+    for effect in forms(name, scene_):
+        if effect.stage == 'noise':
+            continue
+        columns = model.effect_columns(effect, scene_, linear)
+        for i, parameter in list(enumerate(effect.parameters))[:7]:
+            step = np.zeros(len(effect.parameters))
+            step[i] = 1e-6 * parameter.large
+            up, down = (
+                ForwardModel(model.lens, [(effect, sign * step)]).predict(pose, views, False).uv
+                for sign in (1, -1)
+            )
+            expected = (up - down) / (2 * step[i])
+            assert np.nanmax(np.abs(columns[..., i])) > 0
+            np.testing.assert_allclose(
+                columns[..., i], expected, atol=2e-5 * np.nanmax(np.abs(expected))
+            )
+
+
+@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+def test_lens_file_keeps_effects(name, linearised, tmp_path):
+    model, pose, views, _, scene_ = linearised
+    rng = np.random.default_rng(1)
+    for effect in forms(name, scene_):
+        values = rng.normal(size=len(effect.parameters)) * 1e-4
+        extended = replace(model.lens, effects={name: effect.to_dict(values)})
+        save_lens(extended, tmp_path / 'lens.yaml')
+        read = ForwardModel(load_lens(tmp_path / 'lens.yaml'))
+        np.testing.assert_array_equal(
+            read.predict(pose, views).uv, ForwardModel(extended).predict(pose, views).uv
+        )
+        assert read.terms[0][0] == effect
+
+
+def test_unknown_and_incomplete_effects_are_refused():
+    with pytest.raises(LensError, match="effect 'bent' is unknown"):
+        load_effects({'bent': {}}, 'lens.yaml')
+    with pytest.raises(LensError, match=r'lens\.yaml: effect skew is incomplete'):
+        load_effects({'skew': {'parameters': {}}}, 'lens.yaml')
+    with pytest.raises(LensError, match='skew has bend, which does not belong'):
+        load_effects({'skew': {'parameters': {'shear': 0.1, 'bend': 1.0}}}, 'lens.yaml')
+
+
+def test_flat_port_is_snells_law():
+    thickness, index = 0.01, 1.5
+    theta = np.linspace(0.05, 1.4, 20)
+    inside = np.arcsin(np.sin(theta) / index)
+    # A ray through a pane leaves displaced sideways; along the axis that is:
+    exact = thickness * (1 - np.tan(inside) / np.tan(theta))
+    shift, slope = FlatPort(thickness, index).value_and_slope(theta, np.tan(theta / 2))
+    np.testing.assert_allclose(shift, exact, rtol=1e-12)
+    np.testing.assert_allclose(slope[1:-1], np.gradient(exact, theta)[1:-1], rtol=0.01)
+
+
+def test_dot_centroid_is_the_centroid_of_the_dots_image():
+    rng = np.random.default_rng(7)
+    pose, views = scene(rng, frames=3)
+    model = ForwardModel(lens(), ())
+    linear = model.linearise(pose, views)
+    scene_ = model.scene(pose, views, linear)
+    effect = CATALOGUE['dot_centroid'].candidates(scene_)[0]
+    radius = 0.008
+    bias = model.effect_columns(effect, scene_, linear)[..., 0] * radius**2
+    board = scene_.boards[0]
+    # Area by a fine grid of the disc, each piece weighted with the area of its image.
+    ring, turn = np.meshgrid((np.arange(60) + 0.5) / 60, 2 * np.pi * np.arange(120) / 120)
+    at = radius * np.stack([ring * np.cos(turn), ring * np.sin(turn)], axis=-1).reshape(-1, 2)
+    for view, point in ((0, 3), (1, 11), (2, 17)):
+        disc = views.points[view, point] + at @ board.axes[:2]
+        inside = (disc - pose.position[view]) @ pose.rotation[view]
+        uv = project(model.lens, inside).uv
+        along = [
+            project(model.lens, inside + 1e-7 * axis @ pose.rotation[view]).uv - uv
+            for axis in board.axes[:2]
+        ]
+        area = np.abs(along[0][:, 0] * along[1][:, 1] - along[0][:, 1] * along[1][:, 0])
+        weight = area * ring.ravel()
+        exact = (weight[:, None] * uv).sum(0) / weight.sum() - linear.uv[view, point]
+        np.testing.assert_allclose(bias[view, point], exact, atol=0.03 * np.linalg.norm(exact))
+
+
+def test_back_projection_undoes_image_effects():
+    pose, views = scene(np.random.default_rng(2), frames=4)
+    terms = [
+        (CATALOGUE['decentering'](), np.array([0.002, -0.003])),
+        (CATALOGUE['focal_length'](), np.array([0.01])),
+        (CATALOGUE['viewpoint_shift'](1), np.array([0.01])),
+    ]
+    model = ForwardModel(lens(), terms)
+    image = model.predict(pose, views)
+    rays = model.back_project(image.uv)
+    arm = pose.into_body(views.points) - rays.origin
+    off = np.linalg.norm(np.cross(arm, rays.direction), axis=-1)
+    assert image.valid.mean() > 0.9
+    assert np.nanmax(off) < 1e-6
+
+
+def test_a_profile_that_turns_back_past_its_data_is_used_up_to_there():
+    effect = CATALOGUE['radial_profile'](4, 1.54)
+    model = ForwardModel(lens(), ((effect, np.array([-1.3, -2.3, 1.4, -0.3]) * 2),))
+    curve = model.lens.image_height
+    assert np.radians(100) < curve.limit < np.radians(140)
+    theta = np.linspace(0.0, curve.limit, 200)[:-1]
+    np.testing.assert_allclose(curve.angle(curve.value_and_slope(theta)[0]), theta, atol=1e-9)
+    assert model.lens.max_incidence <= curve.limit

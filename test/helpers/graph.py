@@ -1,0 +1,89 @@
+"""Nodes and a probe in the process of the test, spun by one executor, on ROS 2 or standalone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from fisheye_svp_ros import standalone
+from helpers.nodes import TIMEOUT
+
+if not standalone.is_genuine():
+    pytest.importorskip('cyclonedds')
+standalone.install()
+
+import rclpy  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+from rclpy.parameter import Parameter  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+
+RELIABLE = QoSProfile(depth=1000)
+LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class Graph:
+    """Nodes under test; arguments as after `--ros-args`."""
+
+    def __init__(self, *arguments: str) -> None:
+        rclpy.init(args=['--ros-args', *arguments])
+        self.executor = SingleThreadedExecutor()
+        self.probe = self.add(Node('probe'))
+        self._publishers: list[Any] = []
+        self._nodes: list[Any] = [self.probe]
+
+    def add(self, node: Any) -> Any:
+        """Run a node from now on."""
+        self.executor.add_node(node)
+        return node
+
+    def start(self, kind: Callable[[], Any]) -> Any:
+        """Create a node and run it."""
+        node = self.add(kind())
+        self._nodes.append(node)
+        return node
+
+    def hear(self, kind: Any, topic: str, qos: Any = RELIABLE) -> list[Any]:
+        """Return a list that fills with the messages of a topic."""
+        heard: list[Any] = []
+        self.probe.create_subscription(kind, topic, heard.append, qos)
+        return heard
+
+    def tell(self, kind: Any, topic: str, qos: Any = RELIABLE) -> Any:
+        """Return a publisher that is connected."""
+        publisher = self.probe.create_publisher(kind, topic, qos)
+        self._publishers.append(publisher)
+        self.until(lambda: publisher.get_subscription_count() > 0)
+        return publisher
+
+    def until(self, condition: Callable[[], Any], timeout: float = TIMEOUT) -> Any:
+        """Spin until a condition holds; return its answer, fail after a while."""
+        end = time.monotonic() + timeout
+        while time.monotonic() < end:
+            if answer := condition():
+                return answer
+            self.executor.spin_once(timeout_sec=0.02)
+        raise AssertionError('nothing happened in time')
+
+    def idle(self, seconds: float) -> None:
+        """Spin for a while, for what must not happen."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def close(self) -> None:
+        """End all nodes."""
+        for node in self._nodes:
+            self.executor.remove_node(node)
+            node.destroy_node()
+        self.executor.shutdown()
+        rclpy.try_shutdown()
+
+
+def set_parameter(node: Any, name: str, value: Any) -> Any:
+    """Set a parameter as `ros2 param set` does, and return the result with its reason."""
+    result, = node.set_parameters([Parameter(name, value=value)])
+    return result

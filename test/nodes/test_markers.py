@@ -1,0 +1,48 @@
+"""What RViz and Foxglove draw of a rig: epipolar curves on the left image."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.graph import LATCHED, Graph
+
+from geometry_msgs.msg import TransformStamped  # isort: skip
+from visualization_msgs.msg import MarkerArray  # isort: skip
+
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+from fisheye_svp_ros.scene.rigs import rig
+
+_PIXEL = 0.08 / 1536  # m, on the base of a camera
+
+
+@pytest.mark.parametrize(('words', 'frame'), [
+    ((), 'world'),
+    (('-r', 'stereo_depth:left/true_pose:=nowhere'), 'left_camera_optical_frame'),
+])
+def test_epipolar_curves_run_through_the_image_points(
+    ros_domain: int, words: tuple[str, ...], frame: str
+) -> None:
+    g = Graph('-p', 'svp:=false', '-p', 'style:=vergent', '-p', 'rate:=20.0',
+              '-p', 'patience:=0.2', '-p', 'rig:=topic', *words)
+    markers = g.hear(MarkerArray, 'stereo_depth/markers', LATCHED)
+    g.start(StereoDepth)
+    known = g.tell(TransformStamped, 'rig', LATCHED)
+    known.publish(messages.transform_message(rig('vergent'), 1, 'right', 'left'))
+    g.start(SyntheticCamera)
+    g.until(lambda: markers)
+    g.close()
+    shown = {marker.ns: np.array([[p.x, p.y, p.z] for p in marker.points])
+             for marker in markers[0].markers}
+    assert list(shown) == ['camera left', 'epipolar curves', 'image points']
+    assert {marker.header.frame_id for marker in markers[0].markers} == {frame}
+    start, end = shown['epipolar curves'].reshape(-1, 2, 3).swapaxes(0, 1)
+    points, along = shown['image points'], end - start
+    assert len(points) == 33 and len(start) > 33 * 50
+    part = ((points[:, None] - start) * along).sum(axis=-1) / (along**2).sum(axis=-1)
+    nearest = start + np.clip(part, 0, 1)[..., None] * along
+    off = np.linalg.norm(points[:, None] - nearest, axis=-1).min(axis=1)
+    assert off.max() < 0.5 * _PIXEL  # curves are drawn in straight pieces
+    if frame != 'world':
+        assert np.ptp(points[:, 2]) < 1e-12 and np.abs(points[:, :2]).max() < 768 * _PIXEL

@@ -1,0 +1,174 @@
+"""Every parameter of every node, with the values that break it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.graph import Graph, set_parameter
+
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.io.parameters import Row, changed, rows, sweep_of
+from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.simulate.scenario import Scenario
+
+OBSERVATIONS = 'frame,landmark,u,v,x,y,z\n' + ''.join(
+    f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1\n' for i in range(6)
+)
+
+
+def node_class(name: str) -> Any:
+    module = import_module(f'fisheye_svp_ros.nodes.{name}')
+    return getattr(module, ''.join(word.title() for word in name.split('_')))
+
+
+TABLES = {name: rows(node_class(name).SETTINGS) for name in NODES
+          if (Path(__file__).parents[2] / f'fisheye_svp_ros/nodes/{name}.py').exists()}
+
+
+@pytest.fixture
+def start(ros_domain: int, tmp_path: Path) -> Iterator[Callable[..., Any]]:
+    """Return a function that starts a node with parameters."""
+    graphs = []
+    measured = tmp_path / 'observations.csv'
+    measured.write_text(OBSERVATIONS)
+
+    def run(name: str, *arguments: str) -> Any:
+        graph = Graph('-p', f'measured_camera:observations:={measured}', *arguments)
+        graphs.append(graph)
+        return graph.start(node_class(name))
+
+    yield run
+    for graph in graphs:
+        graph.close()
+
+
+def wrong_type(row: Row) -> Any:
+    return 'text' if not isinstance(row.default, str) else 3
+
+
+def outside(row: Row) -> list[Any]:
+    if row.choices:
+        return [word for word in ('nonsense', '') if word not in row.choices]
+    if row.low is None or row.high is None:
+        return []
+    kind = type(row.default)
+    step = 1 if kind is int else 0.01 * (row.high - row.low)
+    numbers = [kind(row.low - step), kind(row.high + step)]
+    return numbers if kind is int else [*numbers, math.nan, math.inf, -math.inf]
+
+
+@pytest.mark.parametrize('name', TABLES)
+def test_every_parameter_is_described_and_refuses_what_breaks_it(
+    name: str, start: Callable[..., Any]
+) -> None:
+    node = start(name)
+    for row in TABLES[name]:
+        described = node.describe_parameter(row.name)
+        assert described.description.startswith(row.description)
+        assert described.description.endswith(f' [{row.unit}]') or not row.unit
+        ranges = [*described.integer_range, *described.floating_point_range]
+        assert [(r.from_value, r.to_value) for r in ranges] == (
+            [] if row.low is None else [(row.low, row.high)]
+        )
+        assert described.additional_constraints == (row.constraint() if row.choices else '')
+        before = node.get_parameter(row.name).value
+        for value in (wrong_type(row), *outside(row)):
+            result = set_parameter(node, row.name, value)
+            assert not result.successful, (row.name, value)
+            assert row.name in result.reason or 'type' in result.reason
+            assert node.get_parameter(row.name).value == before
+
+
+@pytest.mark.parametrize(('name', 'parameter', 'value', 'reason'), [
+    ('synthetic_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('synthetic_camera', 'environment', 'cellar', "environment 'cellar' is unknown"),
+    ('synthetic_camera', 'environment', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('synthetic_camera', 'poses', [0.0] * 6, 'poses holds 6 numbers; seven a pose are needed'),
+    ('synthetic_camera', 'poses', [0.0] * 7, 'the quaternion of pose 0 has norm 0, not 1'),
+    ('synthetic_camera', 'poses', [math.nan] * 7, 'poses is nan; a finite number is needed'),
+    ('synthetic_camera', 'poses_file', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('measured_camera', 'observations', '', 'observations is empty; name the file to replay'),
+    ('measured_camera', 'observations', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('measured_camera', 'true_poses', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('measured_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('localizer', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('stereo_calibrator', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('stereo_depth', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+])
+def test_a_value_that_cannot_be_used_is_refused_with_the_reason(
+    name: str, parameter: str, value: Any, reason: str, start: Callable[..., Any]
+) -> None:
+    node = start(name)
+    before = node.get_parameter(parameter).value
+    result = set_parameter(node, parameter, value)
+    assert not result.successful and reason in result.reason and '\n' not in result.reason
+    assert node.get_parameter(parameter).value == before
+    assert set_parameter(node, 'wait_for_subscribers', 3).successful
+    assert node.settings.wait_for_subscribers == 3
+
+
+def test_a_good_value_is_taken_into_use(start: Callable[..., Any]) -> None:
+    node = start('localizer')
+    assert set_parameter(node, 'lens', 'fish180').successful
+    assert set_parameter(node, 'svp', False).successful
+    assert node.settings.lens == 'fish180' and node.settings.svp is False
+
+
+@pytest.mark.parametrize(('argument', 'reason'), [
+    ('rate:=0.0', 'rate'),
+    ('style:=triple', 'style'),
+    ('poses:=[1.0]', 'seven a pose'),
+    ('sweep.rate:=[1.0]', 'no such parameter to sweep'),
+    ('sweep.poses:=[1.0]', 'no such parameter to sweep'),
+    ('sweep.radius:=[1.0, -1.0]', 'radius is -1.0; allowed is 0.001 to 1e+06'),
+    ('sweep.radius:=[near]', "radius is 'near'; float is needed"),
+    ('sweep.radius:=2.0', 'a list of at least one value is needed'),
+    ('sweep.lens:=[fish180, fish999]', 'fish999.yaml: cannot be read'),
+    ('sweep.environment:=[whole, cellar]', "environment 'cellar' is unknown"),
+    ('sweep.style:=[mono, triple]', "style is 'triple'"),
+])
+def test_a_node_does_not_start_with_what_it_cannot_use(
+    argument: str, reason: str, start: Callable[..., Any]
+) -> None:
+    from rclpy.exceptions import ParameterException
+
+    with pytest.raises((FisheyeSvpError, ParameterException)) as caught:
+        start('synthetic_camera', '-p', argument)
+    assert reason in str(caught.value)
+
+
+def test_an_empty_list_to_sweep_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r'sweep.radius is \[\]; a list of at least one'):
+        sweep_of(Scenario, {'sweep.radius': []})
+
+
+def test_a_sweep_is_the_product_of_its_lists_the_last_fastest() -> None:
+    sweep = sweep_of(Scenario, {'sweep.radius': [2, 0.5], 'sweep.seed': [1, 2, 3], 'radius': 7.0})
+    assert len(sweep) == 6
+    assert [(p['radius'], p['seed']) for p in sweep] == [
+        (2.0, 1), (2.0, 2), (2.0, 3), (0.5, 1), (0.5, 2), (0.5, 3)
+    ]
+    assert changed(Scenario(), next(iter(sweep))).seed == 1
+
+
+def test_a_parameter_that_means_nothing_is_named(
+    start: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    start('localizer', '-p', 'lenz:=fish180')
+    said = capfd.readouterr().err
+    assert "parameter 'lenz' means nothing to this node; it knows " in said
+
+
+def test_parameter_files_and_documentation_say_what_the_code_says() -> None:
+    folder = Path(__file__).resolve().parents[2] / 'docs'
+    space: dict[str, Any] = {'__file__': str(folder / 'parameters.py'), '__name__': 'parameters'}
+    exec((folder / 'parameters.py').read_text(encoding='utf-8'), space)
+    for path, wanted in space['documents']().items():
+        assert path.read_text(encoding='utf-8') == wanted, (
+            f'{path.name} is stale; run: python docs/parameters.py'
+        )

@@ -1,0 +1,340 @@
+"""Recordings: written, cut short, read, tabulated; observations out of them."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.nodes import ROOT, NodeProcess, until
+
+pytest.importorskip('rosbags')
+pytest.importorskip('pyarrow')
+from helpers import graph  # noqa: F401 - supplies the message packages
+
+from fisheye_svp_ros import standalone
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.errors import BagError, ObservationError
+from fisheye_svp_ros.io import bags
+from fisheye_svp_ros.io.bags import Bag, BagWriter
+from fisheye_svp_ros.io.clouds import stamp_of
+from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
+
+DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
+CLOUD = 'sensor_msgs/msg/PointCloud2'
+
+
+def cdr(message: Any) -> bytes:
+    """Return a message as it travels."""
+    if standalone.is_genuine():
+        from rclpy.serialization import serialize_message
+
+        return bytes(serialize_message(message))
+    from fisheye_svp_ros.standalone.messages import serialize
+
+    return serialize(message)
+
+
+def write_results(path: Path, count: int, flush_each: bool = False) -> None:
+    """Write scenarios and results of a localizer, results in reverse order of stamps."""
+    with BagWriter(path) as bag:
+        for n in range(count):
+            tag = messages.key_values_message('scenario', {'scenario': n, 'radius': 0.5 * n}, n)
+            bag.write('/a/scenario', DIAGNOSTICS, cdr(tag))
+        for n in reversed(range(count)):
+            result = messages.key_values_message('n', {'rms_px': n / 3, 'points': 33.0}, n)
+            bag.write('/a/localizer/result', DIAGNOSTICS, cdr(result))
+            if flush_each:
+                bag.flush()
+
+
+def test_a_table_is_a_join_on_stamps(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 7)
+    bag = Bag(tmp_path / 'bag')
+    columns = tabulate(bag.records(is_tabulated))
+    assert columns == {
+        'namespace': ['/a'] * 7,
+        'stamp_ns': list(range(7)),
+        'scenario': list(range(7)),
+        'radius': [0.5 * n for n in range(7)],
+        'localizer.rms_px': [n / 3 for n in range(7)],
+        'localizer.points': [33.0] * 7,
+    }
+    assert bag.damage == ''
+
+
+def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for node, value in (('/x/left/localizer', 1.0), ('/x/stereo_depth', 2.0)):
+            message = messages.key_values_message('n', {'rms_px': value}, 5)
+            bag.write(f'{node}/result', DIAGNOSTICS, cdr(message))
+        failed = messages.key_values_message('n', {}, 6, 'too few points', warn=True)
+        bag.write('/x/stereo_depth/result', DIAGNOSTICS, cdr(failed))
+    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    assert columns['namespace'] == ['/x', '/x', '/x/left'] and columns['stamp_ns'] == [5, 6, 5]
+    assert columns['stereo_depth.rms_px'] == [2.0, None, None]
+    assert columns['stereo_depth.note'] == [None, 'too few points', None]
+    assert columns['localizer.rms_px'] == [None, None, 1.0]
+
+
+def test_the_command_writes_csv_parquet_and_json(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from pyarrow import parquet
+
+    write_results(tmp_path / 'bag', 5)
+    assert main(['table', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out')]) == 0
+    out, err = capsys.readouterr()
+    assert '5 rows' in out and 'localizer.rms_px' in out and err == ''
+    with (tmp_path / 'out' / 'table.csv').open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [float(row['localizer.rms_px']) for row in rows] == [n / 3 for n in range(5)]
+    table = parquet.read_table(tmp_path / 'out' / 'table.parquet')
+    assert table.column('localizer.rms_px').to_pylist() == [n / 3 for n in range(5)]
+    assert table.column('stamp_ns').to_pylist() == list(range(5))
+    document = json.loads((tmp_path / 'out' / 'table.json').read_text())
+    assert document['rows'] == 5 and document['damage'] == ''
+
+
+@pytest.mark.parametrize('part', [0.35, 0.6, 0.9, 0.999])
+def test_a_recording_that_was_cut_short_yields_what_is_whole(
+    tmp_path: Path, part: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_results(tmp_path / 'bag', 40, flush_each=True)
+    whole = len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))['localizer.rms_px'])
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    data = file.read_bytes()
+    file.write_bytes(data[:int(part * len(data))])
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    bag = Bag(tmp_path / 'bag')
+    columns = tabulate(bag.records(is_tabulated))
+    assert 'cut short' in bag.damage
+    known = [v for v in columns.get('localizer.rms_px', []) if v is not None]
+    assert len(columns['stamp_ns']) == whole
+    # Results were written from the last stamp to the first: the first are what is lost.
+    assert known == [n / 3 for n in range(40)][40 - len(known):]
+    if part > 0.5:
+        assert known
+    assert main(['table', str(tmp_path / 'bag')]) == 0
+    assert 'note: ' in capsys.readouterr().err
+
+
+def test_a_chunk_that_is_cut_short_yields_its_whole_messages(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 40)
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    data = file.read_bytes()
+    file.write_bytes(data[:len(data) // 3])
+    stamps = tabulate(Bag(file).records(is_tabulated))['stamp_ns']
+    assert stamps == list(range(len(stamps))) and 20 < len(stamps) < 40
+
+
+@pytest.mark.parametrize(('make', 'reason'), [
+    (lambda path: None, 'there is no such recording; check the path'),
+    (lambda path: path.mkdir(), 'no .mcap or .db3 file in this folder'),
+    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'')),
+     'not a recording, or nothing in it is whole'),
+    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(os.urandom(5000))),
+     'not a recording, or nothing in it is whole'),
+    (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'\x89MCAP0\r\n' + b'\5' * 999)),
+     'not a recording, or nothing in it is whole'),
+])
+def test_what_is_no_recording_is_refused(
+    tmp_path: Path, make: Callable[[Path], None], reason: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    make(tmp_path / 'bag')
+    assert main(['table', str(tmp_path / 'bag')]) == 2
+    error = capsys.readouterr().err
+    assert reason in error and error.count('\n') == 1
+
+
+def test_a_recording_without_results_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        message = messages.number_message(1.0)
+        bag.write('/x', 'std_msgs/msg/Float64', cdr(message))
+    assert main(['table', str(tmp_path / 'bag')]) == 2
+    assert 'neither scenarios nor results in it' in capsys.readouterr().err
+
+
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 1)
+    with pytest.raises(BagError, match='a recording cannot be written there'):
+        BagWriter(tmp_path / 'bag')
+
+
+def write_observations(path: Path, scenario: Scenario, namespace: str = '/x') -> Any:
+    simulation = simulate_scenario(scenario)
+    table = simulation.observations
+    with BagWriter(path) as bag:
+        for stamp, frame in enumerate(table.frames, 1):
+            landmarks = messages.landmarks_message(simulation.landmarks, 0, 'world')
+            bag.write(f'{namespace}/landmarks', CLOUD, cdr(landmarks))
+            for number, name in enumerate(table.cameras):
+                mine = table.take((table.frame == frame) & (table.camera == number))
+                message = messages.image_points_message(mine.landmark, mine.uv, stamp, '')
+                topic = '/'.join(filter(None, (namespace, name, 'image_points')))
+                bag.write(topic, CLOUD, cdr(message))
+    return table
+
+
+@pytest.mark.parametrize('style', ['mono', 'parallel'])
+def test_observations_come_back_from_a_recording(tmp_path: Path, style: str) -> None:
+    wanted = write_observations(
+        tmp_path / 'bag', Scenario(poses_file='calibration', style=style, noise_px=0.3)
+    )
+    table = read_observations(tmp_path / 'bag')
+    assert table.cameras == wanted.cameras
+    for name in ('frame', 'landmark', 'uv', 'xyz', 'camera'):
+        assert np.array_equal(getattr(table, name), getattr(wanted, name)), name
+    assert np.array_equal(np.unique(table.t), np.arange(1, 11) / 1e9)
+
+
+def test_observations_of_two_worlds_are_refused(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 1)
+    with pytest.raises(ObservationError, match='landmarks are in: none'):
+        read_observations(tmp_path / 'bag')
+
+
+@pytest.fixture
+def command(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
+    """Return a function that starts `fisheye-svp ARGUMENTS`."""
+    started: list[NodeProcess] = []
+
+    def run(*arguments: str) -> NodeProcess:
+        env = os.environ | {'PYTHONUNBUFFERED': '1'}
+        env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
+        words = [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments]
+        started.append(NodeProcess(words, env))
+        return started[-1]
+
+    yield run
+    for one in started:
+        if one.process.poll() is None:
+            one.process.kill()
+            one.process.wait()
+
+
+def test_the_recorder_writes_every_message_until_it_is_interrupted(
+    command: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    recorder = command('record', '-o', str(tmp_path / 'bag'))
+    camera = command(
+        'run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
+        '-p', 'repeat:=false', '-p', 'rate:=200.0', '-p', 'sweep.seed:=[1, 2, 3, 4, 5]',
+        '-p', 'noise_px:=0.1',
+    )
+    assert camera.finish() == 0
+    assert recorder.finish(signal.SIGINT) == 0
+    assert not [line for line in recorder.lines if 'Traceback' in line]
+    assert '25 messages on 5 topics' in recorder.lines[-1]
+    columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
+    assert columns['seed'] == [1, 2, 3, 4, 5]
+
+
+def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
+    command: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    recorder = command('record', '-o', str(tmp_path / 'bag'))
+    camera = command('run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
+                     '-p', 'rate:=300.0')
+    file = tmp_path / 'bag' / 'bag.mcap'
+    until(lambda: file.exists() and file.stat().st_size > 20_000)
+    recorder.process.send_signal(signal.SIGKILL)
+    recorder.process.wait()
+    assert camera.finish(signal.SIGTERM) == 0
+    bag = Bag(tmp_path / 'bag')
+    assert len(tabulate(bag.records(is_tabulated))['stamp_ns']) >= 5
+    assert 'cut short' in bag.damage
+
+
+def test_bad_arguments_of_record(command: Callable[..., NodeProcess], tmp_path: Path) -> None:
+    (tmp_path / 'bag').mkdir()
+    there = command('record', '-o', str(tmp_path / 'bag'))
+    assert there.finish() == 2
+    assert 'a recording cannot be written there' in there.lines[-1]
+    broken = command('record', '-o', str(tmp_path / 'new'), '--topics', '(')
+    assert broken.finish() == 2 and 'is no regular expression' in broken.lines[-1]
+    assert not (tmp_path / 'new').exists()
+
+
+DATA = ROOT.parent / 'shared' / 'data' / 'ov_plane'
+
+
+@pytest.mark.skipif(not DATA.exists(), reason='the real data is not here')
+def test_measured_camera_and_localizer_agree_with_the_command(
+    command: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    lens = tmp_path / 'lens.yaml'
+    assert main(['calibrate', str(DATA / 'train.csv'), '--model', 'kannala_brandt',
+                 '--image-size', '1280x800', '-o', str(lens)]) == 0
+    assert main(['localize', str(DATA / 'test.csv'), '--lens', str(lens),
+                 '-o', str(tmp_path)]) == 0
+    recorder = command('record', '-o', str(tmp_path / 'bag'))
+    localizer = command('run', 'localizer', '--ros-args', '-p', f'lens:={lens}',
+                        '-p', 'wait_for_subscribers:=2')
+    camera = command(
+        'run', 'measured_camera', '--ros-args', '-p', f'observations:={DATA / "test.csv"}',
+        '-p', 'wait_for_subscribers:=2', '-p', 'repeat:=false',
+        '-p', 'lock_step:=localizer/result',
+    )
+    assert camera.finish() == 0
+    assert recorder.finish(signal.SIGINT) == 0 and localizer.finish(signal.SIGINT) == 0
+    with (tmp_path / 'poses.csv').open() as stream:
+        wanted = {int(row['frame']): row for row in csv.DictReader(stream)}
+    frames, poses = {}, {}
+    for record in Bag(tmp_path / 'bag').records(
+        lambda topic, _: topic in ('/scenario', '/localizer/pose')
+    ):
+        stamp = stamp_of(record.message)
+        if record.topic == '/scenario':
+            frames[stamp] = int(messages.read_key_values(record.message)['frame'])
+        else:
+            poses[stamp] = record.message.pose.pose
+    assert sorted(frames.values()) == sorted(wanted) and set(poses) == set(frames)
+    for stamp, pose in poses.items():
+        row = wanted[frames[stamp]]
+        position, turn = pose.position, pose.orientation
+        ours = [position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w]
+        theirs = [float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
+        assert np.abs(np.array(ours) - theirs).max() < 1e-9
+    assert min(poses) == 26 * 10**9, 'frames carry their own time'
+
+
+def test_flushing_is_what_bounds_the_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bags, '_FLUSH_EVERY', 0.0)
+    writer = BagWriter(tmp_path / 'bag')
+    message = messages.key_values_message('n', {'scenario': 1}, 1)
+    for _ in range(3):
+        writer.write('/scenario', DIAGNOSTICS, cdr(message))
+        time.sleep(0.001)
+    unfinished = Bag(tmp_path / 'bag')
+    assert len(list(unfinished.records(is_tabulated))) == 3 and 'cut short' in unfinished.damage
+    writer.__exit__(None, None, None)
+
+
+def test_reading_a_recording_needs_neither_ros_nor_dds(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 3)
+    code = (
+        'import sys\n'
+        'for name in ("rclpy", "cyclonedds"): sys.modules[name] = None\n'
+        'from fisheye_svp_ros.cli import main\n'
+        f'sys.exit(main(["table", {str(tmp_path / "bag")!r}]))'
+    )
+    path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
+    env = os.environ | {'PYTHONPATH': path}
+    done = subprocess.run([sys.executable, '-c', code], env=env, capture_output=True, text=True)
+    assert done.returncode == 0 and '3 rows' in done.stdout, done.stderr

@@ -1,0 +1,252 @@
+"""Two engines, one formula: they agree to rounding, and nobody notices which one runs."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.lenses import LENSES, points_around, points_on_rays
+
+from fisheye_svp_ros import cli
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.ray_curves import SumOfShifts
+from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.camera import project, project_with_jacobian
+from fisheye_svp_ros.optics.curves import Equidistant, Gennery
+from fisheye_svp_ros.optics.engines import numpy_engine
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.scene.rigs import calibration_poses, rig
+from fisheye_svp_ros.solve.localization import MIN_POINTS, localize
+from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
+
+FISH214 = load_lens(lens_path('fish214'))
+SAME = 1e-12  # relative
+
+
+@pytest.fixture
+def compiled():
+    """Return the compiled engine, to be called beside the reference."""
+    pytest.importorskip('numba', reason='the engine numba comes with the extra `fast`')
+    from fisheye_svp_ros.optics.engines import numba_engine
+
+    return numba_engine
+
+
+def both_equal(expected, found, scale=1.0):
+    for a, b in zip(expected, found, strict=True):
+        assert a.shape == b.shape
+        finite = np.isfinite(a)
+        np.testing.assert_array_equal(finite, np.isfinite(b))
+        np.testing.assert_allclose(a[finite], b[finite], rtol=SAME, atol=SAME * scale)
+
+
+def points_of_all_kinds(lens):
+    """Points on rays, near the lens, far, behind it, on its axis, at it, and no points at all."""
+    rng = np.random.default_rng(91)
+    special = [[0, 0, 0.3], [1e-12, 0, 0.3], [0, 1e-5, 0.4], [0, 0, -0.3], [0, 0, 0],
+               [np.nan, 0.1, 0.2], [0.1, 0.2, np.inf], [0.3, 0, 0], [0, -0.2, 1e-9]]
+    return np.concatenate([
+        points_on_rays(lens, rng, 300), points_around(rng, 300, 0.01, 0.3, 180.0),
+        points_around(rng, 400, 0.3, 1e4, 180.0), special,
+    ])
+
+
+@pytest.mark.parametrize('lens', LENSES)
+@pytest.mark.parametrize('limited', [True, False])
+def test_projection_and_derivatives_of_any_point(compiled, lens, limited):
+    points = points_of_all_kinds(lens)
+    projected, expected, found = (
+        numpy_engine.project(lens, points, limited), *(
+            [part[0] for part in engine.linearise_views(lens, *identity(1), points[None], limited)]
+            for engine in (numpy_engine, compiled)
+        )
+    )
+    both_equal(projected, compiled.project(lens, points, limited), scale=lens.fx)
+    some = np.isfinite(points).all(axis=1)  # no rotation turns a point at infinity
+    both_equal([p[some] for p in projected], [e[some] for e in expected[:2]], scale=lens.fx)
+    both_equal(expected[:2], found[:2], scale=lens.fx)
+    seen = expected[1]
+    size = np.abs(expected[2][seen]).max(axis=(1, 2), keepdims=True)
+    both_equal([expected[2][seen] / size], [found[2][seen] / size])
+
+
+@pytest.mark.parametrize('count', [0, 1, 33, 255, 256, 257, 20_000])
+def test_derivatives_by_the_pose_whatever_the_number_of_points(compiled, count):
+    rng = np.random.default_rng(92)
+    pose = identity(3).retract(rng.normal(size=(3, 6)))
+    local = points_on_rays(FISH214, rng, 3 * count, nearest=0.3).reshape(3, count, 3)
+    points = np.stack([p.transform(x) for p, x in zip(map(Pose, *pose), local, strict=True)])
+    expected, found = (
+        engine.linearise_views(FISH214, *pose, points, True) for engine in (numpy_engine, compiled)
+    )
+    both_equal(expected, found, scale=1e3)
+
+
+@pytest.mark.parametrize('threads', [1, 2, 3])
+def test_any_number_of_threads(compiled, monkeypatch, threads):
+    monkeypatch.setattr(compiled, '_threads', lambda: threads)
+    points = points_on_rays(FISH214, np.random.default_rng(93), 100_001, nearest=0.3)
+    both_equal(numpy_engine.project(FISH214, points, True),
+               compiled.project(FISH214, points, True), scale=1e3)
+    views = *identity(1000), points[1:].reshape(1000, 100, 3)
+    both_equal(numpy_engine.linearise_views(FISH214, *views, True),
+               compiled.linearise_views(FISH214, *views, True), scale=1e3)
+
+
+def views_and_poses(count, points=33):
+    rng = np.random.default_rng(94)
+    landmarks = points_around(rng, points, 0.4, 2.0, 80.0)
+    pose = identity(count).retract(0.05 * rng.normal(size=(count, 6)))
+    uv = project(FISH214, pose.into_body(landmarks)).uv
+    uv += 0.3 * rng.normal(size=uv.shape)
+    uv[rng.uniform(size=uv.shape[:2]) < 0.1] = np.nan
+    return views_of(landmarks, uv), pose
+
+
+def on_each(run):
+    answers = []
+    for name in ('numpy', 'numba'):
+        engines.use(name)
+        answers.append(run())
+    return answers
+
+
+@pytest.mark.parametrize('count', [1, 700])
+def test_poses_and_their_covariances(compiled, engine, count):
+    views, pose = views_and_poses(count)
+    model = ForwardModel(FISH214)
+    expected, found = on_each(lambda: localize(model, views, pose))
+    assert expected.converged.all() and found.converged.all()
+    assert np.abs(found.pose.difference(expected.pose)).max() < 1e-11
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
+    np.testing.assert_array_equal(found.iterations, expected.iterations)
+
+
+def test_rigs_and_their_covariances(compiled, engine):
+    rng = np.random.default_rng(95)
+    model, landmarks = ForwardModel(FISH214), points_around(rng, 33, 0.5, 2.0, 60.0) * [1, 1, -1]
+    left, right = (
+        views_of(landmarks, uv + 0.3 * rng.normal(size=uv.shape))
+        for uv in (project(FISH214, p.into_body(landmarks)).uv
+                   for p in (calibration_poses().compose(rig('vergent')), calibration_poses()))
+    )
+    for systems in (1, 2):
+        expected, found = on_each(lambda n=systems: calibrate_stereo(model, model, left, right, n))
+        assert expected.converged.all() and found.converged.all()
+        assert np.abs(found.rig.difference(expected.rig)).max() < 1e-10
+        assert np.abs(found.pose.difference(expected.pose)).max() < 1e-10
+        np.testing.assert_allclose(found.rig_covariance, expected.rig_covariance, rtol=1e-6)
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
+
+
+def test_what_is_not_plain_sailing_goes_to_the_reference(compiled, engine):
+    views, pose = views_and_poses(3)
+    model = ForwardModel(FISH214)
+    line = np.linspace(0.2, 0.6, 33)[:, None] * [1.0, 0.5, 2.0]
+    near = views.points.copy()
+    near[1] = line  # fixes no pose
+    near[2, 0] = 0.0, 0.0, 0.02  # inside the lens
+    expected, found = on_each(lambda: localize(model, views._replace(points=near), pose))
+    assert expected.converged.tolist() == found.converged.tolist() == [True, False, True]
+    changed = views._replace(points=near)
+    quick, left = compiled.localize(FISH214, changed.seen, changed.row, MIN_POINTS, pose)
+    assert quick.converged.tolist() == [True, False, False] and left == 2
+    both_equal(expected.pose, found.pose)
+    assert np.isnan(found.covariance[1]).all()
+    views.weight[1, 3:] = 0.0
+    for name in ('numpy', 'numba'):
+        engines.use(name)
+        with pytest.raises(GeometryError, match=r'frame 1 has . usable points'):
+            localize(model, views, pose)
+
+
+def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
+    shift = SumOfShifts(FISH214.viewpoint_shift, (Gennery(0.001),))
+    lens = replace(FISH214, viewpoint_shift=shift)
+    points = points_around(np.random.default_rng(96), 50, 0.3, 2.0, 90.0)
+    assert compiled.packed(lens) is None
+    both_equal(numpy_engine.project(lens, points, True), compiled.project(lens, points, True))
+    views = *identity(1), points[None]
+    both_equal(numpy_engine.linearise_views(lens, *views, True),
+               compiled.linearise_views(lens, *views, True))
+
+
+def test_many_lenses_in_turn_are_not_mixed_up(compiled):
+    point = np.array([[0.3, 0.0, 0.4]])
+    for f in range(100, 300):
+        lens = Lens('', 1, 1, f, f, 0.0, 0.0, Equidistant(), 1.5)
+        uv, _ = compiled.project(lens, point, True)
+        assert uv[0, 0] == pytest.approx(f * np.arctan2(0.3, 0.4), rel=1e-14)
+
+
+@pytest.fixture
+def unsettled(monkeypatch):
+    """Leave the choice to the package, whatever is chosen for the tests."""
+    monkeypatch.setattr(engines, '_engine', numpy_engine)
+    monkeypatch.setenv(engines.VARIABLE, 'auto')
+
+
+@pytest.mark.parametrize(('filled', 'points', 'chosen'), [
+    (True, engines.LOADING - 1, 'numpy'), (True, engines.LOADING, 'numba'),
+    (False, engines.LOADING, 'numpy'), (False, 1e10, 'numba'),
+])
+def test_the_compiled_engine_comes_where_it_pays(
+    compiled, unsettled, monkeypatch, filled, points, chosen
+):
+    monkeypatch.setattr(engines.cache, 'filled', lambda: filled)
+    assert engines.settle(points) == chosen
+    assert engines.settle(1) == chosen
+
+
+def test_what_was_asked_for_stays(compiled, unsettled):
+    engines.use('numpy')
+    assert engines.settle(1e10) == 'numpy'
+
+
+@pytest.mark.parametrize('name', ['auto', 'numba'])
+def test_a_numba_that_does_not_go_with_this_numpy(unsettled, monkeypatch, name):
+    monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.optics.engines.numba_engine', None)
+    monkeypatch.delattr(engines, 'numba_engine', raising=False)
+    monkeypatch.setattr(engines, 'find_spec', lambda _: 'there')
+    if name == 'auto':
+        assert engines.settle(1e10) == 'numpy'
+    else:
+        with pytest.raises(ParameterError, match='the engine numba cannot be loaded'):
+            engines.use(name)
+
+
+def test_small_work_never_loads_numba():
+    code = ('import sys, numpy as np\n'
+            'from fisheye_svp_ros.optics.camera import project\n'
+            'from fisheye_svp_ros.io.lens_files import load_lens\n'
+            f'project(load_lens({str(lens_path("fish214"))!r}), np.ones((1000, 3)))\n'
+            'print("numba" in sys.modules)')
+    environment = {k: v for k, v in os.environ.items() if k != engines.VARIABLE}
+    ran = subprocess.run([sys.executable, '-c', code], env=environment, capture_output=True,
+                         text=True, check=True)
+    assert ran.stdout.strip() == 'False'
+
+
+def test_a_wrong_or_missing_engine_is_one_line(monkeypatch, capsys):
+    with pytest.raises(ParameterError, match="'fortran'; known are auto, numpy, numba"):
+        engines.use('fortran')
+    monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.optics.engines.numba_engine', None)
+    monkeypatch.delattr(engines, 'numba_engine', raising=False)
+    assert cli.main(['localize', 'none.csv', '--lens', 'none', '--engine', 'numba']) == 2
+    assert 'the engine numba cannot be loaded' in capsys.readouterr().err
+
+
+def test_the_engine_changes_no_answer_of_the_camera(engine):
+    points = points_around(np.random.default_rng(97), 200, 0.01, 1.0, 180.0)
+    image = project_with_jacobian(FISH214, points)
+    both_equal(numpy_engine.project(FISH214, points, True), (image.uv, image.valid),
+               scale=1e3)

@@ -1,0 +1,202 @@
+"""Lens YAML: what is written is read back, what is broken is refused with its reason."""
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from fisheye_svp_ros.errors import LensError, OutputError
+from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_lens, save_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.curves import (
+    IMAGE_HEIGHTS,
+    VIEWPOINT_SHIFTS,
+    KannalaBrandt,
+    curve_name,
+)
+
+DOCUMENT = {
+    'name': 'trial',
+    'image': {'width': 1280, 'height': 800},
+    'projection': {'model': 'kannala_brandt', 'fx': 453.1, 'fy': 452.9, 'cx': 640.2, 'cy': 399.7,
+                   'k': [0.01, -0.02, 0.003, -0.0004]},
+    'max_incidence_deg': 95.0,
+    'viewpoint_shift': {'model': 'gennery', 's0': -0.001, 'e': [0.01, -0.003, 1e-05]},
+    'effects': {'skew': {'skew': 0.001}},
+    'calibration': {'rms_px': 0.2, 'observations': 100, 'frames': 5, 'source': 'train.csv'},
+}
+
+
+def changed(path, value):
+    """DOCUMENT with the field at a dotted path replaced, or left out for None."""
+    document = copy.deepcopy(DOCUMENT)
+    *outer, last = path.split('.')
+    section = document
+    for name in outer:
+        section = section[name]
+    section[last] = value
+    if value is None:
+        del section[last]
+    return document
+
+
+@pytest.mark.parametrize('name', ['fish180', 'fish214'])
+def test_config_lenses_survive_a_round_trip(name, tmp_path):
+    lens = load_lens(lens_path(name))
+    save_lens(lens, tmp_path / 'lens.yaml')
+    assert load_lens(tmp_path / 'lens.yaml') == lens
+
+
+def test_every_field_survives_a_round_trip(tmp_path):
+    lens = lens_from_dict(DOCUMENT)
+    save_lens(lens, tmp_path / 'lens.yaml')
+    again = load_lens(tmp_path / 'lens.yaml')
+    assert again == lens
+    assert lens_to_dict(again) == DOCUMENT
+
+
+@pytest.mark.parametrize('height', IMAGE_HEIGHTS)
+@pytest.mark.parametrize('shift', [None, *VIEWPOINT_SHIFTS])
+def test_every_curve_survives_a_round_trip(height, shift):
+    document = changed('projection', {'model': height, 'f': 400.0, 'cx': 640.0, 'cy': 400.0})
+    document['max_incidence_deg'] = 80.0
+    document['viewpoint_shift'] = {
+        None: None,
+        'gennery': {'model': 'gennery', 's0': 0.001, 'e': [0.01, 0.0, 0.0]},
+        'flat_port': {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
+    }[shift]
+    lens = lens_from_dict(document)
+    assert curve_name(lens.image_height) == height
+    assert (lens.viewpoint_shift and curve_name(lens.viewpoint_shift)) == shift
+    assert lens_from_dict(lens_to_dict(lens)) == lens
+
+
+def test_what_may_be_left_out(tmp_path):
+    path = tmp_path / 'wide.yaml'
+    path.write_text(
+        'image: {width: 640, height: 480}\n'
+        'projection: {model: kannala_brandt, f: 3e2, cx: 319.5, cy: 239.5, k: [1e-2, -2E-3]}\n'
+        'max_incidence_deg: 80\n'
+    )
+    lens = load_lens(path)
+    assert (lens.name, lens.fx, lens.fy) == ('wide', 300.0, 300.0)
+    assert lens.image_height == KannalaBrandt(0.01, -0.002)
+    assert lens.viewpoint_shift is None
+    assert (lens.effects, lens.calibration) == ({}, None)
+
+
+def test_parameters_by_name():
+    lens = lens_from_dict(DOCUMENT)
+    names = ['f', 'cx', 'k2', 's0', 'e1']
+    moved = lens.with_parameters(names, [1.0, 2.0, 3.0, 4.0, 5.0])
+    assert (moved.fx, moved.fy, moved.cx, moved.cy) == (1.0, 1.0, 2.0, lens.cy)
+    assert moved.parameters == {**lens.parameters, 'fx': 1.0, 'fy': 1.0, 'cx': 2.0, 'k2': 3.0,
+                                's0': 4.0, 'e1': 5.0}
+    assert moved.svp().viewpoint_shift is None
+    found = {name: {'e0': 0.1} for name in ('viewpoint_shift', 'skew', 'flat_port')}
+    assert set(replace(moved, effects=found).svp().effects) == {'skew'}
+    with pytest.raises(LensError, match=r"no parameter 'k5'; it has fx, fy, .* e2"):
+        lens.with_parameters(['k5'], [0.0])
+    with pytest.raises(LensError, match="no parameter 's0'"):
+        lens.svp().with_parameters(['s0'], [0.0])
+
+
+@pytest.mark.parametrize(('path', 'value', 'reason'), [
+    ('image', None, 'image is missing; a mapping is needed'),
+    ('image', 640, 'image is missing; a mapping is needed'),
+    ('image.width', None, 'image: width is None; a number is needed'),
+    ('image.width', '640', "image: width is '640'; a number is needed"),
+    ('image.width', 640.5, 'image: width is 640.5; a whole number of pixels is needed'),
+    ('image.width', float('nan'), 'image: width is nan; a whole number of pixels is needed'),
+    ('image.height', 0, 'height is 0; it must be above 0'),
+    ('projection', None, 'projection is missing; a mapping is needed'),
+    ('projection.model', None, 'projection.model is None; known are orthographic, equidistant'),
+    ('projection.model', 'pinhole', "projection.model is 'pinhole'; known are"),
+    ('projection.model', ['x'], r"projection.model is \['x'\]; known are"),
+    ('projection.fx', None, 'projection: fx is None; a number is needed'),
+    ('projection.fx', True, 'projection: fx is True; a number is needed'),
+    ('projection.fx', -1.0, 'fx is -1.0; it must be above 0'),
+    ('projection.fy', float('inf'), 'fy is inf; a finite number is needed'),
+    ('projection.cx', float('nan'), 'cx is nan; a finite number is needed'),
+    ('projection.f', 400.0, 'projection has both f and fx or fy; keep one of them'),
+    ('projection.k', 0.1, 'projection.k must be a list of numbers, is 0.1'),
+    ('projection.k', ['a'], r"projection.k must be a list of numbers, is \['a'\]"),
+    ('projection.k', [0.0] * 5, 'projection.k has 5 values; this model takes 4'),
+    ('projection.k', [float('nan')], 'k1 is nan; a finite number is needed'),
+    ('projection.k', [-0.3], r'max_incidence_deg is 95; these curves allow .* up to 60\.39'),
+    ('projection.p1', 0.1, "projection: unknown field 'p1'; known are"),
+    ('max_incidence_deg', None, 'max_incidence_deg is None; a number is needed'),
+    ('max_incidence_deg', 0, 'max_incidence_deg is 0; these curves allow a value above 0'),
+    ('max_incidence_deg', 190, 'max_incidence_deg is 190; these curves allow'),
+    ('max_incidence_deg', float('nan'), 'max_incidence_deg is nan; these curves allow'),
+    ('viewpoint_shift', 0.001, 'viewpoint_shift must be a mapping with a model'),
+    ('viewpoint_shift.model', 'cahvore', "viewpoint_shift.model is 'cahvore'; known are gennery"),
+    ('viewpoint_shift.s0', 'x', "viewpoint_shift: s0 is 'x'; a number is needed"),
+    ('viewpoint_shift.e', [0.0] * 4, "viewpoint_shift: unknown field 'e3'; known are"),
+    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01},
+     'viewpoint_shift: a coefficient is missing; needed are thickness, refractive_index'),
+    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.0},
+     'refractive_index is 1.0; it must be above 1'),
+    ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},
+     'max_incidence_deg is 95; these curves allow .* up to 90'),
+    ('effects', [1], 'effects must map each effect name to its parameters'),
+    ('effects.skew', 0.001, 'effects must map each effect name to its parameters'),
+    ('calibration', [1], r'calibration must be a mapping, is \[1\]'),
+    ('distortion', {}, "unknown field 'distortion'; known are calibration, effects, image"),
+])
+def test_broken_lens_is_refused_with_its_reason(path, value, reason, tmp_path):
+    file = tmp_path / 'broken.yaml'
+    file.write_text(yaml.safe_dump(changed(path, value)))
+    with pytest.raises(LensError, match=reason) as caught:
+        load_lens(file)
+    assert str(caught.value).startswith(str(file))
+    assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize(('content', 'reason'), [
+    (b'', 'a YAML mapping is expected, found NoneType'),
+    (b'- 1\n', 'a YAML mapping is expected, found list'),
+    (b'image: {width: 1\n', 'broken YAML at line 2: '),
+    (b'\xff\xfe\x00', 'not a text file; a YAML file in UTF-8 is expected'),
+])
+def test_broken_file_is_refused_with_its_reason(content, reason, tmp_path):
+    file = tmp_path / 'broken.yaml'
+    file.write_bytes(content)
+    with pytest.raises(LensError, match=reason) as caught:
+        load_lens(file)
+    assert str(caught.value).startswith(str(file))
+
+
+def test_missing_file_and_unwritable_place(tmp_path):
+    with pytest.raises(LensError, match=r'absent\.yaml: cannot be read .*; check the path'):
+        load_lens(tmp_path / 'absent.yaml')
+    with pytest.raises(LensError, match='cannot be read'):
+        load_lens(tmp_path)
+    (tmp_path / 'file').write_text('')
+    with pytest.raises(OutputError, match='cannot be written'):
+        save_lens(lens_from_dict(DOCUMENT), tmp_path / 'file' / 'lens.yaml')
+    assert [p.name for p in tmp_path.iterdir()] == ['file']
+
+
+@pytest.mark.parametrize('name', IMAGE_HEIGHTS)
+def test_image_height_curves_invert_and_differentiate(name):
+    kind = IMAGE_HEIGHTS[name]
+    curve = kind(-0.01, 0.004, 0.0, -0.0001) if name == 'kannala_brandt' else kind()
+    theta = np.linspace(0.0, 0.97 * curve.limit, 300)
+    height, slope = curve.value_and_slope(theta)
+    np.testing.assert_allclose(curve.angle(height), theta, rtol=0, atol=1e-13)
+    step = 1e-5
+    low, high = (curve.value_and_slope(theta + d)[0] for d in (-step, step))
+    np.testing.assert_allclose((high - low) / (2 * step), slope, rtol=1e-6)
+    assert np.all(slope > 0)
+
+
+def test_kannala_brandt_ends_where_its_height_stops_growing():
+    curve = KannalaBrandt(-0.3)
+    assert curve.limit == pytest.approx(np.sqrt(1 / 0.9), abs=1e-12)
+    assert KannalaBrandt(0.1).limit == np.pi
+    edge, slope = curve.value_and_slope(np.array(curve.limit))
+    assert slope == pytest.approx(0.0, abs=1e-12)
+    assert curve.angle(edge) == pytest.approx(curve.limit, abs=1e-6)

@@ -1,0 +1,110 @@
+"""The demo, a small one: one lens, one radius, all three tasks."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from helpers.nodes import ROOT
+
+pytest.importorskip('pyarrow')
+from helpers import graph  # noqa: F401 - skips where there is neither ROS 2 nor Cyclone DDS
+
+from fisheye_svp_ros.commands.processes import Processes
+from fisheye_svp_ros.errors import BagError, StandaloneError
+from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.paper.demonstration import shown
+
+pytestmark = pytest.mark.xdist_group('demo')  # run once
+
+
+@pytest.fixture(scope='module')
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Run the demo once; return its folder and what it printed."""
+    folder = tmp_path_factory.mktemp('demo')
+    env = {name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'}
+    env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
+    done = subprocess.run(
+        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'demo', '-o', str(folder),
+         '--lenses', 'fish180', '--radii', '0.5'],
+        env=env, capture_output=True, text=True, timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_every_scenario_is_there_once_beside_the_published_numbers(demo: Any) -> None:
+    folder, _ = demo
+    rows = json.loads((folder / 'demo.json').read_text())['rows']
+    assert [(row['task'], row['where']) for row in rows] == [
+        (task, where)
+        for task, names in (
+            ('localization', ('whole', 'inner', 'outer')),
+            ('calibration', ('parallel', 'vergent', 'divergent')),
+            ('depth', ('parallel', 'vergent', 'divergent')),
+        )
+        for where in names
+    ]
+    whole, inner, outer = rows[:3]
+    # Kita, table 1: -0.16, 0.24 and -1.67 mm.
+    assert whole['published_error'] == pytest.approx([-0.1614e-3] * 2)
+    for row in (whole, inner, outer):
+        assert row['error'] == pytest.approx(row['published_error'][0], rel=0.2)
+        assert row['pixels'] == pytest.approx(row['published_pixels'][0], rel=0.1)
+    assert all(row['error'] > 0 and row['pixels'] > 0 for row in rows[3:])
+
+
+def test_everything_is_recorded(demo: Any) -> None:
+    folder, _ = demo
+    columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
+    counts = {name: columns['namespace'].count(name) for name in set(columns['namespace'])}
+    assert counts == {'/localization': 3, '/calibration': 3 * 10, '/depth': 3 * 2}
+    assert len(set(zip(columns['namespace'], columns['stamp_ns'], strict=True))) == 39
+    everything = Bag(folder / 'recording').records(lambda topic, typename: True)
+    types = {record.topic: record.typename for record in everything}
+    pose = types['/localization/localizer/pose']
+    assert pose == 'geometry_msgs/msg/PoseWithCovarianceStamped'
+    assert types['/depth/stereo_depth/metrics/error3_m'] == 'std_msgs/msg/Float64'
+
+
+def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
+    folder, printed = demo
+    assert printed.count('localization') >= 3 and 'published' in printed
+    for name in ('errors.png', 'residuals.png'):
+        assert (folder / name).read_bytes().startswith(b'\x89PNG')
+    assert (folder / 'table.csv').exists() and (folder / 'table.parquet').exists()
+
+
+def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
+    folder, _ = demo
+    for log in (folder / 'logs').glob('*.log'):
+        text = log.read_text()
+        assert 'Traceback' not in text and 'WARN' not in text and 'dropped' not in text, log
+
+
+def test_a_missing_scenario_is_named(demo: Any) -> None:
+    folder, _ = demo
+    columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
+    with pytest.raises(BagError, match=r'no result of localizer for fish180, whole, 2\.0 m'):
+        shown(columns, ['fish180'], [2.0])
+    twice = {name: cells * 2 for name, cells in columns.items()}
+    with pytest.raises(BagError, match='was recorded twice'):
+        shown(twice, ['fish180'], [0.5])
+
+
+def test_a_process_that_fails_is_named_and_none_is_left(tmp_path: Path) -> None:
+    with (
+        pytest.raises(StandaloneError, match=r'bad ended with status 2: .*nothere.yaml'),
+        Processes(tmp_path / 'logs') as processes,
+    ):
+        processes.start('good', ['run', 'localizer'])
+        processes.start('bad', ['run', 'localizer', '--ros-args', '-p', 'lens:=nothere'])
+        running = list(processes._running.values())
+        processes.wait(['good'], 60.0)
+    assert all(process.poll() is not None for process in running)

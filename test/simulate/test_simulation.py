@@ -1,0 +1,128 @@
+"""Simulated observations: what is there, what is absent, and how it scatters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
+from fisheye_svp_ros.effects.quantisation import QuantisationEffect
+from fisheye_svp_ros.effects.wrong_ids import WrongIdsEffect
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
+from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+
+FISH180, FISH214 = (load_lens(lens_path(name)) for name in ('fish180', 'fish214'))
+
+
+def rng():
+    return np.random.default_rng(51)
+
+
+def test_one_row_an_image_point():
+    landmarks = environment('outer', 0.5)
+    times, boards = np.arange(10) * 0.1, np.arange(18) // 8
+    table = simulate(ForwardModel(FISH214), landmarks, calibration_poses(), 0.0, rng(),
+                     t=times, board=boards)
+    assert len(table) == 180
+    assert table.frames.tolist() == list(range(10))
+    np.testing.assert_array_equal(table.landmark, np.tile(landmarks.ids, 10))
+    np.testing.assert_array_equal(table.board, np.tile(boards, 10))
+    np.testing.assert_array_equal(table.t, np.repeat(times, 18))
+    np.testing.assert_array_equal(table.xyz, np.tile(landmarks.points, (10, 1)))
+    assert np.isnan(table.sigma).all()
+    assert table.cameras == ('',)
+    views = group_views(table)
+    expected = project(FISH214, calibration_poses().into_body(views.points)).uv
+    np.testing.assert_array_equal(views.uv, expected)
+
+
+def test_what_has_no_image_is_absent():
+    points = np.array([[0, 0, 1.0], [0, 0.1, -1.0], [0.1, 0, 0.1],
+                       [np.sin(1.8), 0, -np.cos(1.8)]])
+    landmarks = Landmarks(np.array([3, 1, 4, 5]), points)
+    table = simulate(ForwardModel(FISH214), landmarks, paper_pose(1), 0.0, rng())
+    assert table.landmark.tolist() == [1, 5]
+    narrow = replace(FISH214, width=800, height=1536)
+    table = simulate(ForwardModel(narrow), landmarks, paper_pose(1), 0.0, rng())
+    assert table.landmark.tolist() == [1]
+    empty = simulate(ForwardModel(FISH214), Landmarks(np.array([3]), points[:1]), paper_pose(2),
+                     0.0, rng())
+    assert len(empty) == 0
+
+
+def test_noise_is_gaussian_and_follows_the_seed():
+    landmarks = environment('inner', 2.0)
+    clean = simulate(ForwardModel(FISH180), landmarks, paper_pose(400), 0.0, rng())
+    noisy = simulate(ForwardModel(FISH180), landmarks, paper_pose(400), 0.3, rng())
+    again = simulate(ForwardModel(FISH180), landmarks, paper_pose(400), 0.3, rng())
+    np.testing.assert_array_equal(noisy.uv, again.uv)
+    scatter = (noisy.uv - clean.uv) / 0.3
+    assert scatter.mean() == pytest.approx(0.0, abs=0.03)
+    assert scatter.std() == pytest.approx(1.0, abs=0.02)
+    assert (scatter**4).mean() == pytest.approx(3.0, abs=0.2)
+    assert np.corrcoef(scatter.T)[0, 1] == pytest.approx(0.0, abs=0.04)
+    np.testing.assert_array_equal(noisy.sigma, 0.3)
+
+
+@pytest.mark.parametrize('sigma', [-0.1, float('nan'), float('inf')])
+def test_impossible_noise(sigma):
+    with pytest.raises(ParameterError, match=r'noise is .* px; 0 or more is needed'):
+        simulate(ForwardModel(FISH180), environment('inner', 2.0), paper_pose(1), sigma, rng())
+
+
+def test_stereo_is_one_table_of_two_cameras():
+    landmarks, right = environment('whole', 2.0), calibration_poses()
+    left_in_right = rig('vergent')
+    table = simulate_stereo(ForwardModel(FISH180), ForwardModel(FISH214), landmarks, left_in_right,
+                            right, 0.0, rng(), t=np.arange(10.0))
+    assert table.cameras == ('left', 'right')
+    views = group_views(table)
+    assert views.frame.tolist() == [frame for frame in range(10) for _ in range(2)]
+    assert views.camera.tolist() == [0, 1] * 10
+    for camera, lens, pose in ((0, FISH180, right.compose(left_in_right)), (1, FISH214, right)):
+        mine = views.take(views.camera == camera)
+        expected = project(lens, pose.into_body(mine.points)).uv
+        np.testing.assert_array_equal(mine.uv[mine.used], expected[mine.used])
+        np.testing.assert_array_equal(np.unique(mine.t[mine.used]), np.arange(10.0))
+
+
+def noisy(effect, values, sigma=0.2, frames=300):
+    """Return clean and noisy image points (frames, N, 2) with one effect of the noise."""
+    landmarks = environment('inner', 2.0)
+    terms = ((effect, np.array(values)),)
+    tables = (
+        simulate(ForwardModel(FISH180, some), landmarks, paper_pose(frames), noise, rng())
+        for some, noise in (((), 0.0), (terms, sigma))
+    )
+    return tuple(table.uv.reshape(frames, -1, 2) for table in tables)
+
+
+def test_noise_that_grows_with_the_angle():
+    clean, seen = noisy(NoiseVsAngleEffect(), [0.8], sigma=0.1)
+    points = paper_pose(1).into_body(environment('inner', 2.0).points)[0]
+    theta = np.arctan2(np.linalg.norm(points[:, :2], axis=1), points[:, 2])
+    scatter = (seen - clean).std(axis=(0, 2))
+    np.testing.assert_allclose(scatter, 0.1 * np.exp(0.8 * theta**2), rtol=0.15)
+
+
+def test_rounded_image_points():
+    clean, seen = noisy(QuantisationEffect(), [0.25])
+    np.testing.assert_array_equal(seen / 0.25, np.round(seen / 0.25))
+    assert (seen - clean).std() == pytest.approx(np.hypot(0.2, 0.25 / np.sqrt(12)), rel=0.03)
+
+
+def test_image_points_swapped_with_others_of_their_view():
+    clean, seen = noisy(WrongIdsEffect(), [0.1], sigma=0.0)
+    wrong = np.any(seen != clean, axis=-1)
+    assert wrong.mean() == pytest.approx(0.1, abs=0.02)
+    assert (wrong.sum(axis=1) % 2 == 0).all()
+    for before, after in zip(clean, seen, strict=True):
+        assert sorted(map(tuple, before)) == sorted(map(tuple, after))

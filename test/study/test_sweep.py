@@ -1,0 +1,374 @@
+"""Offline sweeps: the same numbers as one by one, whoever works on them and whatever happens."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.nodes import ROOT, until
+
+pytest.importorskip('pyarrow')
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.parameters import changed
+from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.study.metrics import localization_metrics
+from fisheye_svp_ros.study.sweep import InProcess, plan_sweep, solve_sweep, sweep_rows, tasks
+
+SMALL = """
+/**:
+  ros__parameters:
+    sweep.environment: [whole, inner]
+    sweep.radius: [2.0, 0.3]
+    sweep.shift_scale: [0.0, 1.0]
+    noise_px: 0.3
+    seed: 5
+localizer: {ros__parameters: {svp: true}}
+"""
+# Seconds of work, in many tasks.
+LONG = f"""
+synthetic_camera:
+  ros__parameters:
+    noise_px: 0.5
+    environment: inner
+    sweep.radius: [2.0, 0.5, 0.3]
+    sweep.seed: {list(range(1700))}
+"""
+TASKS = 10
+
+
+@pytest.fixture(scope='module')
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the finished sweep LONG."""
+    folder = tmp_path_factory.mktemp('undisturbed')
+    (folder / 'file.yaml').write_text(LONG)
+    finish(folder / 'file.yaml', '-o', folder / 'out')
+    return folder / 'out'
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[[str], Path]:
+    """Return a function that writes a sweep file."""
+    def file(text: str) -> Path:
+        path = tmp_path / 'file.yaml'
+        path.write_text(text)
+        return path
+
+    return file
+
+
+def sweep(*arguments: Any) -> None:
+    assert main(['sweep', *map(str, arguments)]) == 0
+
+
+def start(*arguments: Any) -> subprocess.Popen[str]:
+    """Start a sweep in a process of its own."""
+    env = os.environ | {'PYTHONPATH': str(ROOT)}
+    command = [sys.executable, '-m', 'fisheye_svp_ros.cli', 'sweep', *map(str, arguments)]
+    return subprocess.Popen(command, env=env, text=True, stderr=subprocess.PIPE,
+                            stdout=subprocess.DEVNULL)
+
+
+def finish(*arguments: Any) -> None:
+    """Run a sweep in a process of its own: BLAS gets its threads from there."""
+    process = start(*arguments)
+    _, err = process.communicate()
+    assert process.returncode == 0, err
+
+
+def files_of(folder: Path) -> list[bytes]:
+    """Return the tables of a finished sweep, byte by byte."""
+    assert sorted(p.name for p in folder.iterdir()) == ['sweep.csv', 'sweep.json', 'sweep.parquet']
+    return [(folder / name).read_bytes() for name in ('sweep.csv', 'sweep.parquet')]
+
+
+def parts_in(folder: Path) -> int:
+    return len(list((folder / 'parts').glob('0*.parquet')))
+
+
+def test_rows_are_those_of_scenarios_one_by_one(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    sweep(write(SMALL), '-o', tmp_path / 'out')
+    columns = read_columns(tmp_path / 'out' / 'sweep.parquet')
+    assert read_columns(tmp_path / 'out' / 'sweep.csv') == columns | {
+        'poses_file': [None] * 8
+    }
+    assert columns['scenario'] == list(range(8))
+    assert columns['environment'] == ['whole'] * 4 + ['inner'] * 4
+    assert columns['radius'] == [2.0, 2.0, 0.3, 0.3] * 2
+    assert columns['shift_scale'] == [0.0, 1.0] * 4
+    for number in range(8):
+        point = {name: columns[name][number] for name in ('environment', 'radius', 'shift_scale')}
+        scenario = changed(Scenario(noise_px=0.3, seed=5), point)
+        simulation = simulate_scenario(scenario, number)
+        seen, model = simulation.observations, model_of('fish214', point['shift_scale'], svp=True)
+        solution = localize(model, views_of(seen.xyz, seen.uv[None]))
+        metrics = localization_metrics(solution.pose, solution.residual, simulation.poses[0])
+        for name, value in metrics.items():
+            assert columns[f'localizer.{name}'][number] == pytest.approx(float(value[0]), abs=1e-9)
+
+
+def test_each_scenario_has_noise_of_its_own_and_always_the_same() -> None:
+    plan = plan_sweep({'synthetic_camera': {'noise_px': 0.5, 'sweep.seed': [1, 1, 2]}})
+    rms = sweep_rows(plan, range(3))['localizer.rms_px']
+    assert len(set(rms)) == 3
+    assert sweep_rows(plan, range(1, 3))['localizer.rms_px'] == rms[1:]
+
+
+def test_every_set_of_a_rig_is_a_row() -> None:
+    plan = plan_sweep({
+        'synthetic_camera': {
+            'sweep.style': ['parallel', 'divergent'], 'sweep.radius': [0.5, 2.0],
+            'poses_file': 'calibration',
+        },
+        'stereo_calibrator': {'svp': False, 'views': 4}, 'stereo_depth': {'svp': False},
+    })
+    (numbers, columns), = solve_sweep(plan, tasks(plan), 'numpy', InProcess(), 1)
+    assert numbers == range(4)
+    assert columns['scenario'] == [n for n in range(4) for _ in range(10)]
+    assert columns['set'] == list(range(10)) * 4
+    assert columns['stereo_calibrator.views'] == [1, 2, 3, 4, 4, 4, 4, 4, 4, 4] * 4
+    assert max(columns['stereo_calibrator.position_error_m']) < 1e-9
+    assert max(columns['stereo_depth.error3_m']) < 1e-8
+    assert set(columns['stereo_depth.note']) == {None}
+
+
+def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> None:
+    few = tmp_path / 'few.csv'
+    few.write_text('landmark,x,y,z\n1,0,0,-1\n2,1,0,-1\n3,0,1,-1\n')
+    line = tmp_path / 'line.csv'
+    line.write_text('landmark,x,y,z\n' + ''.join(f'{i},0,0,{-1 - i}\n' for i in range(6)))
+    plan = plan_sweep({'synthetic_camera': {
+        'sweep.environment': ['whole', str(few), 'inner', str(line)], 'sweep.radius': [1.0, 2.0]
+    }})
+    columns = sweep_rows(plan, range(8))
+    assert [error is not None for error in columns['localizer.rms_px']] == [
+        True, True, False, False, True, True, False, False
+    ]
+    assert 'has 3 usable points' in columns['localizer.note'][2]
+    assert 'do not fix a pose' in columns['localizer.note'][6]
+    assert columns['localizer.note'][0] is None
+
+
+BAD = {
+    'sweep.radios: [1.0]': 'sweep.radios: no such parameter to sweep',
+    'sweep.radius: []': 'sweep.radius is None; a list of at least one value',
+    'sweep.radius: 2.0': 'sweep.radius is 2.0; a list of at least one value',
+    'sweep.radius: [near, far]': "radius is 'near'; float is needed",
+    'sweep.radius: [1.0, near]': 'differ in type',
+    'sweep.radius: [-1.0]': 'radius is -1.0; allowed is',
+    'sweep.style: [mono, parallel]': 'make two sweeps of it',
+    'sweep.lens: [fish214, nonsense]': 'nonsense.yaml: cannot be read',
+    'sweep.environment: [nowhere]': "environment 'nowhere' is unknown",
+    'radius: 2.0': 'nothing is swept',
+    'sweep.seed: [1], radios: 3': 'radios is no parameter of synthetic_camera',
+    'sweep.seed: [1], poses: [1.0, 2.0]': 'seven a pose are needed',
+    'sweep.seed: [1], poses: 3.0': 'poses is 3.0; a list is needed',
+    'sweep.seed: [1], noise_px: much': "noise_px is 'much'; float is needed",
+    f'sweep.seed: {list(range(1001))}, sweep.radius: {[0.1 * n for n in range(1, 1001)]}':
+        '1001000 scenarios (1001 seed x 1000 radius); --large if that is meant',
+}
+
+
+@pytest.mark.parametrize('parameters', BAD)
+def test_a_bad_sweep_is_refused_before_anything_runs(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    parameters: str,
+) -> None:
+    path = write(f'synthetic_camera: {{ros__parameters: {{{parameters}}}}}')
+    assert main(['sweep', str(path), '-o', str(tmp_path / 'out')]) == 2
+    err = capsys.readouterr().err
+    assert BAD[parameters] in err and str(path) in err and err.count('\n') == 1
+    assert not (tmp_path / 'out').exists()
+
+
+@pytest.mark.parametrize(('text', 'reason'), [
+    ('localiser: {ros__parameters: {svp: true}}', 'is no node of a sweep'),
+    ('localizer: {ros__parameters: {sweep.radius: [1.0]}}', 'is no parameter of localizer'),
+    ('', 'should hold node names'),
+    ('a: [', 'cannot read parameter file'),
+    ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
+     '{sweep.style: [parallel]}}', "rig is 'topic'"),
+    ('localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '
+     '{sweep.seed: [1]}}', 'nonsense.yaml: cannot be read'),
+])
+def test_a_file_that_is_no_sweep_is_refused(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str,
+    reason: str,
+) -> None:
+    assert main(['sweep', str(write(text)), '-o', str(tmp_path / 'out')]) == 2
+    err = capsys.readouterr().err
+    assert reason in err and err.count('\n') == 1
+
+
+def test_the_result_does_not_depend_on_who_works(
+    write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
+) -> None:
+    sweep(write(LONG), '-o', tmp_path / 'two', '--workers', 2)
+    assert files_of(tmp_path / 'two') == files_of(undisturbed)
+    summary = json.loads((undisturbed / 'sweep.json').read_text())
+    assert summary['scenarios'] == summary['metrics']['localizer.rms_px']['solved'] == 5100
+
+
+def test_killed_twice_and_resumed_it_is_the_same_file(
+    write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
+) -> None:
+    path, out = write(LONG), tmp_path / 'out'
+    before = 0
+    for resume in ([], ['--resume']):
+        process = start(path, '-o', out, *resume)
+        until(lambda: parts_in(out) > before)  # noqa: B023
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        before = parts_in(out)
+    assert before < TASKS
+    sweep(path, '-o', out, '--workers', 2, '--resume')
+    assert files_of(out) == files_of(undisturbed)
+
+
+def test_parts_are_neither_repeated_nor_mixed_nor_lost(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    path, out = write(LONG), tmp_path / 'out'
+    process = start(path, '-o', out)
+    until(lambda: parts_in(out) >= 2)
+    process.kill()
+    process.communicate()
+    done = {p.name: p.stat().st_mtime_ns for p in (out / 'parts').glob('0*.parquet')}
+    assert main(['sweep', str(path), '-o', str(out)]) == 2
+    assert '--resume goes on with it' in capsys.readouterr().err
+    other = tmp_path / 'other.yaml'
+    other.write_text(LONG.replace('0.5\n', '0.6\n'))
+    assert main(['sweep', str(other), '-o', str(out), '--resume']) == 2
+    assert 'another sweep was interrupted there' in capsys.readouterr().err
+    # What is done stays as it is until it is joined.
+    kept: dict[str, int] = {}
+    monkeypatch.setattr('shutil.rmtree', lambda folder, **_: kept.update(
+        {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.parquet')}))
+    sweep(path, '-o', out, '--resume')
+    assert 'scenarios are done already' in capsys.readouterr().err
+    assert len(kept) == TASKS and {name: kept[name] for name in done} == done
+    monkeypatch.undo()
+    sweep(path, '-o', out, '--resume')
+    assert 'holds this sweep already' in capsys.readouterr().err
+
+
+@pytest.mark.xdist_group('engines')
+def test_it_goes_on_with_the_engine_that_it_was_begun_with(
+    write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
+) -> None:
+    pytest.importorskip('numba')
+    path, out = write(LONG), tmp_path / 'out'
+    process = start(path, '-o', out, '--engine', 'numpy')
+    until(lambda: parts_in(out) >= 1)
+    process.kill()
+    process.communicate()
+    finish(path, '-o', out, '--resume', '--engine', 'numba')
+    assert files_of(out) == files_of(undisturbed)
+
+
+def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Path) -> None:
+    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
+    out = tmp_path / 'out'
+    process = start(write(LONG), '-o', out, '--workers', 2)
+    until(lambda: parts_in(out) >= 1)
+    workers = [child for child in psutil.Process(process.pid).children()
+               if 'spawn_main' in ' '.join(child.cmdline())]
+    workers[0].kill()
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and 'a worker process died' in err
+    assert parts_in(out) >= 1
+
+
+def test_workers_end_with_a_sweep_that_is_killed(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
+    out = tmp_path / 'out'
+    process = start(write(LONG), '-o', out, '--workers', 2)
+    until(lambda: parts_in(out) >= 1)
+    children = psutil.Process(process.pid).children()
+    assert len(children) >= 2
+    process.kill()
+    process.communicate()
+    gone, alive = psutil.wait_procs(children, timeout=30)
+    assert not alive and len(gone) == len(children)
+
+
+class TestDask:
+    @pytest.fixture
+    def cluster(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
+        """Return a cluster of two worker processes on loopback."""
+        distributed = pytest.importorskip(
+            'distributed', reason='dask.distributed is not installed (extra `dask`)')
+        monkeypatch.setenv('PYTHONPATH', str(ROOT))
+        with distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, host='127.0.0.1', dashboard_address=None,
+            local_directory=str(tmp_path / 'dask'),
+        ) as cluster:
+            yield cluster
+
+    def test_the_same_rows_though_a_worker_is_killed(
+        self, cluster: Any, write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
+    ) -> None:
+        path, out = write(LONG), tmp_path / 'out'
+        process = start(path, '-o', out, '--dask', cluster.scheduler_address)
+        until(lambda: parts_in(out) >= 1)
+        pids = [nanny.pid for nanny in cluster.workers.values()]
+        os.kill(pids[0], signal.SIGKILL)
+        _, err = process.communicate(timeout=60)
+        assert process.returncode == 0, err
+        assert files_of(out) == files_of(undisturbed)
+
+    def test_no_scheduler_is_one_line(
+        self, write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        pytest.importorskip(
+            'distributed', reason='dask.distributed is not installed (extra `dask`)')
+        monkeypatch.setattr('fisheye_svp_ros.commands.executors._PATIENCE', 0.2)
+        arguments = ['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out'), '--dask']
+        assert main([*arguments, 'tcp://127.0.0.1:9']) == 2
+        assert 'no Dask scheduler answers there' in capsys.readouterr().err
+
+
+def test_points_of_a_sweep_are_counted_like_an_odometer() -> None:
+    plan = plan_sweep({'synthetic_camera': {'sweep.radius': [2.0, 1.0], 'sweep.seed': [7, 8, 9]}})
+    assert list(plan.sweep) == [
+        {'radius': r, 'seed': s} for r in (2.0, 1.0) for s in (7, 8, 9)
+    ]
+    with pytest.raises(ParameterError):
+        plan_sweep({})
+
+
+def test_the_order_of_work_does_not_matter() -> None:
+    plan = plan_sweep({'synthetic_camera': {'noise_px': 1.0, 'sweep.seed': list(range(40))}})
+    whole = sweep_rows(plan, range(40))
+    rows = np.array(whole['localizer.position_error_m'])
+    for numbers in (range(30, 40), range(30)):
+        again = sweep_rows(plan, numbers)['localizer.position_error_m']
+        assert again == pytest.approx(rows[numbers.start:numbers.stop], abs=1e-12)
+
+
+def test_a_missing_package_is_one_line(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    monkeypatch.delitem(sys.modules, 'fisheye_svp_ros.io.columns', raising=False)
+    assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 2
+    err = capsys.readouterr().err
+    assert 'the Python package pyarrow is not installed' in err and err.count('\n') == 1
