@@ -88,6 +88,9 @@ def test_landmarks_of_a_spreadsheet_begin_with_a_byte_order_mark(tmp_path):
     assert load_landmarks(file).ids.tolist() == [7]
 
 
+WHOLE = 'a whole number from 0 up is needed'
+
+
 @pytest.mark.parametrize(('content', 'reason'), [
     ('', 'it is empty; a header with landmark,x,y,z is needed'),
     ('landmark,x,y\n', "column 'z' is missing"),
@@ -96,8 +99,8 @@ def test_landmarks_of_a_spreadsheet_begin_with_a_byte_order_mark(tmp_path):
     ('landmark,x,y,z\n1,0,nan,0\n', "line 2: y is 'nan'; a finite number is needed"),
     ('landmark,x,y,z\n1,0,0,0\n2,0,abc,0\n', "line 3: y is 'abc'; a number is needed"),
     ('landmark,x,y,z\n1,0,0\n', 'line 2: 3 fields where the header has 4'),
-    ('landmark,x,y,z\n1.5,0,0,0\n', "line 2: landmark is '1.5'; a whole number from 0 up is needed"),
-    (f'landmark,x,y,z\n{2**70},0,0,0\n', 'line 2: landmark is .*; a whole number from 0 up is needed'),
+    ('landmark,x,y,z\n1.5,0,0,0\n', f"line 2: landmark is '1.5'; {WHOLE}"),
+    (f'landmark,x,y,z\n{2**70},0,0,0\n', f'line 2: landmark is .*; {WHOLE}'),
 ])
 def test_broken_landmark_file(content, reason, tmp_path):
     file = tmp_path / 'landmarks.csv'
