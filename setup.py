@@ -40,6 +40,7 @@ setup(
         'matplotlib>=3.6',
         'rich>=13.0',
         'Jinja2>=3.1',
+        'opencv-python-headless>=4.6',
         'rosbags>=0.11',
         'pyarrow>=14',
     ],
@@ -50,7 +51,6 @@ setup(
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
-            'opencv-python-headless>=4.6',
         ],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.0', 'types-PyYAML', 'scipy-stubs'],
     },
