@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind bench test-oldest clean
+.PHONY: demo test lint paper paper-search blind bench mutation test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -42,6 +42,11 @@ bench: .venv-bench/ready
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
+
+# How many of 300 small faults the tests find, into docs/mutation.md; takes an hour or two.
+mutation: $(VENV)/ready
+	$(BIN)/pip install --quiet 'cosmic-ray>=8.3'
+	$(BIN)/python -m benchmark.mutation --sample 300
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
