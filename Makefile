@@ -25,7 +25,8 @@ paper: $(VENV)/ready
 	$(BIN)/fisheye-svp paper -o $(OUT)/paper
 
 paper-search: $(VENV)/ready
-	$(BIN)/fisheye-svp paper --search -o config
+	$(BIN)/python -m benchmark.paper search
+	$(BIN)/python -m benchmark.paper stopping
 
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready

@@ -17,15 +17,18 @@ from fisheye_svp_ros.paper.evaluation import (
     localize_environments,
     measure,
 )
-from fisheye_svp_ros.paper.poses import pose_sets
 from fisheye_svp_ros.paper.tables import STYLE_NAMES
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.scene.rigs import BASELINE
 from fisheye_svp_ros.solve.lens_adjustment import adjust
 from fisheye_svp_ros.solve.localization import localize
 
 CALIBRATION_NOISE = 0.2  # px
+POSE_SETS = 40
+_TILT, _ROLL = np.radians(12.0), np.radians(20.0)
+_ASIDE, _BACK = 0.05, (-0.03, 0.12)  # m
 _FREE = ('f', 'cx', 'cy', 'e0', 'e1', 'e2')
 NOISES = (0.1, 0.2, 0.3, 0.4, 0.5)  # px
 _RANGES = np.geomspace(0.2, 200.0, 28)  # m
@@ -44,6 +47,23 @@ class Crossings(NamedTuple):
     quantity: str
     where: str
     ranges: Array
+
+
+def pose_sets(count: int = POSE_SETS) -> list[Pose]:
+    """Return sets of ten random poses (10,) of the right camera, the same at every call.
+
+    Tilts of up to some 25 degrees, rolls of some 20; the rig within 0.05 m of the axis of the
+    landmarks, 0.03 m before to 0.12 m behind their centre.
+    """
+    rng = np.random.default_rng(0)
+    sets = []
+    for _ in range(count):
+        turns = rng.standard_normal((10, 3)) * [_TILT, _TILT, _ROLL]
+        places = rng.uniform(-_ASIDE, _ASIDE, (10, 3))
+        places[:, 2] = rng.uniform(*_BACK, 10)
+        rotation = rotation_from_vector(turns) @ PAPER_FROM_OPTICAL
+        sets.append(Pose(rotation, places + rotation[..., 0] * BASELINE / 2))
+    return sets
 
 
 def scaled_shift(lens: Lens, factor: float) -> Lens:

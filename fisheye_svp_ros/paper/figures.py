@@ -1,31 +1,52 @@
-"""Figures 4 to 8 of Kita's paper, from our numbers, in the paper's arrangement."""
+"""Figures 4 to 10 of Kita's paper, in its arrangement, and pictures of what lies past it."""
 
-from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import Evaluation, Localized, shift_at
-from fisheye_svp_ros.paper.family import Family, shift_curves
-from fisheye_svp_ros.paper.tables import LENSES, STYLE_NAMES
+from fisheye_svp_ros.paper.beyond import NOISES, Crossings
+from fisheye_svp_ros.paper.evaluation import (
+    Evaluation,
+    Localized,
+    Measured,
+    landmarks_at,
+    shift_at,
+)
+from fisheye_svp_ros.paper.results import Panel
+from fisheye_svp_ros.paper.studies import Family, shift_curves
+from fisheye_svp_ros.paper.tables import LENSES, NAMES, STYLE_NAMES
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
+from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 
-COLOURS = {'fish180': OURS, 'fish214': PUBLISHED}
-NAMES = {'fish180': 'Fish180', 'fish214': 'Fish214'}
-MAGNIFIED = 100
-INK = '#404850'
+_COLOURS = {'fish180': OURS, 'fish214': PUBLISHED}
+_MAGNIFIED = 100  # residuals of figure 6
+_VERTICAL_MAGNIFIED = {'fish180': 100, 'fish214': 10}
+_TRUE, _MEASURED = PUBLISHED, OURS
+_CURVE = 120  # points of an epipolar curve
+_ZERO = 1e-6  # an error below it is rounding
+_INK = '#404850'
+_LINES = ('-', '--', ':')
 # Views of the paper's world: axes that run to the right and up, and their names.
 _VIEWS = (((0, 1), 'x / m', 'y / m'), ((0, 2), 'x / m', 'z / m'))
+_SUMMARIES: dict[str, Callable[[Evaluation], float]] = {
+    'Localization: mean |z| / mm': lambda e: float(np.abs(e.localization[..., 2]).mean()),
+    'Stereo calibration:\nmean position error / mm':
+        lambda e: float(np.linalg.norm(e.calibration[..., :3], axis=-1).mean()),
+    'Epipolar curves: mean Error2 / px': lambda e: float(e.panels('error2_px').mean()),
+    'Stereo depth: mean Error3 / mm': lambda e: float(1e3 * e.panels('error3_m').mean()),
+}
 
 
 def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
@@ -35,12 +56,12 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
         for name, lens in lenses.items():
             theta = np.linspace(0, lens.max_incidence, 200)
             curves = 1e3 * shift_curves(family.fits, name, theta)
-            axis.plot(np.degrees(theta), curves.T, color=COLOURS[name], alpha=0.18, linewidth=0.8)
-            axis.plot(np.degrees(theta), 1e3 * shift_at(lens, theta), color=COLOURS[name],
+            axis.plot(np.degrees(theta), curves.T, color=_COLOURS[name], alpha=0.18, linewidth=0.8)
+            axis.plot(np.degrees(theta), 1e3 * shift_at(lens, theta), color=_COLOURS[name],
                       linewidth=2, label=f'{NAMES[name]} (light: all {len(family.fits)} fits)')
         axis.axvline(88, color=FAINT, linestyle=':')
         axis.annotate('outermost landmarks', (88, axis.get_ylim()[1]), ha='right', va='top',
-                      rotation=90, color=INK, fontsize=8)
+                      rotation=90, color=_INK, fontsize=8)
         axis.set(xlabel='incident angle / degree', ylabel='viewpoint shift / mm', xlim=(0, 107))
         axis.legend(loc='upper left')
 
@@ -52,10 +73,10 @@ def draw_height(path: Path, lenses: dict[str, Lens]) -> None:
         for name, lens in lenses.items():
             theta = np.linspace(0, lens.max_incidence, 200)
             height, _ = lens.image_height.value_and_slope(theta)
-            axis.plot(np.degrees(theta), lens.fx * height, color=COLOURS[name], linewidth=2,
+            axis.plot(np.degrees(theta), lens.fx * height, color=_COLOURS[name], linewidth=2,
                       label=NAMES[name])
-            axis.axhline(lens.width / 2, color=COLOURS[name], linestyle=':', linewidth=1)
-        axis.annotate('dotted: half the image', (2, 775), color=INK, fontsize=8)
+            axis.axhline(lens.width / 2, color=_COLOURS[name], linestyle=':', linewidth=1)
+        axis.annotate('dotted: half the image', (2, 775), color=_INK, fontsize=8)
         axis.set(xlabel='incident angle / degree', ylabel='image height / px', xlim=(0, 107),
                  ylim=(0, 820))
         axis.legend(loc='center left')
@@ -65,7 +86,7 @@ def draw_localization(path: Path, found: dict[str, Evaluation]) -> None:
     """Figure 6: two views of every environment, and the residuals of both lenses, x 100."""
     rows = [(radius, spread) for radius in range(len(RADII)) for spread in range(len(SPREADS))]
     with picture(path, 10.5, 2.5 * len(rows)) as figure:
-        axes = fixed_grid(figure, len(rows), 4)
+        axes = _fixed_grid(figure, len(rows), 4)
         for line, (radius, spread) in zip(axes, rows, strict=True):
             points = found[LENSES[0]].localized[spread].views.points[radius]
             for axis, view in zip(line[:2], _VIEWS, strict=True):
@@ -73,9 +94,9 @@ def draw_localization(path: Path, found: dict[str, Evaluation]) -> None:
             line[0].set_ylabel(f'{SPREADS[spread].title()}, {RADII[radius]} m\ny / m')
             for axis, name in zip(line[2:], LENSES, strict=True):
                 one = found[name]
-                draw_image_frame(axis, one.lens)
+                _draw_image_frame(axis, one.lens)
                 mean = one.localization[radius, spread, -1]
-                _draw_residuals(axis, one.localized[spread], radius, COLOURS[name])
+                _draw_residuals(axis, one.localized[spread], radius, _COLOURS[name])
                 axis.set_title(f'{NAMES[name]}: {mean:.4f} px', fontsize=9)
 
 
@@ -88,11 +109,11 @@ def draw_rigs(path: Path) -> None:
                 (np.zeros(3), np.array([0.0, 0.0, 1.0]), 'right'),
                 (left.position, left.rotation[:, 2], 'left'),
             ):
-                axis.plot(*position[[0, 2]], 's', color=INK, markersize=8)
+                axis.plot(*position[[0, 2]], 's', color=_INK, markersize=8)
                 axis.annotate('', (position + 0.12 * axis_z)[[0, 2]], position[[0, 2]],
                               arrowprops={'arrowstyle': '->', 'color': OURS, 'linewidth': 1.6})
                 axis.annotate(name, position[[0, 2]] - [0, 0.012], ha='center', va='top',
-                              color=INK)
+                              color=_INK)
             axis.set(title=style, xlabel='x / m', xlim=(-0.24, 0.09), ylim=(-0.05, 0.15))
             axis.set_aspect('equal')
         figure.axes[0].set_ylabel('viewing direction / m')
@@ -100,7 +121,7 @@ def draw_rigs(path: Path) -> None:
 
 def draw_calibration_poses(path: Path) -> None:
     """Figure 8: the ten poses of a vergent rig among the Whole landmarks at 0.5 m."""
-    points = environment('whole', 0.5).points
+    points = landmarks_at('whole', 0.5)
     right = calibration_poses()
     count = len(right.position)
     left = right.compose(
@@ -109,7 +130,7 @@ def draw_calibration_poses(path: Path) -> None:
     with picture(path, 9.6, 4.6) as figure:
         for axis, view in zip(figure.subplots(1, 2), _VIEWS, strict=True):
             (across, up), x_name, y_name = view
-            axis.plot(points[:, across], points[:, up], 's', color=INK, markersize=3)
+            axis.plot(points[:, across], points[:, up], 's', color=_INK, markersize=3)
             for camera, colour, name in ((right, OURS, 'right'), (left, PUBLISHED, 'left')):
                 ends = camera.position + 0.12 * camera.rotation[..., 2]
                 for one, end in zip(camera.position, ends, strict=True):
@@ -122,7 +143,66 @@ def draw_calibration_poses(path: Path) -> None:
         legend_below(figure, axis)
 
 
-def fixed_grid(figure: Figure, rows: int, columns: int) -> Array:
+def draw_stereo(path: Path, found: Evaluation, panels: list[Panel]) -> None:
+    """Nine rows: left image with epipolar curves and vertical errors; two views of 3-D points."""
+    with picture(path, 9.6, 3.2 * len(panels)) as figure:
+        axes = _fixed_grid(figure, len(panels), 3)
+        for line, measured, panel in zip(axes, found.measured, panels, strict=True):
+            _draw_left_image(line[0], found, measured, panel.style)
+            line[0].set_ylabel(f'{panel.style}, {panel.radius} m')
+            for axis, ((across, up), *names) in zip(line[1:], _VIEWS, strict=True):
+                _draw_points(axis, measured, across, up)
+                _frame_world(axis, panel.radius, *names)
+            line[1].set_title(_caption(panel), fontsize=8.5, loc='left')
+        name = found.lens.name
+        figure.suptitle(
+            f'{NAMES[name]}: vertical errors x {_VERTICAL_MAGNIFIED[name]}; orange: true, blue: '
+            'measured\nError2: mean distance from the epipolar curve; Error3: mean distance of '
+            'points in space', fontsize=10, y=0.998)
+
+
+def draw_solvers(path: Path, found: Mapping[str, Mapping[str, Evaluation]]) -> None:
+    """Draw mean errors of all solvers, a line a solver, a mark a lens."""
+    place = np.arange(len(found))[::-1]
+    with picture(path, 11.0, 4.2) as figure:
+        axes = figure.subplots(1, len(_SUMMARIES), sharey=True)
+        for axis, (title, summary) in zip(axes, _SUMMARIES.items(), strict=True):
+            for k, name in enumerate(LENSES):
+                values = np.array([summary(by_lens[name]) for by_lens in found.values()])
+                drawn = np.where(values > _ZERO, values, np.nan)
+                axis.plot(drawn, place, 'os'[k], color=_COLOURS[name], label=NAMES[name])
+            axis.set_title(title, fontsize=9)
+            axis.set_xscale('log')
+            axis.xaxis.set_major_locator(LogLocator(numticks=6))
+            low = axis.get_xlim()[0]
+            exact = list(found).index('ShiftVP')
+            axis.annotate('none', (low, place[exact]), xytext=(4, 0), va='center', color=_INK,
+                          textcoords='offset points', fontsize=8)
+        axes[0].set_yticks(place, list(found))
+        legend_below(figure, axes[0])
+
+
+def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:
+    """Draw the range at which an SVP error drops under the noise, against the noise."""
+    quantities = list(dict.fromkeys(c.quantity for c in crossings))
+    titles = {'position': 'z of localization', 'residual': 'residual of localization',
+              'Error2': 'Error2'}
+    with picture(path, 11.0, 4.2) as figure:
+        axes = figure.subplots(1, len(quantities), sharey=True)
+        for axis, quantity in zip(axes, quantities, strict=True):
+            for name in LENSES:
+                mine = [c for c in crossings if (c.lens, c.quantity) == (name, quantity)]
+                for line, one in zip(_LINES, mine, strict=True):
+                    axis.plot(NOISES, np.where(one.ranges > 0, one.ranges, np.nan), line,
+                              color=_COLOURS[name], label=f'{NAMES[name]}, {one.where}',
+                              marker='o', markersize=3)
+            axis.set(title=titles[quantity], xlabel='noise of u and of v / px', yscale='log')
+            axis.legend(fontsize=7.5)
+        axes[0].set_ylabel('SVP error is under the noise beyond / m')
+        axes[0].yaxis.set_major_formatter('{x:g}')
+
+
+def _fixed_grid(figure: Figure, rows: int, columns: int) -> Array:
     """Return axes at fixed places: a constrained layout of so many takes seconds."""
     figure.set_layout_engine('none')
     inch = 1 / figure.get_figheight()
@@ -132,7 +212,7 @@ def fixed_grid(figure: Figure, rows: int, columns: int) -> Array:
     }))
 
 
-def frame_world(axis: Any, radius: float, x_name: str, y_name: str) -> None:
+def _frame_world(axis: Any, radius: float, x_name: str, y_name: str) -> None:
     """Set an axis to a square of the world about the origin that holds a sphere."""
     axis.set(xlim=(-1.15 * radius, 1.15 * radius), ylim=(-1.15 * radius, 1.15 * radius),
              xticks=[-radius, 0, radius], yticks=[-radius, 0, radius])
@@ -142,7 +222,7 @@ def frame_world(axis: Any, radius: float, x_name: str, y_name: str) -> None:
     axis.set_aspect('equal')
 
 
-def draw_image_frame(axis: Any, lens: Lens) -> None:
+def _draw_image_frame(axis: Any, lens: Lens) -> None:
     """Draw the circular field of a lens and set the axis to its image, v down."""
     edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
     axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
@@ -157,19 +237,49 @@ def draw_image_frame(axis: Any, lens: Lens) -> None:
 def _draw_world(axis: Any, view: tuple[tuple[int, int], str, str], points: Array) -> None:
     """Draw landmarks and, at the origin, the camera that gazes along -z."""
     (across, up), x_name, y_name = view
-    axis.plot(points[:, across], points[:, up], 's', color=INK, markersize=2.5)
+    axis.plot(points[:, across], points[:, up], 's', color=_INK, markersize=2.5)
     axis.plot(0, 0, 's', markerfacecolor='white', markeredgecolor=OURS, markersize=6)
     radius = float(np.linalg.norm(points[0]).round(6))
     if up == 2:
         axis.plot([0, 0], [0, -radius / 3], color=OURS, linewidth=1.5)
-    frame_world(axis, radius, x_name, y_name)
+    _frame_world(axis, radius, x_name, y_name)
 
 
 def _draw_residuals(axis: Any, localized: Localized, row: int, colour: str) -> None:
     """Draw image points as circles, residuals (measured less predicted) as lines, magnified."""
     seen = localized.views.used[row]
     uv = localized.views.uv[row][seen]
-    ends = uv - MAGNIFIED * localized.solved.residual[row][seen]
-    axis.plot(uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=INK, markersize=3,
+    ends = uv - _MAGNIFIED * localized.solved.residual[row][seen]
+    axis.plot(uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=_INK, markersize=3,
               markeredgewidth=0.6)
     axis.plot([uv[:, 0], ends[:, 0]], [uv[:, 1], ends[:, 1]], color=colour, linewidth=1.2)
+
+
+def _caption(panel: Panel) -> str:
+    text = f'Error2 = {panel.error2:.3f} px, Error3 = {panel.error3:.2f} mm'
+    if np.isnan(panel.published_error2):
+        return text + '\npublished: no caption kept'
+    return (f'{text}\npublished: {panel.published_error2:.3f} px, '
+            f'{panel.published_error3:.2f} mm')
+
+
+def _draw_left_image(axis: Any, found: Evaluation, measured: Measured, style: str) -> None:
+    lens = found.lens
+    _draw_image_frame(axis, lens)
+    both = np.isfinite(measured.distance)
+    known = ForwardModel(lens.svp())
+    curves = epipolar_curves(known, known, rig(style), measured.uv_right[both], _CURVE)
+    axis.plot(curves[..., 0].T, curves[..., 1].T, color=FAINT, linewidth=0.6)
+    u, v = measured.uv_left[both].T
+    axis.plot(u, v, 'o', color=_INK, markersize=2)
+    ends = v - _VERTICAL_MAGNIFIED[lens.name] * measured.vertical[both]
+    axis.plot([u, u], [v, ends], color=OURS, linewidth=1.2)
+
+
+def _draw_points(axis: Any, measured: Measured, across: int, up: int) -> None:
+    known = np.isfinite(measured.measured[:, 0])
+    true, solved = measured.true[known], measured.measured[known]
+    axis.plot([true[:, across], solved[:, across]], [true[:, up], solved[:, up]], color=FAINT,
+              linewidth=0.8)
+    axis.plot(true[:, across], true[:, up], 'o', color=_TRUE, markersize=3.2)
+    axis.plot(solved[:, across], solved[:, up], 'o', color=_MEASURED, markersize=1.8)

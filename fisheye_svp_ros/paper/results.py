@@ -1,4 +1,4 @@
-"""Everything that `fisheye-svp paper` reports, computed once; numbers only."""
+"""Everything that `fisheye-svp paper` reports, computed once, and as the mapping of paper.json."""
 
 from __future__ import annotations
 
@@ -9,43 +9,36 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.lens_files import lens_to_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.beyond import (
-    VARIANTS,
-    Crossings,
-    crossings,
-    evaluate_variant,
-)
+from fisheye_svp_ros.paper.beyond import NOISES, VARIANTS, Crossings, crossings, evaluate_variant
 from fisheye_svp_ros.paper.claims import Claim, claims
-from fisheye_svp_ros.paper.evaluation import Evaluation, captions_of, localize_spreads
-from fisheye_svp_ros.paper.family import Family, load_family
-from fisheye_svp_ros.paper.stopping import (
-    Excess,
-    excess_of_published,
-    stopped_early,
-)
+from fisheye_svp_ros.paper.evaluation import Evaluation, captions_of
+from fisheye_svp_ros.paper.studies import Family, Stopping, load_family, load_stopping
 from fisheye_svp_ros.paper.tables import (
     LENSES,
+    PANELS,
     Cell,
+    agreeing,
     calibration_cells,
     localization_cells,
 )
+from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 
 SVP = 'SVP'
 
 
 class Panel(NamedTuple):
-    """One panel of figure 9 or 10, its place in PANELS; px and mm.
+    """One panel of figure 9 or 10; px and mm.
 
     error2: mean distance to the epipolar curve; vertical: the same within the column; published:
     NaN without a caption.
     """
 
     lens: str
-    place: int
+    radius: float
+    style: str
     points: int
     error2: float
     vertical: float
@@ -55,17 +48,14 @@ class Panel(NamedTuple):
 
 
 class Results(NamedTuple):
-    """found: evaluations by variant and lens; stopped: by lens, `paper_stopping.stopped_early`;
-    family: the fits that `paper --search` kept.
-    """
+    """found: evaluations by variant and lens; family, stopping: results of longer studies."""
 
     lenses: dict[str, Lens]
     found: dict[str, dict[str, Evaluation]]
     claims: list[Claim]
     crossings: list[Crossings]
-    excess: Excess
-    stopped: dict[str, Array]
     family: Family
+    stopping: Stopping
 
     @property
     def svp(self) -> dict[str, Evaluation]:
@@ -74,15 +64,55 @@ class Results(NamedTuple):
 
     def cells(self, variant: str = SVP) -> list[Cell]:
         """Return the 180 cells of tables 1 to 4 for a variant of the solver."""
-        found = self.found[variant]
-        return [
-            *localization_cells(np.stack([found[name].localization for name in LENSES])),
-            *calibration_cells(np.stack([found[name].calibration for name in LENSES])),
-        ]
+        found = [self.found[variant][name] for name in LENSES]
+        return [*localization_cells(np.stack([one.localization for one in found])),
+                *calibration_cells(np.stack([one.calibration for one in found]))]
 
     def panels(self) -> list[Panel]:
         """Return the 18 panels of figures 9 and 10 with the captions that belong to them."""
         return [panel for name in LENSES for panel in _panels(self.svp[name])]
+
+    def agreeing(self, limit: float) -> int:
+        """Count z and residual cells of tables 1 and 2, of 36, within a relative difference."""
+        return agreeing(np.stack([self.svp[name].localization for name in LENSES]), limit)
+
+    def verdicts(self) -> dict[str, int]:
+        """Return how many statements have which verdict."""
+        found = [claim.verdict for claim in self.claims]
+        return {verdict: found.count(verdict) for verdict in sorted(set(found))}
+
+    def document(self) -> dict[str, Any]:
+        """Return the mapping of paper.json; NaN stands for what the paper does not print."""
+        return {
+            'summary': {
+                'z_and_residual_cells': 36,
+                'within_10_percent': self.agreeing(0.10),
+                'within_5_percent': self.agreeing(0.05),
+                'claims': self.verdicts(),
+            },
+            'lenses': {name: lens_to_dict(lens) for name, lens in self.lenses.items()},
+            'cells': [_cell(cell) for cell in self.cells()],
+            'panels': [
+                {
+                    'figure': 9 + LENSES.index(panel.lens), 'lens': panel.lens,
+                    'radius_m': panel.radius, 'style': panel.style, 'points': panel.points,
+                    'error2_px': _pair(panel.published_error2, panel.error2),
+                    'error2_vertical_px': _pair(np.nan, panel.vertical),
+                    'error3_mm': _pair(panel.published_error3, panel.error3),
+                }
+                for panel in self.panels()
+            ],
+            'claims': [claim._asdict() for claim in self.claims],
+            'other_solvers': {
+                variant: [_cell(cell) for cell in self.cells(variant)] for variant in self.found
+            },
+            'noise': [
+                {'lens': c.lens, 'quantity': c.quantity, 'where': c.where,
+                 'noise_px': list(NOISES), 'range_m': c.ranges.tolist()}
+                for c in self.crossings
+            ],
+            'out_of_line_cell': _out_of_line(self.stopping),
+        }
 
 
 def compute(executor: Executor, done: Callable[[], None] = lambda: None) -> Results:
@@ -99,28 +129,18 @@ def compute(executor: Executor, done: Callable[[], None] = lambda: None) -> Resu
         for variant, name in product(VARIANTS, LENSES)
     }
     ranges = [submit(crossings, lens) for lens in lenses.values()]
-    stops = {name: submit(_stopped, lens) for name, lens in lenses.items()}
     found = {
         variant: {name: evaluations[variant, name].result() for name in LENSES}
         for variant in VARIANTS
     }
-    whole = found[SVP][LENSES[0]].localized[0]
-    return Results(
-        lenses, found, claims(found[SVP]),
-        [crossing for future in ranges for crossing in future.result()],
-        excess_of_published(whole, lenses[LENSES[0]]),
-        {name: future.result() for name, future in stops.items()},
-        load_family(),
-    )
+    return Results(lenses, found, claims(found[SVP]),
+                   [crossing for future in ranges for crossing in future.result()],
+                   load_family(), load_stopping())
 
 
 def tasks() -> int:
     """Return how many tasks `compute` hands to its executor."""
-    return len(LENSES) * (len(VARIANTS) + 2)
-
-
-def _stopped(lens: Lens) -> Array:
-    return stopped_early(localize_spreads(lens), lens)
+    return len(LENSES) * (len(VARIANTS) + 1)
 
 
 def _panels(found: Evaluation) -> list[Panel]:
@@ -128,7 +148,31 @@ def _panels(found: Evaluation) -> list[Panel]:
     vertical, points = found.panels('error2_vertical_px'), found.panels('points')
     captions = captions_of(found.lens.name, error2, error3)
     return [
-        Panel(found.lens.name, i, int(points[i]), float(error2[i]), float(vertical[i]),
-              float(error3[i]), *captions.get(i, (float('nan'), float('nan'))))
-        for i in range(len(error2))
+        Panel(found.lens.name, *panel, int(points[i]), float(error2[i]), float(vertical[i]),
+              float(error3[i]), *captions.get(i, (np.nan, np.nan)))
+        for i, panel in enumerate(PANELS)
     ]
+
+
+def _out_of_line(study: Stopping) -> dict[str, Any]:
+    return {
+        'published_minus_ours_mm': study.offset_mm.tolist(),
+        'relative_excess_of_squares': study.relative_cost,
+        'stopped_early': [
+            {'lens': LENSES[k], 'damping': study.dampings[d], 'gain_px2': study.gains[g],
+             'radius_m': RADII[r], 'range': SPREADS[s], 'median_off_z': float(value)}
+            for (k, d, g, r, s), value in np.ndenumerate(study.off)
+        ],
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    return {
+        'table': cell.table, 'lens': cell.lens, 'radius_m': cell.radius, 'row': cell.row,
+        'quantity': cell.quantity, 'unit': cell.unit,
+        **_pair(cell.published, cell.ours), 'new': bool(np.isnan(cell.published)),
+    }
+
+
+def _pair(published: float, ours: float) -> dict[str, float]:
+    return {'published': published, 'ours': ours, 'relative_difference': ours / published - 1}

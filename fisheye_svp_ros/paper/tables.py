@@ -15,7 +15,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.rigs import STYLES
 
-LENSES = ('fish180', 'fish214')
+NAMES = {'fish180': 'Fish180', 'fish214': 'Fish214'}
+LENSES = tuple(NAMES)
 QUANTITIES = ('x', 'y', 'z', 'axis', 'residual')
 UNITS = ('mm', 'mm', 'mm', 'deg', 'px')
 STYLE_NAMES = tuple(STYLES)

@@ -4,19 +4,20 @@ import numpy as np
 import pytest
 import yaml
 
-from fisheye_svp_ros.io.landmark_files import environment
-from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
-from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.paper.family import (
+from benchmark.paper.search import recover
+from benchmark.paper.stopping import excess_of_published, stopped_early
+from benchmark.paper.writing import (
     best_of,
     family_document,
     layout_document,
     lens_document,
-    load_family,
-    shift_curves,
     whole_directions,
 )
-from fisheye_svp_ros.paper.search import recover
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.paper.evaluation import localize_spreads
+from fisheye_svp_ros.paper.studies import load_family, load_stopping, shift_curves
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
     LENSES,
@@ -54,7 +55,7 @@ def test_what_is_written_is_what_was_found(found, tmp_path):
     for lens, numbers in zip(LENS_PAIR, best.lens_numbers, strict=True):
         document = yaml.safe_load(yaml.safe_dump(lens_document(lens, best, 32)))
         read = lens_from_dict(document)
-        assert 'paper --search' in document['provenance']
+        assert 'benchmark.paper search' in document['provenance']
         assert read.fx == pytest.approx(numbers[0], abs=0.006)
         np.testing.assert_allclose(read.viewpoint_shift.coefficients, numbers[1:], atol=1e-7)
         assert (read.name, read.width, read.max_incidence) == (
@@ -77,6 +78,16 @@ def test_the_family_comes_back(found, tmp_path):
         np.testing.assert_allclose(member.layout, one.layout, atol=1e-4)
     curves = shift_curves(family.members, 'fish214', np.array([0.0, 1.0]))
     np.testing.assert_allclose(curves[:, 0], [one.lens_numbers[1, 1] for one in found], atol=1e-7)
+
+
+def test_the_study_of_early_stops_is_that_of_the_lens_in_use():
+    lens = LENS_PAIR[0]
+    localized = localize_spreads(lens)
+    kept = load_stopping()
+    excess = excess_of_published(localized[0], lens)
+    np.testing.assert_allclose(kept.offset_mm, excess.offset_mm, atol=1e-9)
+    assert kept.relative_cost == pytest.approx(excess.relative_cost, rel=1e-6)
+    np.testing.assert_allclose(kept.off[0], stopped_early(localized, lens), rtol=1e-6, atol=1e-9)
 
 
 def test_agreeing_counts_z_and_residuals_only():

@@ -2,7 +2,7 @@
 
 Tables 1 and 2 are fitted with the exact solver.  Unknowns: the directions of 33 landmarks, shared
 by both lenses, and per lens f and the four numbers of its Gennery curve.  Many fits from different
-starts show what the tables determine and what they leave open (see `paper_family`).
+starts show what the tables determine and what they leave open (`paper.studies.Family`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.evaluation import Localized, localize_environments
+from fisheye_svp_ros.paper.studies import NAMES
 from fisheye_svp_ros.paper.tables import LOCALIZATION
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.landmarks import RADII
@@ -22,7 +23,6 @@ from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_ma
 
 STARTS, ITERATIONS = 32, 30
 INNER, OUTER = 15, 18
-NAMES = ('f', 's0', 'e0', 'e1', 'e2')
 START = np.array([[3.194, -1.14, 0.865, -0.307, 0.162], [3.807, -2.77, 1.152, 0.755, -0.079]])
 _SCALE = np.array([100.0, 1e-3, 1e-2, 1e-2, 1e-2])  # px and m for one unit of an unknown
 _LARGEST_F = np.array([3.20, 4.11])  # the circular fields must fit the images
@@ -65,7 +65,7 @@ def recover(lenses: tuple[Lens, Lens], seed: int, iterations: int = ITERATIONS) 
     lens_start = START * (1 + 0.2 * rng.standard_normal(START.shape))
     lens_start[:, 0] = np.minimum(lens_start[:, 0], _LARGEST_F)
     layout_start = rings + np.radians(2.0) * rng.standard_normal(rings.shape)
-    fit = _Fit(lenses, rings)
+    fit = _TableFit(lenses, rings)
     solved = levenberg_marquardt(
         fit, (np.concatenate([layout_start, lens_start.ravel()])[None],), iterations
     )
@@ -83,7 +83,7 @@ def lens_with(lens: Lens, numbers: Array) -> Lens:
     return lens.with_parameters(NAMES, numbers.tolist())
 
 
-class _Fit:
+class _TableFit:
     """One system of 76 unknowns, see least_squares.Problem.
 
     Unknowns: of each landmark its angle from -z (rad) times cosine and sine of its azimuth, which

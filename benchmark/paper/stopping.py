@@ -8,20 +8,24 @@ to the data's own weight, and Levenberg's, the same amount for every millimetre 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import Localized
-from fisheye_svp_ros.paper.tables import LOCALIZATION, OUT_OF_LINE
+from fisheye_svp_ros.paper.evaluation import Localized, localize_spreads
+from fisheye_svp_ros.paper.tables import LENSES, LOCALIZATION, OUT_OF_LINE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.solve.localization import normal_equations
 
+COMMAND = 'python -m benchmark.paper stopping (make paper-search)'
 DAMPINGS = ('marquardt', 'levenberg')
 GAINS = (1.0, 1e-2, 1e-3, 1e-4)  # px^2: the fall of the sum of squares at which a solver stops
 _STARTS = 40
@@ -38,6 +42,25 @@ class Excess(NamedTuple):
 
     offset_mm: Array
     relative_cost: float
+
+
+def stopping_document(executor: Executor) -> dict[str, Any]:
+    """Return the YAML mapping that `paper.studies.load_stopping` reads."""
+    lenses = [load_lens(lens_path(name)) for name in LENSES]
+    localized = [localize_spreads(lens) for lens in lenses]
+    excess = excess_of_published(localized[0][0], lenses[0])
+    return {
+        'command': COMMAND,
+        'published_minus_ours_mm': excess.offset_mm.tolist(),
+        'relative_excess_of_squares': excess.relative_cost,
+        'dampings': list(DAMPINGS),
+        'gains_px2': list(GAINS),
+        'median_off_z': {
+            name: off.reshape(-1, off.shape[-1]).tolist()
+            for name, off in zip(LENSES, executor.map(stopped_early, localized, lenses),
+                                 strict=True)
+        },
+    }
 
 
 def excess_of_published(localized: Localized, lens: Lens) -> Excess:
