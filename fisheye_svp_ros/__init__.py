@@ -1,3 +1,44 @@
-"""What the single-viewpoint approximation of a fisheye lens costs, and where simulation errs."""
+"""What the single-viewpoint approximation of a fisheye lens costs, and where simulation errs.
+
+`import fisheye_svp_ros as fsvp` is the library; a name is loaded when it is asked for.
+"""
+
+from importlib import import_module as _import_module
+from typing import Any as _Any
 
 __version__ = '0.1.0'
+
+_HOMES = {
+    'FisheyeSvpError': 'errors',
+    'Pose': 'pose',
+    'Lens': 'optics.lens',
+    'Observations': 'scene.observations',
+    'rig': 'scene.rigs',
+    'Columns': 'io.result_files',
+    'read_observations': 'io.readers',
+    'write_observations': 'io.readers',
+    'read_poses': 'io.readers',
+    'load_lens': 'library',
+    'save_lens': 'library',
+    'project': 'library',
+    'back_project': 'library',
+    'localize': 'library',
+    'calibrate': 'library',
+    'calibrate_stereo': 'library',
+    'stereo_depth': 'library',
+    'simulate_scenario': 'library',
+    'sweep': 'library',
+    'diagnose': 'library',
+    'budget': 'library',
+}
+__all__ = [*_HOMES]
+
+
+def __getattr__(name: str) -> _Any:
+    if name not in _HOMES:
+        raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    return getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOMES})

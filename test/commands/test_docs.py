@@ -54,7 +54,7 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
     assert done.returncode == 0, done.stdout
 
 
-@pytest.mark.parametrize('page', PAGES)
+@pytest.mark.parametrize('page', sorted(path.name for path in (ROOT / 'docs').glob('*.md')))
 def test_links_lead_somewhere(page: str) -> None:
     text = (ROOT / 'docs' / page).read_text()
     for target in re.findall(r'\]\(([^)#]+)\)', text):

@@ -1,0 +1,359 @@
+"""The library, `import fisheye_svp_ros as fsvp`: what commands and nodes call, on plain objects.
+
+A lens is a `Lens`, a lens file or the name of one that comes with the package; observations are
+an `Observations` table or a file that `read_observations` reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io import lens_files
+from fisheye_svp_ros.io.parameters import SWEEP, changed, rows
+from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.io.result_files import Columns, Result
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics import camera
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
+from fisheye_svp_ros.scene.observations import Observations, stereo_views
+from fisheye_svp_ros.scene.rigs import BASELINE, rig
+from fisheye_svp_ros.simulate import scenario as scenarios
+from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.solve.measured import localize_measured, rms_px
+from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
+from fisheye_svp_ros.study import budget as budgets
+from fisheye_svp_ros.study import sweep as sweeps
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.optics.camera import Image, Rays
+
+AnyLens = Lens | str | Path
+AnyObservations = Observations | str | Path
+
+
+@dataclass(frozen=True)
+class Localized(Result):
+    """A pose a frame: frame (F,); pose (F,) of the camera in the world; covariance (F, 6, 6), m
+    and rad, of the change in `Pose.retract`; rms_px (F,).
+
+    residual (N, 2), px: measured minus predicted, in the order of the observations, NaN where not
+    used; sigma_px: noise of u and v, estimated, None where the observations bring their own;
+    left_out: frames whose points do not fix a pose.
+    """
+
+    frame: Index
+    pose: Pose
+    covariance: Array
+    rms_px: Array
+    residual: Array
+    sigma_px: float | None
+    left_out: tuple[int, ...]
+
+    def table(self) -> Columns:
+        """Return one row a frame, as poses.csv has it, with the rms."""
+        return Columns({'frame': self.frame, **_pose_columns(self.pose), 'rms_px': self.rms_px})
+
+
+@dataclass(frozen=True)
+class Calibrated(Result):
+    """A fitted lens: names (K,) of what was fitted, covariance (K, K) in their own units.
+
+    sigma_px, left_out: as in `Localized`; converged: whether the adjustment came to its end.
+    """
+
+    lens: Lens
+    names: tuple[str, ...]
+    covariance: Array
+    sigma_px: float | None
+    left_out: tuple[int, ...]
+    converged: bool
+
+    def table(self) -> Columns:
+        """Return one row a parameter that was fitted."""
+        return Columns({
+            'parameter': self.names,
+            'value': parameter_values(self.lens, self.names),
+            'standard_error': np.sqrt(np.diag(self.covariance)),
+        })
+
+
+@dataclass(frozen=True)
+class CalibratedRig(Result):
+    """A rig, the left camera in the right one: rig; covariance (6, 6), m and rad; frame (V,);
+    pose (V,) of the right camera in the world; rms_px over both cameras; converged.
+    """
+
+    rig: Pose
+    covariance: Array
+    frame: Index
+    pose: Pose
+    rms_px: float
+    converged: bool
+
+    def table(self) -> Columns:
+        """Return one row a frame: the right camera in the world."""
+        return Columns({'frame': self.frame, **_pose_columns(self.pose)})
+
+
+@dataclass(frozen=True)
+class StereoDepth(Result):
+    """Points (N, 3), m, in the right camera, of what both cameras see; frame, landmark (N,).
+
+    gap (N,), m: distance of the two rays; epipolar_px (N,): of the left point from the epipolar
+    curve of the right one (Error2 is its mean).  NaN where the rays do not meet.
+    """
+
+    frame: Index
+    landmark: Index
+    points: Array
+    gap: Array
+    epipolar_px: Array
+
+    def table(self) -> Columns:
+        """Return one row a point."""
+        x, y, z = self.points.T
+        return Columns({'frame': self.frame, 'landmark': self.landmark, 'x': x, 'y': y, 'z': z,
+                        'gap': self.gap, 'epipolar_px': self.epipolar_px})
+
+
+@dataclass(frozen=True)
+class Simulated(Result):
+    """What cameras see: observations, one frame a pose; pose (F,) of the camera in the world, of
+    the right one of a rig; rig: the left camera in the right one, None for one camera; lens.
+    """
+
+    lens: Lens
+    observations: Observations
+    pose: Pose
+    rig: Pose | None
+
+    def table(self) -> Columns:
+        """Return one row an image point."""
+        o = self.observations
+        return Columns({
+            'frame': o.frame, 'camera': [o.cameras[i] for i in o.camera], 'landmark': o.landmark,
+            'u': o.uv[:, 0], 'v': o.uv[:, 1], 'x': o.xyz[:, 0], 'y': o.xyz[:, 1],
+            'z': o.xyz[:, 2],
+        })
+
+
+@dataclass(frozen=True)
+class Swept(Result):
+    """The rows of a sweep, one a set of image points, by column; None where nothing is known."""
+
+    columns: dict[str, list[Any]]
+
+    def table(self) -> Columns:
+        """Return the rows."""
+        return Columns(self.columns)
+
+
+@dataclass(frozen=True)
+class Diagnosed(Result):
+    """verdict; document: the mapping of diagnosis.json; lens: extended by what was found."""
+
+    verdict: str
+    document: dict[str, Any]
+    lens: Lens
+
+    def table(self) -> Columns:
+        """Return one row a cause."""
+        causes = self.document['causes']
+        return Columns({name: [cause[name] for cause in causes]
+                        for name in ('effect', 'p_value', 'gain')})
+
+
+@dataclass(frozen=True)
+class Budgeted(Result):
+    """SVP errors and what noise causes: spreads (A,), rad; ranges (R,), m; error, noise: arrays
+    (A, R) by quantity, SI and px (`study.budget.Budget`).
+    """
+
+    spreads: Array
+    ranges: Array
+    error: dict[str, Array]
+    noise: dict[str, Array]
+
+    def table(self) -> Columns:
+        """Return one row a spread and range."""
+        spread, distance = np.meshgrid(self.spreads, self.ranges, indexing='ij')
+        return Columns({
+            'spread': spread.ravel(), 'range': distance.ravel(),
+            **{name: np.ravel(values) for name, values in self.error.items()},
+            **{f'{name}_noise': np.ravel(values) for name, values in self.noise.items()},
+        })
+
+
+def load_lens(lens: AnyLens) -> Lens:
+    """Return a lens from its file, or by the name of one that comes with the package.
+
+    Raises LensError, naming file and field, for anything impossible.
+    """
+    return lens if isinstance(lens, Lens) else lens_files.load_lens(lens_path(str(lens)))
+
+
+def save_lens(lens: Lens, path: str | Path) -> None:
+    """Write a lens file.  Raises OutputError where it cannot be written."""
+    lens_files.save_lens(lens, path)
+
+
+def project(lens: AnyLens, points: Array) -> Image:
+    """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
+    return camera.project(load_lens(lens), np.asarray(points, dtype=float))
+
+
+def back_project(lens: AnyLens, uv: Array) -> Rays:
+    """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
+    return camera.back_project(load_lens(lens), np.asarray(uv, dtype=float))
+
+
+def localize(observations: AnyObservations, lens: AnyLens) -> Localized:
+    """Pose every frame of one camera that can be posed; no start values are needed.
+
+    Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
+    """
+    table = _table(observations)
+    measured = localize_measured(ForwardModel(load_lens(lens)), table)
+    views, result = measured.views, measured.result
+    residual = np.full((len(table), 2), np.nan)
+    residual[views.row[views.used]] = result.residual[views.used]
+    return Localized(
+        views.frame, result.pose, result.covariance, np.array([*map(rms_px, result.residual)]),
+        residual, measured.sigma, measured.left_out,
+    )
+
+
+def calibrate(
+    observations: AnyObservations, model: str, image_size: tuple[int, int],
+    free: Sequence[str] | None = None, name: str = 'lens',
+) -> Calibrated:
+    """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`."""
+    found = lens_calibration.calibrate(_table(observations), model, image_size, free, name)
+    adjusted = found.adjusted
+    return Calibrated(adjusted.lens, tuple(adjusted.names), adjusted.covariance, found.sigma,
+                      found.left_out, bool(adjusted.converged))
+
+
+def calibrate_stereo(
+    observations: AnyObservations, left: AnyLens, right: AnyLens
+) -> CalibratedRig:
+    """Return the rig of the cameras `left` and `right` of a table, lenses known.
+
+    Raises ObservationError for a missing camera, GeometryError where the views fix no rig.
+    """
+    views = stereo_views(_table(observations))
+    found = stereo_calibration.calibrate_stereo(*_models(left, right), *views)
+    residual = np.concatenate([found.left_residual, found.right_residual])
+    return CalibratedRig(
+        found.rig.take(0), found.rig_covariance[0], views[0].frame, found.pose.take(0),
+        rms_px(residual), bool(found.converged[0]),
+    )
+
+
+def stereo_depth(
+    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose
+) -> StereoDepth:
+    """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
+
+    Raises ObservationError for a missing camera.
+    """
+    one, other = stereo_views(_table(observations))
+    both = one.used & other.used
+    known = (*_models(left, right), rig, one.uv[both], other.uv[both])
+    solved = triangulate(*known)
+    frame = np.broadcast_to(one.frame[:, None], both.shape)
+    return StereoDepth(frame[both], one.landmark[both], solved.points, solved.gap,
+                       epipolar_offset(*known).distance)
+
+
+def simulate_scenario(**scenario: Any) -> Simulated:
+    """Return what the cameras of a scenario see; keywords: parameters of `Scenario`.
+
+    Raises ParameterError for an unknown parameter or a value that is not allowed, FisheyeSvpError
+    for a lens, landmarks or poses that cannot be used.
+    """
+    _check_names(sweeps.CAMERA, scenario)
+    seen = scenarios.simulate_scenario(changed(scenarios.Scenario(), scenario))
+    return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
+
+
+def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swept:
+    """Solve the Cartesian product of lists of scenario parameters, as `fisheye-svp sweep` does.
+
+    nodes: further parameters by node: synthetic_camera, localizer, stereo_calibrator,
+    stereo_depth.
+    Raises ParameterError for an unknown parameter or a value that is not allowed.
+    """
+    swept = {f'{SWEEP}{name}': list(values) for name, values in over.items()}
+    parameters = {**nodes, sweeps.CAMERA: {**nodes.get(sweeps.CAMERA, {}), **swept}}
+    for node, values in parameters.items():
+        _check_names(node, values)
+    plan = sweeps.plan_sweep(parameters)
+    return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
+
+
+def diagnose(
+    observations: AnyObservations, lens: AnyLens, *, free_intrinsics: bool | None = None,
+    held_out: AnyObservations | None = None,
+) -> Diagnosed:
+    """Find what a lens's simulation gets wrong about observations, and extend it.
+
+    free_intrinsics: whether they are to be fitted, by default where a fit made the lens;
+    held_out: other frames of the same camera and target to measure the gain on.
+    Raises GeometryError or ObservationError where the data cannot be solved at all.
+    """
+    from fisheye_svp_ros.diagnosis.diagnosis import diagnose as find_causes
+    from fisheye_svp_ros.diagnosis.inputs import posable
+
+    known = load_lens(lens)
+    table, test = (None if one is None else posable(_table(one), known)[0]
+                   for one in (observations, held_out))
+    assert table is not None
+    found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test)
+    return Diagnosed(found.verdict, found.to_dict(), found.lens)
+
+
+def budget(
+    lens: AnyLens, *, noise_px: float = 0.3, style: str = 'parallel', baseline: float = BASELINE
+) -> Budgeted:
+    """Tabulate what SVP costs and what noise does, by spread and range of the landmarks.
+
+    style, baseline (m): of the stereo rig.
+    Raises LensError for a lens without a viewpoint shift, ParameterError for impossible noise.
+    """
+    setup = budgets.Setup(load_lens(lens), rig(style, baseline), noise_px)
+    return Budgeted(*budgets.make_budget(setup))
+
+
+def _check_names(node: str, values: Mapping[str, Any]) -> None:
+    if node not in sweeps.TABLES:
+        raise ParameterError(f'{node!r} is no node of a sweep: {", ".join(sweeps.TABLES)}')
+    known = [row.name for row in rows(sweeps.TABLES[node])]
+    for name in (given.removeprefix(SWEEP) for given in values):
+        if name not in known:
+            raise ParameterError(f'{name!r} is no parameter of {node}: {", ".join(known)}')
+
+
+def _table(observations: AnyObservations) -> Observations:
+    if isinstance(observations, Observations):
+        return observations
+    return read_observations(observations)
+
+
+def _models(left: AnyLens, right: AnyLens) -> tuple[ForwardModel, ForwardModel]:
+    return ForwardModel(load_lens(left)), ForwardModel(load_lens(right))
+
+
+def _pose_columns(pose: Pose) -> dict[str, Array]:
+    numbers = np.concatenate([pose.position, quaternion_from_rotation(pose.rotation)], axis=-1)
+    return dict(zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), numbers.T, strict=True))

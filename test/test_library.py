@@ -1,0 +1,142 @@
+"""The library: lazy names, results that are kept, the page that shows them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import pkgutil
+import re
+import subprocess
+import sys
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.nodes import ROOT
+
+import fisheye_svp_ros as fsvp
+from fisheye_svp_ros import library
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.io.result_files import Columns, Result
+
+_BLOCK = re.compile(r'```python\n(.*?)```(?:\n\n```text\n(.*?)```)?', re.DOTALL)
+
+
+@pytest.fixture(scope='module')
+def seen() -> library.Simulated:
+    """Return ten views of a lens with a shift."""
+    return fsvp.simulate_scenario(
+        lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration')
+
+
+@pytest.fixture(scope='module')
+def pair() -> library.Simulated:
+    """Return ten views of a rig."""
+    return fsvp.simulate_scenario(
+        lens='fish214', radius=0.5, style='vergent', noise_px=0.2, poses_file='calibration')
+
+
+def test_importing_loads_nothing_else() -> None:
+    code = ('import sys, fisheye_svp_ros as f; dir(f); f.__version__; '
+            'print(sorted({m.partition(".")[0] for m in sys.modules}))')
+    loaded = subprocess.run([sys.executable, '-c', code], cwd=ROOT, check=True, text=True,
+                            capture_output=True).stdout
+    for heavy in ('numpy', 'scipy', 'matplotlib', 'numba', 'rosbags', 'pyarrow', 'yaml', 'cv2'):
+        assert f"'{heavy}'" not in loaded
+
+
+def test_names_are_there_and_typed_and_no_modules() -> None:
+    modules = {module.name for module in pkgutil.iter_modules(fsvp.__path__)}
+    stub = (ROOT / 'fisheye_svp_ros' / '__init__.pyi').read_text()
+    assert set(re.findall(r' as (\w+)$', stub, re.MULTILINE)) == set(fsvp.__all__)
+    assert not modules & set(fsvp.__all__)
+    assert set(fsvp.__all__) <= set(dir(fsvp))
+    for name in fsvp.__all__:
+        assert getattr(fsvp, name).__name__ == name
+    with pytest.raises(AttributeError, match='nonsense'):
+        _ = fsvp.nonsense
+
+
+@pytest.mark.parametrize(('page', 'blocks'), [('library.md', 6), ('conventions.md', 1)])
+def test_a_page_runs_as_printed(
+    page: str, blocks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    found = _BLOCK.findall((ROOT / 'docs' / page).read_text())
+    assert len(found) == blocks
+    for code, expected in found:
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        assert printed.getvalue() == expected
+
+
+def _results(seen: library.Simulated, pair: library.Simulated) -> list[Result]:
+    svp = seen.lens.svp()
+    rig = pair.rig
+    assert rig is not None
+    return [
+        seen, pair, fsvp.localize(seen.observations, svp),
+        fsvp.calibrate(seen.observations, 'equidistant', (1536, 1536)),
+        fsvp.calibrate_stereo(pair.observations, svp, svp),
+        fsvp.stereo_depth(pair.observations, svp, svp, rig),
+        fsvp.sweep({'radius': [0.5, 2.0]}), fsvp.budget('fish180'),
+        fsvp.diagnose(seen.observations, seen.lens),
+    ]
+
+
+def test_results_come_back(
+    seen: library.Simulated, pair: library.Simulated, tmp_path: Path
+) -> None:
+    results = _results(seen, pair)
+    kinds = {kind for kind in Result.__subclasses__() if kind.__module__ == library.__name__}
+    assert {type(one) for one in results} == kinds
+    for one in results:
+        one.save(tmp_path / 'result.json')
+        again = type(one).load(tmp_path / 'result.json')
+        for field in fields(one):  # type: ignore[arg-type]
+            kept, was = getattr(again, field.name), getattr(one, field.name)
+            if isinstance(was, fsvp.Lens):  # its file holds degrees
+                assert kept.max_incidence == pytest.approx(was.max_incidence, rel=1e-15)
+                kept = replace(kept, max_incidence=was.max_incidence)
+            assert repr(kept) == repr(was)
+        assert list(map(repr, again.table().rows())) == list(map(repr, one.table().rows()))
+
+
+def test_a_file_that_is_no_such_result(seen: library.Simulated, tmp_path: Path) -> None:
+    seen.save(tmp_path / 'seen.json')
+    for name in ('seen.json', 'none.json'):
+        with pytest.raises(ObservationError, match=name):
+            library.Localized.load(tmp_path / name)
+
+
+def test_localize_says_what_the_command_says(seen: library.Simulated, tmp_path: Path) -> None:
+    table = tmp_path / 'observations.csv'
+    fsvp.write_observations(table, seen.observations)
+    assert main(['localize', str(table), '--lens', 'fish214', '-o', str(tmp_path)]) == 0
+    found = fsvp.localize(table, 'fish214')
+    told = fsvp.read_poses(tmp_path / 'poses.csv')
+    np.testing.assert_array_equal(told.frame, found.frame)
+    np.testing.assert_allclose(told.pose.position, found.pose.position, atol=1e-12)
+    assert found.residual.shape == seen.observations.uv.shape
+    assert np.nanmax(np.abs(found.residual)) < 1.0
+
+
+def test_an_unknown_parameter_is_refused() -> None:
+    with pytest.raises(ParameterError, match=r"'noise' is no .*noise_px"):
+        fsvp.simulate_scenario(noise=0.1)
+    with pytest.raises(ParameterError, match="'radii' is no parameter"):
+        fsvp.sweep({'radii': [1.0]})
+    with pytest.raises(ParameterError, match="'solver' is no node"):
+        fsvp.sweep({'radius': [1.0]}, solver={})
+
+
+def test_columns(tmp_path: Path) -> None:
+    columns = Columns({'frame': np.arange(2), 'x': [0.5, None]})
+    assert columns == {'frame': [0, 1], 'x': [0.5, None]}
+    assert list(columns.rows()) == [(0, 0.5), (1, None)]
+    assert str(columns) == 'frame     x\n    0   0.5\n    1  None'
