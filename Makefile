@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind bench mutation test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent bench mutation test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -31,6 +31,11 @@ paper-search: $(VENV)/ready
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind --trials 200
+
+# The same with data of a generator that shares no code with the package; takes long, too, and
+# goes on where it was interrupted.
+blind-independent: $(VENV)/ready
+	$(BIN)/python -m benchmark.independent --trials 69 -o $(OUT)/blind_independent
 
 # Speed beside what a user would pick instead, into docs/benchmarks.md; leave the machine alone.
 bench: .venv-bench/ready
