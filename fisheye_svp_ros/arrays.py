@@ -1,4 +1,7 @@
-"""The array types that the core takes and returns."""
+"""The array types that the core takes and returns, and named tuples of arrays with equal rows."""
+
+from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,3 +9,49 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+
+class Batch:
+    """Methods of a named tuple whose fields, arrays or batches, share their leading axes."""
+
+    __slots__ = ()
+
+    def take(self, index: Any) -> Self:
+        """Return what stands at `index` of the leading axes."""
+        return self._made(part.take(index) if isinstance(part, Batch) else part[index]
+                          for part in self._parts())
+
+    def put(self, index: Any, other: Self) -> None:
+        """Write `other` to the places `index` of the leading axes."""
+        for mine, new in zip(self._parts(), other._parts(), strict=True):
+            if isinstance(mine, Batch):
+                mine.put(index, new)
+            else:
+                mine[index] = new
+
+    @classmethod
+    def stack(cls, parts: Sequence[Self]) -> Self:
+        """Join batches of one shape along a new first axis."""
+        return cls._joined(np.stack, parts)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
+        """Join batches along their first axis."""
+        return cls._joined(np.concatenate, parts)
+
+    @classmethod
+    def _joined(cls, join: Any, parts: Sequence[Self]) -> Self:
+        return cls._made(
+            fields[0]._joined(join, fields) if isinstance(fields[0], Batch) else join(fields)
+            for fields in zip(*(part._parts() for part in parts), strict=True)
+        )
+
+    @classmethod
+    def _made(cls, parts: Any) -> Self:
+        make: Any = cls
+        made: Self = make(*parts)
+        return made
+
+    def _parts(self) -> tuple[Any, ...]:
+        assert isinstance(self, tuple)
+        return self

@@ -7,12 +7,12 @@ of geometry_msgs/PoseWithCovariance.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Batch, Mask
 
 # Kita's camera at the origin gazes along -z with x right, y up; the optical frame has y down.
 PAPER_FROM_OPTICAL: Array = np.diag([1.0, -1.0, -1.0])
@@ -24,11 +24,15 @@ _CROSS: Array = np.array([
 ])
 
 
-class Pose(NamedTuple):
-    """Rotation (..., 3, 3) and position (..., 3), m, of a body in its reference frame."""
-
+class _Pose(NamedTuple):
     rotation: Array
     position: Array
+
+
+class Pose(_Pose, Batch):
+    """Rotation (..., 3, 3) and position (..., 3), m, of a body in its reference frame."""
+
+    __slots__ = ()
 
     def inverse(self) -> Pose:
         """Return the reference frame in the body."""
@@ -57,14 +61,29 @@ class Pose(NamedTuple):
         turn = vector_from_rotation(self.rotation @ np.swapaxes(true.rotation, -1, -2))
         return np.concatenate([self.position - true.position, turn], axis=-1)
 
-    def take(self, index: Any) -> Pose:
-        """Return the poses at `index` of the leading axes."""
-        return Pose(self.rotation[index], self.position[index])
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The leading axes."""
+        return self.position.shape[:-1]
+
+    def reshape(self, *shape: int) -> Pose:
+        """Return the same poses with other leading axes."""
+        return Pose(self.rotation.reshape(*shape, 3, 3), self.position.reshape(*shape, 3))
+
+    def broadcast_to(self, *shape: int) -> Pose:
+        """Return the poses repeated along leading axes; not to be written to."""
+        return Pose(np.broadcast_to(self.rotation, (*shape, 3, 3)),
+                    np.broadcast_to(self.position, (*shape, 3)))
+
+    def where(self, chosen: Mask, other: Pose) -> Pose:
+        """Return these poses where chosen (...), and others where not."""
+        return Pose(np.where(chosen[..., None, None], self.rotation, other.rotation),
+                    np.where(chosen[..., None], self.position, other.position))
 
 
 def identity(*shape: int) -> Pose:
     """Return identity poses of the given batch shape."""
-    return Pose(np.broadcast_to(np.eye(3), (*shape, 3, 3)).copy(), np.zeros((*shape, 3)))
+    return Pose(np.tile(_IDENTITY, (*shape, 1, 1)), np.zeros((*shape, 3)))
 
 
 def rotation_from_vector(vector: Array) -> Array:

@@ -192,7 +192,7 @@ def _at_all_radii(lens: Lens, directions: Array, start: Pose | None = None) -> L
     points = (np.array(RADII)[:, None, None] * directions[:, None]).reshape(
         -1, *directions.shape[1:])
     if start is not None:
-        start = Pose(*(np.tile(a, (len(directions), *[1] * (a.ndim - 1))) for a in start))
+        start = start.broadcast_to(len(directions), *start.shape).reshape(-1)
     return localize_environments(lens, points, start=start)
 
 

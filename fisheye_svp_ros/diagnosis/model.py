@@ -80,9 +80,7 @@ def prepare(observations: Observations, poses: dict[int, Pose] | None = None) ->
     known = None
     if poses is not None:
         chosen = [poses[int(number)] for number in numbers]
-        known = Pose(
-            np.stack([p.rotation for p in chosen]), np.stack([p.position for p in chosen])
-        )
+        known = Pose.stack(chosen)
     return Data(observations, views, frame_of.reshape(-1), camera_of.reshape(-1), known)
 
 
@@ -104,8 +102,7 @@ def start(data: Data, lens: Lens) -> State:
         mine = np.flatnonzero(data.camera_of == camera)
         relative = pose.take(data.frame_of[mine]).inverse().compose(solved.take(mine))
         middle = np.argsort(np.linalg.norm(relative.position, axis=1))[len(mine) // 2]
-        rig.rotation[camera] = relative.rotation[middle]
-        rig.position[camera] = relative.position[middle]
+        rig.put(camera, relative.take(middle))
     return State(pose, rig, replace(lens, effects={}), model.terms)
 
 

@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays, back_project, project
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 
 Term = tuple[Effect, Array]
@@ -98,7 +98,7 @@ class ForwardModel:
             return back_project(self.lens, uv)
         ideal = uv
         views = views_of(np.zeros((*uv.shape[:-1], 3)), uv)
-        pose = Pose(np.broadcast_to(np.eye(3), (len(uv), 3, 3)), np.zeros((len(uv), 3)))
+        pose = identity(len(uv))
         for _ in range(4):
             scene = Scene(views, self.lens, pose, ideal)
             ideal = uv - self._moved(scene, 'image') - self._moved(scene, 'detector')

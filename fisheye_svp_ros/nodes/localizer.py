@@ -8,7 +8,6 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
@@ -17,12 +16,13 @@ from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import Localization
-from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS, NO_POSE, localization_metrics
+from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import SolverSettings
+from fisheye_svp_ros.study.solutions import Solved, localized
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
+_NEAR = 0.1  # rad, and of the distance of the nearest landmark
 _EXACT = 1e-6  # px; what fits better fits perfectly
 
 
@@ -47,9 +47,9 @@ class Localizer(SolverNode):
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         seen: messages.ImagePoints = items['image_points']
         views, model = self.views(stamp, landmarks, seen), self.model(items)
-        solution = self._localized(model, views)
-        if not solution.converged[0]:
-            raise GeometryError(NO_POSE)
+        true: Pose | None = items.get('true_pose')
+        found = self._localized(model, views, true).checked()
+        solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         self._pose.publish(
             messages.pose_with_covariance_message(pose, solution.covariance[0], stamp, world)
@@ -57,34 +57,41 @@ class Localizer(SolverNode):
         self._residuals.publish(
             messages.cloud_message(residuals(model, views, solution), stamp, seen.frame)
         )
-        true: Pose | None = items.get('true_pose')
         if true is not None:
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        self.publish_result(stamp, localization_metrics(solution.pose, solution.residual, true))
+        self.publish_result(stamp, found.metrics)
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
 
-    def _localized(self, model: ForwardModel, views: Views) -> Localization:
-        """Solve from where the camera was; from anywhere if that fits worse than it did there."""
+    def _localized(
+        self, model: ForwardModel, views: Views, true: Pose | None
+    ) -> Solved[Localization]:
+        """Solve from where the camera was, which is faster; from anywhere if that is not near."""
         start, before = self._before
-        solution = localize_both_sides(model, views, start)
-        rms = self._rms_px(solution)
-        if start is not None and rms >= _AS_WELL * before:
-            solution = localize_both_sides(model, views)
-            rms = self._rms_px(solution)
-        converged = solution.converged[0]
-        self._before = (solution.pose, max(rms, _EXACT)) if converged else (None, 0.0)
-        return solution
+        found = localized(model, views, true, start)
+        if start is not None and not (
+            _rms_px(found) < _AS_WELL * before and _is_near(start, found.solution.pose, views)
+        ):
+            found = localized(model, views, true)
+        rms, pose = _rms_px(found), found.solution.pose
+        self._before = (pose, max(rms, _EXACT)) if np.isfinite(rms) else (None, 0.0)
+        return found
 
-    def _rms_px(self, solution: Localization) -> float:
-        """Return what `rms_px` does of the residuals, from the cost; infinite without a pose."""
-        if not solution.converged[0]:
-            return np.inf
-        points = solution.residual.shape[1]
-        return float(np.sqrt(solution.cost[0] / points)) * self.settings.sigma_px
+
+def _rms_px(found: Solved[Localization]) -> float:
+    """Return the residual of one view; infinite without a pose."""
+    return float(found.metrics['rms_px'][0]) if found.solved[0] else np.inf
+
+
+def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
+    """Say whether a camera that went from one pose (1,) to another sees nearly the same."""
+    change = pose.difference(start)[0]
+    nearest = np.linalg.norm(pose.into_body(views.points)[0], axis=-1).min()
+    return bool(np.linalg.norm(change[:3]) < _NEAR * nearest
+                and np.linalg.norm(change[3:]) < _NEAR)
 
 
 def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:

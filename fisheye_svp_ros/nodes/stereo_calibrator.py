@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
 
-from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
-from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
-from fisheye_svp_ros.study.metrics import (
-    NO_RIG,
-    STEREO_CALIBRATION_METRICS,
-    stereo_calibration_metrics,
-)
+from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
+from fisheye_svp_ros.study.metrics import STEREO_CALIBRATION_METRICS
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
+from fisheye_svp_ros.study.solutions import Solved, calibrated
 
 
 class StereoCalibrator(SolverNode):
@@ -44,24 +40,20 @@ class StereoCalibrator(SolverNode):
         known = self._window if scenario == self._scenario else []
         window = [*known, seen_in(stamp, landmarks, items, self.CAMERAS)][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
-        solution = calibrate_stereo(model, model, left, right)
-        if not solution.converged[0]:
-            raise GeometryError(NO_RIG)
+        found = calibrated(model, left, right, true=true_rig(items)).checked()
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario = window, scenario
-        self._publish(stamp, items, solution)
+        self._publish(stamp, items, found)
 
-    def _publish(self, stamp: int, items: Items, solution: StereoCalibration) -> None:
-        rig, true = solution.rig.take(0), true_rig(items)
+    def _publish(self, stamp: int, items: Items, found: Solved[StereoCalibration]) -> None:
+        rig, true = found.solution.rig.take(0), true_rig(items)
         left, right = (items[f'{camera}image_points'].frame for camera in self.CAMERAS)
         self._rig.publish(messages.transform_message(rig, stamp, right, left))
         if true is not None:
             error = rig.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, right))
-        self.publish_result(stamp, stereo_calibration_metrics(
-            solution.rig, solution.left_residual, solution.right_residual, true
-        ))
+        self.publish_result(stamp, found.metrics)
 
 
 def main(args: list[str] | None = None) -> int:

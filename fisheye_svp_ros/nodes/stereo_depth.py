@@ -9,7 +9,7 @@ from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
@@ -22,14 +22,10 @@ from fisheye_svp_ros.nodes.solver import (
 )
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import STEREO
-from fisheye_svp_ros.solve.stereo_depth import (
-    epipolar_curves,
-    epipolar_offset,
-    triangulate,
-    triangulate_optimally,
-)
-from fisheye_svp_ros.study.metrics import NO_PAIR, STEREO_DEPTH_METRICS, stereo_depth_metrics
+from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
+from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
 from fisheye_svp_ros.study.settings import StereoDepthSettings
+from fisheye_svp_ros.study.solutions import measured
 
 
 class StereoDepth(SolverNode):
@@ -59,18 +55,16 @@ class StereoDepth(SolverNode):
         ids, in_left, in_right = np.intersect1d(
             left.landmark, right.landmark, assume_unique=True, return_indices=True
         )
-        if not len(ids):
-            raise GeometryError(NO_PAIR)
         uv = left.uv[in_left], right.uv[in_right]
-        offset = epipolar_offset(model, model, rig, *uv)
-        solve = triangulate_optimally if self.settings.optimal else triangulate
-        solved = solve(model, model, rig, *uv)
-        cloud = structured(LANDMARKS, ids[solved.valid], *solved.points[solved.valid].T)
+        found = measured(
+            model, rig.take(None), uv[0][None], uv[1][None],
+            _true_points(known_points(landmarks, right)[in_right], items), self.settings.optimal,
+        ).checked()
+        points = found.solution.points[0]
+        seen = np.isfinite(points[:, 0])
+        cloud = structured(LANDMARKS, ids[seen], *points[seen].T)
         self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
-        self.publish_result(stamp, stereo_depth_metrics(
-            offset.distance[None], offset.vertical[None], solved.points[None],
-            _true_points(known_points(landmarks, right)[in_right], items),
-        ))
+        self.publish_result(stamp, found.metrics)
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame

@@ -82,7 +82,7 @@ def calibrated_shift(lens: Lens) -> Lens:
     free poses it cannot be told from where the camera's origin is said to be.
     """
     poses = pose_sets(len(RADII))
-    right = Pose(*(np.concatenate(parts) for parts in zip(*poses, strict=True)))
+    right = Pose.concatenate(poses)
     points = np.repeat(
         np.stack([landmarks_at('whole', radius) for radius in RADII]),
         len(poses[0].position), axis=0,

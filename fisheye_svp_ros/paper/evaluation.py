@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.optics.lens import Lens
@@ -22,15 +22,10 @@ from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
-from fisheye_svp_ros.solve.localization import Localization, localize
-from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
-from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
-from fisheye_svp_ros.study.metrics import (
-    Metrics,
-    localization_metrics,
-    stereo_calibration_metrics,
-    stereo_depth_metrics,
-)
+from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
+from fisheye_svp_ros.study.metrics import Metrics
+from fisheye_svp_ros.study.solutions import calibrated, localized, measured
 
 # Section 5: where along z the right camera stands, m; Fish214 alone is moved.
 RIGHT_CAMERA_Z = {'fish214': -0.1}
@@ -48,7 +43,8 @@ class Measured(NamedTuple):
     """Stereo measurement of N landmarks, NaN where a camera does not see one (section 5).
 
     uv_left, uv_right (N, 2), px; foot (N, 2), px: nearest point of the epipolar curve; distance,
-    vertical (N,), px: to the curve, and to it in the same column; true, measured (N, 3), m, world.
+    vertical (N,), px: to the curve, and to it in the same column; true, measured (N, 3), m, world;
+    metrics: Error2 in both readings and Error3, see `study.metrics.stereo_depth_metrics`.
     """
 
     uv_left: Array
@@ -58,14 +54,7 @@ class Measured(NamedTuple):
     vertical: Array
     true: Array
     measured: Array
-
-    @property
-    def metrics(self) -> dict[str, float]:
-        """Error2 in both readings and Error3, see `errors.stereo_depth_metrics`."""
-        found = stereo_depth_metrics(
-            self.distance[None], self.vertical[None], self.measured[None], self.true[None]
-        )
-        return {name: float(value[0]) for name, value in found.items()}
+    metrics: dict[str, float]
 
 
 class Evaluation(NamedTuple):
@@ -127,9 +116,8 @@ def localize_environments(
     blank = views_of(points, np.zeros((*points.shape[:2], 2)))
     views = views_of(points, ForwardModel(lens).predict(true, blank).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
-    solved = localize(model, views, true if start is None else start)
-    metrics = localization_metrics(solved.pose, solved.residual, true)
-    return Localized(_rows(metrics), solved, views)
+    found = localized(model, views, true, true if start is None else start)
+    return Localized(_rows(found.metrics), found.solution, views)
 
 
 def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[Localized, ...]:
@@ -158,20 +146,18 @@ def calibrate_rigs(
     model = ForwardModel(lens)
     for radius, left_in_right in systems:
         points = radius * directions
-        for seen, pose in zip(views, (right.compose(_spread(left_in_right, right)), right),
-                              strict=True):
+        left = right.compose(left_in_right.broadcast_to(*right.shape))
+        for seen, pose in zip(views, (left, right), strict=True):
             blank = views_of(points, np.zeros((len(right.position), len(points), 2)))
             seen.append(views_of(points, model.predict(pose, blank).uv))
-    left_views, right_views = (_joined(seen) for seen in views)
-    known = ForwardModel(lens.svp() if solver is None else solver)
-    solved = calibrate_stereo(known, known, left_views, right_views, len(systems))
-    true = Pose(*(np.stack(parts) for parts in zip(*(r for _, r in systems), strict=True)))
-    metrics = stereo_calibration_metrics(
-        solved.rig, solved.left_residual, solved.right_residual, true
+    left_views, right_views = map(Views.concatenate, views)
+    found = calibrated(
+        ForwardModel(lens.svp() if solver is None else solver), left_views, right_views,
+        len(systems), Pose.stack([true for _, true in systems]),
     )
-    table = _rows(metrics)
+    table = _rows(found.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
-    return table.reshape(len(RADII), len(STYLE_NAMES), -1), solved
+    return table.reshape(len(RADII), len(STYLE_NAMES), -1), found.solution
 
 
 def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measured:
@@ -183,16 +169,16 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     points = landmarks_at('whole', radius)
     blank = views_of(points, np.zeros((1, len(points), 2)))
     model = ForwardModel(lens)
-    uv_right = model.predict(right, blank).uv[0]
-    uv_left = model.predict(right.compose(_spread(left_in_right, right)), blank).uv[0]
-    both = np.isfinite(uv_left + uv_right).all(axis=-1)
+    uv_right = model.predict(right, blank).uv
+    uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv
     known = ForwardModel(lens.svp() if solver is None else solver)
-    offset = epipolar_offset(known, known, left_in_right, uv_left[both], uv_right[both])
-    points_in_right = triangulate(known, known, left_in_right, uv_left[both], uv_right[both])
-    filled = [_filled(both, part) for part in (*offset, points_in_right.points)]
-    distance, vertical, foot, solved = filled
-    measured = solved @ right.rotation[0].T + right.position[0]
-    return Measured(uv_left, uv_right, foot, distance, vertical, points, measured)
+    solved = measured(known, left_in_right.take(None), uv_left, uv_right, right.into_body(points))
+    found = solved.solution
+    return Measured(
+        uv_left[0], uv_right[0], found.foot[0], found.distance[0], found.vertical[0], points,
+        found.points[0] @ right.rotation[0].T + right.position[0],
+        {name: float(value[0]) for name, value in solved.metrics.items()},
+    )
 
 
 def captions_of(lens: str, error2: Array, error3: Array) -> dict[int, tuple[float, float]]:
@@ -217,17 +203,3 @@ def _rows(metrics: Metrics) -> Array:
     return np.column_stack([
         *position, np.degrees(metrics['axis_error_rad']), metrics['mean_residual_px']
     ])
-
-
-def _spread(one: Pose, like: Pose) -> Pose:
-    return Pose(*(np.broadcast_to(a, b.shape) for a, b in zip(one, like, strict=True)))
-
-
-def _joined(views: list[Views]) -> Views:
-    return Views(*(np.concatenate(arrays) for arrays in zip(*views, strict=True)))
-
-
-def _filled(rows: Mask, values: Array) -> Array:
-    whole = np.full((len(rows), *values.shape[1:]), np.nan)
-    whole[rows] = values
-    return whole

@@ -24,7 +24,6 @@ from fisheye_svp_ros.paper.evaluation import (
 from fisheye_svp_ros.paper.results import Panel
 from fisheye_svp_ros.paper.studies import Family, shift_curves
 from fisheye_svp_ros.paper.tables import LENSES, NAMES, STYLE_NAMES
-from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
@@ -123,10 +122,7 @@ def draw_calibration_poses(path: Path) -> None:
     """Figure 8: the ten poses of a vergent rig among the Whole landmarks at 0.5 m."""
     points = landmarks_at('whole', 0.5)
     right = calibration_poses()
-    count = len(right.position)
-    left = right.compose(
-        Pose(*(np.broadcast_to(a, (count, *a.shape)) for a in rig('vergent')))
-    )
+    left = right.compose(rig('vergent').take(None))
     with picture(path, 9.6, 4.6) as figure:
         for axis, view in zip(figure.subplots(1, 2), _VIEWS, strict=True):
             (across, up), x_name, y_name = view

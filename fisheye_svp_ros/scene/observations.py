@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
@@ -97,13 +97,7 @@ def make_observations(
     )
 
 
-class Views(NamedTuple):
-    """Observations in batch form: S views (one frame of one camera) of up to N points.
-
-    points (S, N, 3), m; uv (S, N, 2), px; weight (S, N): 1 / sigma, 0 for padding; landmark,
-    board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding.
-    """
-
+class _Views(NamedTuple):
     points: Array
     uv: Array
     weight: Array
@@ -114,9 +108,15 @@ class Views(NamedTuple):
     camera: Index
     row: Index
 
-    def take(self, index: Any) -> Views:
-        """Return some of the views."""
-        return Views(*(array[index] for array in self))
+
+class Views(_Views, Batch):
+    """Observations in batch form: S views (one frame of one camera) of up to N points.
+
+    points (S, N, 3), m; uv (S, N, 2), px; weight (S, N): 1 / sigma, 0 for padding; landmark,
+    board (S, N); t (S, N), s; frame, camera (S,); row (S, N): row of the table, -1 for padding.
+    """
+
+    __slots__ = ()
 
     @property
     def seen(self) -> tuple[Array, Array, Array]:

@@ -32,8 +32,7 @@ def rig_from_angle(inward: float, baseline: float) -> Pose:
 
 def paper_pose(*shape: int) -> Pose:
     """Return the paper's true pose: at the origin, gazing along -z of the world."""
-    rotation = np.broadcast_to(PAPER_FROM_OPTICAL, (*shape, 3, 3)).copy()
-    return Pose(rotation, np.zeros((*shape, 3)))
+    return Pose(np.tile(PAPER_FROM_OPTICAL, (*shape, 1, 1)), np.zeros((*shape, 3)))
 
 
 def calibration_poses(baseline: float = BASELINE) -> Pose:

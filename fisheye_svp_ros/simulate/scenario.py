@@ -221,8 +221,4 @@ def _smooth(poses: Pose, steps: int) -> Pose:
     turn = vector_from_rotation(after.rotation @ np.swapaxes(before.rotation, -1, -2))
     rotation = rotation_from_vector(part * turn[:, None]) @ before.rotation[:, None]
     position = before.position[:, None] + part * (after.position - before.position)[:, None]
-    last = poses.take(slice(-1, None))
-    return Pose(
-        np.concatenate([rotation.reshape(-1, 3, 3), last.rotation]),
-        np.concatenate([position.reshape(-1, 3), last.position]),
-    )
+    return Pose.concatenate([Pose(rotation, position).reshape(-1), poses.take(slice(-1, None))])

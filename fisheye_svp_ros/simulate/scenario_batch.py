@@ -68,22 +68,21 @@ def simulate_batches(scenarios: Sequence[Scenario], first: int) -> Iterator[Batc
 
 def _simulate(scenes: Sequence[_Scene], first: int) -> Batch:
     one = scenes[0].scenario
-    poses = _stacked([scene.poses for scene in scenes])
+    poses = Pose.stack([scene.poses for scene in scenes])
     rigs = [rig for scene in scenes if (rig := scenario_rig(scene.scenario)) is not None]
-    rig = _stacked(rigs) if rigs else None
+    rig = Pose.stack(rigs) if rigs else None
     cameras = (poses,) if rig is None else (poses.compose(rig.take(np.s_[:, None])), poses)
     landmark = np.stack([scene.landmarks.ids for scene in scenes])
     points = np.stack([scene.landmarks.points for scene in scenes])
     model = ForwardModel(true_lens(one.lens, one.shift_scale))
     noise = [noise_generator(scene.scenario.seed, first + scene.row) for scene in scenes]
-    shape = (*poses.position.shape[:2], landmark.shape[1])
+    shape = (*poses.shape, landmark.shape[1])
     flat = shape[0] * shape[1]
     sets = np.repeat(np.arange(shape[0]), shape[1])
     uv = []
     for number, camera in enumerate(cameras):
         views = blank_views(landmark[sets], points[sets], flat)
-        place = Pose(camera.rotation.reshape(flat, 3, 3), camera.position.reshape(flat, 3))
-        seen = predicted(model, place, views._replace(camera=views.camera + number))
+        seen = predicted(model, camera.reshape(flat), views._replace(camera=views.camera + number))
         ideal = Predicted(seen.uv.reshape(*shape, 2), seen.scale.reshape(*shape, 1))
         uv.append(np.stack([
             recorded(model, Predicted(*parts), scene.scenario.noise_px, rng)
@@ -91,7 +90,3 @@ def _simulate(scenes: Sequence[_Scene], first: int) -> Batch:
         ]))
     row = np.array([scene.row for scene in scenes])
     return Batch(row, one.lens, one.shift_scale, landmark, points, rig, cameras, tuple(uv))
-
-
-def _stacked(poses: Sequence[Pose]) -> Pose:
-    return Pose(*(np.stack(parts) for parts in zip(*poses, strict=True)))

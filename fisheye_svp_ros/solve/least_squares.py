@@ -7,17 +7,18 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.optics.engines.stopping import (
+from fisheye_svp_ros.optics.engines.marquardt import (
+    FIRST_DAMPING,
+    FIRST_GROWTH,
     MAX_ITERATIONS,
-    NOISE,
-    ROUNDING,
-    STEP_TOLERANCE,
     STUCK,
+    adjusted,
+    is_better,
+    is_last,
 )
 
 Arrays = tuple[Array, ...]
 
-_LEAST = 1e-300  # what is divided by in place of 0
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 
 
@@ -55,49 +56,49 @@ def levenberg_marquardt(
 ) -> Solved:
     """Minimise every system from its own start, with a damping of its own.
 
-    Source: Marquardt's scaling with Nielsen's damping (IMM-REP-1999-05, section 3).  A step that
-    leaves the domain of the lens costs infinity and is refused; one too small to matter, or after
-    which the next would be, is taken without another look, and is the last.
+    Its rules are those of `optics.engines.marquardt`.  A step that leaves the domain of the lens
+    costs infinity and is refused; the last one is taken without another look.
     """
     systems = start[0].shape[0]
-    state = tuple(array.copy() for array in start)
     active: Index = np.arange(systems)
-    total, normal = problem.linearise(state, active)
-    damping, growth = np.full(systems, 1e-4), np.full(systems, 2.0)
-    converged, moved_before = np.zeros(systems, dtype=bool), np.zeros(systems)
-    iterations = np.zeros(systems, dtype=np.int64)
+    total, normal = problem.linearise(start, active)
+    found = Solved(
+        tuple(array.copy() for array in start), total, np.zeros(systems, dtype=np.bool_),
+        np.zeros(systems, dtype=np.int64), normal,
+    )
+    damping, growth = np.full(systems, FIRST_DAMPING), np.full(systems, FIRST_GROWTH)
+    moved_before = np.zeros(systems)
     active = active[np.isfinite(total)]
     for _ in range(max_iterations):
         if not active.size:
             break
-        iterations[active] += 1
-        step, moved = problem.step(_take(normal, active), damping[active])
-        trial = problem.retract(_take(state, active), step)
+        found.iterations[active] += 1
+        step, moved = problem.step(_at(found.normal, active), damping[active])
+        trial = problem.retract(_at(found.state, active), step)
         before = total[active]
-        done = moved <= STEP_TOLERANCE**2 + ROUNDING * before
-        done |= moved * moved <= STEP_TOLERANCE**2 * (1 + before) * moved_before[active]
-        done &= damping[active] < 1
+        done = is_last(moved, moved_before[active], before, damping[active])
         if done.any():
             last, on = active[done], ~done
-            converged[last] = True
+            found.converged[last] = True
             total[last] = np.maximum(before - moved, 0.0)[done]
-            state = _put(state, last, trial, done)
+            found = found._replace(state=_written(found.state, last, trial, done))
             active, before, moved = active[on], before[on], moved[on]
             trial = tuple(array[on] for array in trial)
             if not active.size:
                 break
         cost, fresh = problem.linearise(trial, active)
-        better = cost <= before * (1 + ROUNDING) + NOISE * np.sqrt(before)
-        ratio = np.where(better, before - cost, 0.0) / np.fmax(moved, _LEAST)
+        better = is_better(cost, before)
         accepted = active[better]
         total[accepted], moved_before[accepted] = cost[better], moved[better]
-        state = _put(state, accepted, trial, better)
-        normal = _put(normal, accepted, fresh, better)
-        damping[active], growth[active] = _adjusted(
-            damping[active], growth[active], better, ratio
+        found = found._replace(
+            state=_written(found.state, accepted, trial, better),
+            normal=_written(found.normal, accepted, fresh, better),
+        )
+        damping[active], growth[active] = adjusted(
+            damping[active], growth[active], better, before - cost, moved
         )
         active = active[damping[active] < STUCK]
-    return Solved(state, total, converged, iterations, normal)
+    return found
 
 
 def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
@@ -130,19 +131,14 @@ def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     return (step,), moved
 
 
-def _adjusted(damping: Array, growth: Array, better: Mask, ratio: Array) -> tuple[Array, Array]:
-    shrunk = np.maximum(damping * np.clip(1 - (2 * ratio - 1) ** 3, 0.1, 2.0), 1e-15)
-    raised = np.maximum(damping, 1e-9) * growth
-    return np.where(better, shrunk, raised), np.where(better, 2.0, 2 * growth)
-
-
-def _take(arrays: Arrays, index: Index) -> Arrays:
+def _at(arrays: Arrays, index: Index) -> Arrays:
+    """Return the rows at ascending places; all of them are not copied."""
     if len(index) == len(arrays[0]):
         return arrays
     return tuple(array[index] for array in arrays)
 
 
-def _put(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> Arrays:
+def _written(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> Arrays:
     """Return arrays with the masked ones of the new rows, which go to `index`."""
     if len(index) == len(arrays[0]):
         return new

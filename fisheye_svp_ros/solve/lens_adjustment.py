@@ -54,7 +54,7 @@ def adjust(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> Adjust
     determine the parameters.
     """
     start = np.array([parameter_values(lens, names)])
-    solved = adjust_batch(lens, views, Pose(*(array[None] for array in pose)), start, names)
+    solved = adjust_batch(lens, views, pose.take(None), start, names)
     if not np.isfinite(solved.cost[0]):
         raise GeometryError(
             f'lens {lens.name!r} cannot image all landmarks from the start poses; check that '

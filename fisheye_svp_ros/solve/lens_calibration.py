@@ -13,9 +13,7 @@ from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
 from fisheye_svp_ros.optics.camera import back_project, incidence
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens
-from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views
-from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import (
     Adjusted,
@@ -29,7 +27,7 @@ from fisheye_svp_ros.solve.lens_start import (
     monotone_limit,
     thinned,
 )
-from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px, sigma_known
 
 OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
@@ -168,10 +166,7 @@ def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
         better = fresh.cost < adjusted.cost * (1 - 1e-6)
         if not better.any():
             break
-        pose = Pose(*(
-            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-            for new, old in zip(fresh.pose, pose, strict=True)
-        ))
+        pose = fresh.pose.where(better, pose)
     return adjusted
 
 
@@ -180,7 +175,7 @@ def _posed(lens: Lens, views: Views) -> Localization:
     lens = _with_corner(lens)
     rays = back_project(lens, views.uv)
     start = initial_poses(views.points, rays.direction, np.where(rays.valid, views.weight, 0.0))
-    return localize_both_sides(ForwardModel(lens), views, start)
+    return localize(ForwardModel(lens), views, start)
 
 
 def _with_corner(lens: Lens) -> Lens:

@@ -54,8 +54,7 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     shape = direction.shape[:3]
     points = np.broadcast_to(views.points, (*shape, 3)).reshape(-1, *views.points.shape[1:])
     weight = np.broadcast_to(views.weight, shape).reshape(-1, shape[-1])
-    flat = initial_poses(points, direction.reshape(points.shape), weight)
-    pose = Pose(flat.rotation.reshape(*shape[:2], 3, 3), flat.position.reshape(*shape[:2], 3))
+    pose = initial_poses(points, direction.reshape(points.shape), weight).reshape(*shape[:2])
     misfit = np.array([
         _misfit(one, pose.take(i), views) for i, one in enumerate(lenses)
     ])

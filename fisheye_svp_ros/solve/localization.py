@@ -8,6 +8,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.engines.results import FLAT
 from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
@@ -26,28 +27,37 @@ _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
     """Return the maximum-likelihood pose of every view; no start value is needed.
 
-    Kita, section 3: bundle adjustment of one camera against known landmarks.
+    Kita, section 3: bundle adjustment of one camera against known landmarks.  A flat target seen
+    small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
+    either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
     if start is None:
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)
+    found, some_flat = _localized(model, views, start)
+    if not some_flat:
+        return found
+    flat, centre, normal = _flat_targets(views)
+    reflected = _reflected(found.pose.take(flat), centre, normal)
+    other, _ = _localized(model, views.take(flat), reflected)
+    better = other.cost < found.cost[flat]
+    found.put(flat[better], other.take(better))
+    return found
+
+
+def _localized(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
+    """Solve from these starts alone; return also whether any target may be flat."""
     quick = None
     if model.plain:
         quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, start)
     if quick is None:
-        return _by_reference(model, views, start)
-    found, unsolved = quick
-    if unsolved:
-        left = np.flatnonzero(~found.converged)
-        merge(found, left, _by_reference(model, views.take(left), start.take(left)))
-    return found
-
-
-def merge(found: Localization, rows: Index, other: Localization) -> None:
-    """Replace some of the views by others' results, in place."""
-    for old, new in zip((*found.pose, *found[1:]), (*other.pose, *other[1:]), strict=True):
-        old[rows] = new
+        return _by_reference(model, views, start), True
+    found, remaining, flat = quick
+    if remaining:
+        rest = np.flatnonzero(~found.converged)
+        found.put(rest, _by_reference(model, views.take(rest), start.take(rest)))
+    return found, flat > 0
 
 
 def _by_reference(model: ForwardModel, views: Views, start: Pose) -> Localization:
@@ -86,6 +96,30 @@ def start_poses(model: ForwardModel, views: Views) -> Pose:
             views.points - axial @ np.swapaxes(pose.rotation, -1, -2), rays.direction, inside
         )
     return pose
+
+
+def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
+    """Return the views (F,) of flat targets, the centres (F, 3) of these and normals (F, 3)."""
+    weight = views.weight[:, None]
+    centre = weight @ views.points / weight.sum(axis=2, keepdims=True)
+    centred = views.points - centre
+    extent, axes = np.linalg.eigh((np.swapaxes(centred, -1, -2) * weight) @ centred)
+    flat = np.flatnonzero(extent[:, 0] < FLAT**2 * extent[:, 2])
+    return flat, centre[flat, 0], axes[flat, :, 0]
+
+
+def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
+    """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
+    sight = pose.inverse().transform(centre)
+    along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
+    to_camera = _mirror(along) @ np.swapaxes(pose.rotation, -1, -2) @ _mirror(normal)
+    rotation = np.swapaxes(to_camera, -1, -2)
+    return Pose(rotation, centre - (rotation @ sight[..., None])[..., 0])
+
+
+def _mirror(normal: Array) -> Array:
+    mirror: Array = np.eye(3) - 2 * normal[..., :, None] * normal[..., None, :]
+    return mirror
 
 
 def check_views(views: Views, minimum: int, what: str = 'in it') -> None:

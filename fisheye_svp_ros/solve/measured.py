@@ -10,8 +10,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
-from fisheye_svp_ros.solve.flat_target import localize_both_sides
-from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization
+from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
 
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
 
@@ -36,15 +35,11 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
     """
     views, left_out = posable_views(observations, model)
-    result = localize_both_sides(model, views)
+    result = localize(model, views)
     fixed = result.converged
     if not fixed.all():
         left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
-        views = views.take(fixed)
-        result = Localization(
-            result.pose.take(fixed), result.covariance[fixed], result.residual[fixed],
-            result.cost[fixed], result.converged[fixed], result.iterations[fixed],
-        )
+        views, result = views.take(fixed), result.take(fixed)
     if not len(views.frame):
         raise GeometryError(f'{observations.source}: the points of no frame fix a pose')
     sigma = None

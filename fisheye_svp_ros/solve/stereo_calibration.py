@@ -62,12 +62,12 @@ def calibrate_stereo(
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
     covariance = arrow_covariance(solved.normal)
     lost = ~solved.converged
-    shape = (*pose.position.shape[:2], -1, 2)
+    shape = (*pose.shape, -1, 2)
     covariance.shared[lost] = covariance.blocks[lost] = np.nan
     return StereoCalibration(
         rig, covariance.shared, pose, covariance.blocks,
-        residuals(left, _flat(_left_pose(pose, rig)), left_views).reshape(shape),
-        residuals(right, _flat(pose), right_views).reshape(shape),
+        residuals(left, _left_pose(pose, rig).reshape(-1), left_views).reshape(shape),
+        residuals(right, pose.reshape(-1), right_views).reshape(shape),
         solved.cost, solved.converged, solved.iterations,
     )
 
@@ -116,10 +116,10 @@ class _Rigs:
 
     def _equations(self, side: int, pose: Pose, index: Index) -> tuple[Array, Array, Array]:
         """Return costs (S, V), H (S, V, 6, 6) and g (S, V, 6) of one camera's poses (S, V)."""
-        views, shape = self._views[side], pose.position.shape[:2]
+        views, shape = self._views[side], pose.shape
         if len(index) < len(self._rows):
             views = views.take(self._rows[index].ravel())
-        cost, (hessian, gradient) = pose_equations(self._models[side], _flat(pose), views)
+        cost, (hessian, gradient) = pose_equations(self._models[side], pose.reshape(-1), views)
         return cost.reshape(shape), hessian.reshape(*shape, 6, 6), gradient.reshape(*shape, 6)
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
@@ -136,16 +136,12 @@ def _left_pose(right: Pose, rig: Pose) -> Pose:
 
 def _left_change(right: Pose, rig: Pose) -> Array:
     """Derivative (S, V, 6, 12) of the left camera's change by those of the right one and rig."""
-    change = np.zeros((*right.position.shape[:2], 6, 12))
+    change = np.zeros((*right.shape, 6, 12))
     change[..., range(6), range(6)] = 1.0
     arm = (right.rotation @ rig.position[:, None, :, None])[..., 0]
     change[..., :3, 3:6] = -cross_matrix(arm)
     change[..., :3, 6:9] = change[..., 3:, 9:] = right.rotation
     return change
-
-
-def _flat(pose: Pose) -> Pose:
-    return Pose(pose.rotation.reshape(-1, 3, 3), pose.position.reshape(-1, 3))
 
 
 def _starts(
@@ -160,25 +156,16 @@ def _starts(
             f'frame {left_views.frame[lost[0]]} cannot be posed in either camera; each view needs '
             f'{MIN_POINTS} points that are not on one line'
         )
-    shape = (systems, -1)
-    both = (left_posed & right_posed).reshape(shape)
+    both = (left_posed & right_posed).reshape(systems, -1)
     if not both.any(axis=1).all():
         raise GeometryError(
             f'no view can be posed in both cameras; one with {MIN_POINTS} points in each is needed'
         )
     rigs = right_pose.inverse().compose(left_pose)
-    rig = _robust_mean(_shaped(rigs, shape), both)
-    from_left = _shaped(left_pose, shape).compose(rig.inverse().take(np.s_[:, None]))
-    posed = right_posed.reshape(shape)[..., None]
-    own = _shaped(right_pose, shape)
-    return Pose(
-        np.where(posed[..., None], own.rotation, from_left.rotation),
-        np.where(posed, own.position, from_left.position),
-    ), rig
-
-
-def _shaped(pose: Pose, shape: tuple[int, int]) -> Pose:
-    return Pose(pose.rotation.reshape(*shape, 3, 3), pose.position.reshape(*shape, 3))
+    rig = _robust_mean(rigs.reshape(systems, -1), both)
+    from_left = left_pose.reshape(systems, -1).compose(rig.inverse().take(np.s_[:, None]))
+    own = right_pose.reshape(systems, -1)
+    return own.where(right_posed.reshape(systems, -1), from_left), rig
 
 
 def _posed(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
@@ -188,7 +175,7 @@ def _posed(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
     pose = identity(len(views.frame))
     if posed.any():
         solved = localize(model, views.take(posed))
-        pose.rotation[posed], pose.position[posed] = solved.pose
+        pose.put(posed, solved.pose)
         posed[posed] = solved.converged
     return pose, posed
 

@@ -168,14 +168,11 @@ class _Pairs:
 
     def __init__(self, rig: Pose, uv_left: Array, uv_right: Array) -> None:
         self.shape = np.broadcast_shapes(
-            uv_left.shape[:-1], uv_right.shape[:-1], rig.position.shape[:-1]
+            uv_left.shape[:-1], uv_right.shape[:-1], rig.shape
         )
         self.left = np.broadcast_to(uv_left, (*self.shape, 2)).reshape(-1, 2)
         self.right = np.broadcast_to(uv_right, (*self.shape, 2)).reshape(-1, 2)
-        self.rig = Pose(
-            np.broadcast_to(rig.rotation, (*self.shape, 3, 3)).reshape(-1, 3, 3),
-            np.broadcast_to(rig.position, (*self.shape, 3)).reshape(-1, 3),
-        )
+        self.rig = rig.broadcast_to(*self.shape).reshape(-1)
 
     def take(self, index: Index | Mask) -> _Pairs:
         """Return some of the M pairs."""

@@ -167,8 +167,7 @@ def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     """Return error and noise (S,) of epipolar distance and depth for caps (S, N, 3)."""
     true, svp = ForwardModel(setup.lens), ForwardModel(setup.lens.svp())
     right = true.predict(identity(len(points)), _blank(points)).uv
-    left_pose = Pose(*(np.broadcast_to(a, (len(points), *a.shape)) for a in setup.rig))
-    left = true.predict(left_pose, _blank(points)).uv
+    left = true.predict(setup.rig.broadcast_to(len(points)), _blank(points)).uv
     both: Mask = np.asarray(np.isfinite(left + right).all(axis=-1))
     pairs = (svp, svp, setup.rig, left[both], right[both])
     offset = epipolar_offset(*pairs)

@@ -21,11 +21,6 @@ STEREO_CALIBRATION_METRICS = ('views', *_FIT, *_POSE)
 STEREO_DEPTH_METRICS = ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px', 'error3_m',
                         'error3_max_m')
 
-# Why a set has no metrics.
-NO_POSE = 'image_points: they do not fix a pose (all near one line?)'
-NO_RIG = 'image_points: they do not fix a rig'
-NO_PAIR = 'image_points: no landmark is in both images'
-
 
 def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
     """Return LOCALIZATION_METRICS of poses (S,), residuals (S, N, 2), px, NaN = no point.

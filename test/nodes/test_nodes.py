@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph, set_parameter
-from helpers.targets import plane, poses_around
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
@@ -23,7 +22,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, stamp_of, unpack
 from fisheye_svp_ros.io.landmark_files import environment
-from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import camera, messages
 from fisheye_svp_ros.nodes.base import Finished
@@ -33,15 +32,12 @@ from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.camera import incidence
-from fisheye_svp_ros.optics.curves import Equidistant
-from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
-from fisheye_svp_ros.solve.flat_target import localize_both_sides
 from fisheye_svp_ros.solve.localization import localize
 
 
@@ -357,27 +353,6 @@ def test_a_camera_that_jumps_is_found_again(graph: Callable[..., Graph]) -> None
     found = [message.pose.pose.position for message in sets.poses]
     want = localize(ForwardModel(lens), views).pose.position
     np.testing.assert_allclose([[p.x, p.y, p.z] for p in found], want, atol=1e-9)
-
-
-def test_a_flat_target_is_not_left_on_the_wrong_side(
-    graph: Callable[..., Graph], tmp_path: Path
-) -> None:
-    lens = Lens('tele', 1280, 960, 1800.0, 1800.0, 639.5, 479.5, Equidistant(), 0.44)
-    save_lens(lens, tmp_path / 'tele.yaml')
-    model, target, rng = ForwardModel(lens), plane(), np.random.default_rng(3)
-    poses = poses_around(target, 100, rng, widest=0.3, distance=(8.0, 20.0))
-    views = group_views(simulate(model, target, poses, 0.1, rng))
-    one, truth = localize(model, views), localize(model, views, poses)
-    both = localize_both_sides(model, views)
-    helped = one.converged & (one.cost > truth.cost + 9) & (both.cost < truth.cost + 1e-6)
-    wrong = np.flatnonzero(helped)[0]
-    sets = Sets(graph(f'lens:={tmp_path}/tele.yaml', 'patience:=0.2'))
-    sets.landmarks.publish(messages.landmarks_message(target, 0, 'world'))
-    seen = views.landmark[wrong], views.uv[wrong]
-    sets.points.publish(messages.image_points_message(*seen, 1, 'camera'))
-    sets.graph.until(lambda: sets.poses)
-    found, best = sets.poses[0].pose.pose.position, truth.pose.position[wrong]
-    np.testing.assert_allclose([found.x, found.y, found.z], best, atol=1e-6)
 
 
 def test_points_without_landmarks_are_dropped(graph: Callable[..., Graph]) -> None:

@@ -18,11 +18,12 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.camera import project, project_with_jacobian
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery
-from fisheye_svp_ros.optics.engines import numpy_engine
+from fisheye_svp_ros.optics.engines import marquardt, numpy_engine
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
+from fisheye_svp_ros.solve import least_squares, localization
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
@@ -110,6 +111,12 @@ def views_and_poses(count, points=33):
     return views_of(landmarks, uv), pose
 
 
+def njit_of(rule):
+    from numba import njit
+
+    return njit(rule)
+
+
 def on_each(run):
     answers = []
     for name in ('numpy', 'numba'):
@@ -129,6 +136,44 @@ def test_poses_and_their_covariances(compiled, engine, count):
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
     np.testing.assert_array_equal(found.iterations, expected.iterations)
+
+
+def test_both_take_the_same_steps(compiled, monkeypatch):
+    """Far starts: steps are refused, damping grows and shrinks, the last step is the same one."""
+    views, pose = views_and_poses(60)
+    start = pose.retract(0.6 * np.random.default_rng(95).normal(size=(60, 6)))
+    ends, given = set(), (FISH214, views.seen, views.row, MIN_POINTS, start)
+    # What is given up for the reference takes no steps of the compiled form to the end.
+    kept = compiled.localize(*given)[0].converged
+    assert kept.sum() > 40
+    for limit in range(1, 40):
+        monkeypatch.setattr(least_squares.levenberg_marquardt, '__defaults__', (limit,))
+        expected = localization.localize(ForwardModel(FISH214), views, start)
+        expected, found = expected.take(kept), compiled.localize(*given, limit)[0].take(kept)
+        np.testing.assert_array_equal(found.iterations, expected.iterations)
+        assert np.abs(found.pose.difference(expected.pose)).max() < 1e-8
+        np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-6)
+        ends |= set(found.iterations.tolist())
+    assert len(ends) > 10
+
+
+def test_the_rules_of_damping_are_the_same_compiled(compiled):
+    rng = np.random.default_rng(96)
+    damping, growth, cost, before, moved, moved_before = (
+        10.0 ** rng.uniform(-14, 6, (6, 400)))
+    cost[::7] = np.inf
+    moved[::11], cost[1::13] = 0.0, before[1::13]
+    quick = [njit_of(rule) for rule in (
+        marquardt.is_last, marquardt.is_better, marquardt.adjusted)]
+    better = marquardt.is_better(cost, before)
+    arguments = ((moved, moved_before, before, damping), (cost, before),
+                 (damping, growth, better, before - cost, moved))
+    for rule, compiled_rule, given in zip(
+        (marquardt.is_last, marquardt.is_better, marquardt.adjusted), quick, arguments, strict=True
+    ):
+        want = np.stack(np.atleast_2d(rule(*given)), axis=-1)
+        found = [np.atleast_1d(compiled_rule(*numbers)) for numbers in zip(*given, strict=True)]
+        np.testing.assert_allclose(found, want, rtol=1e-12)
 
 
 def test_rigs_and_their_covariances(compiled, engine):
@@ -158,8 +203,9 @@ def test_what_is_not_plain_sailing_goes_to_the_reference(compiled, engine):
     expected, found = on_each(lambda: localize(model, views._replace(points=near), pose))
     assert expected.converged.tolist() == found.converged.tolist() == [True, False, True]
     changed = views._replace(points=near)
-    quick, left = compiled.localize(FISH214, changed.seen, changed.row, MIN_POINTS, pose)
-    assert quick.converged.tolist() == [True, False, False] and left == 2
+    quick, remaining, flat = compiled.localize(
+        FISH214, changed.seen, changed.row, MIN_POINTS, pose)
+    assert quick.converged.tolist() == [True, False, False] and remaining == 2 and flat == 1
     both_equal(expected.pose, found.pose)
     assert np.isnan(found.covariance[1]).all()
     views.weight[1, 3:] = 0.0

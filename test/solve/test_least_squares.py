@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.solve.least_squares import (
-    STEP_TOLERANCE,
-    dense_step,
-    levenberg_marquardt,
-    solve_damped,
-)
+from fisheye_svp_ros.optics.engines.marquardt import STEP_TOLERANCE
+from fisheye_svp_ros.solve.least_squares import dense_step, levenberg_marquardt, solve_damped
 
 # NIST StRD, Misra1a (lower difficulty): y = b1 (1 - exp(-b2 x)), certified values.
 MISRA_X = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8,

@@ -84,13 +84,13 @@ def pose_equations(
 
 def localize(
     lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose
-) -> tuple[Localization, int] | None:
+) -> tuple[Localization, int, int] | None:
     """Solve single poses from starts (S,), if the engine can do so by itself.
 
     row (S, N): below 0 for padding; minimum: usable points that a view must have.  Returns also
-    how many have not converged, which are left to the solver.
+    how many have not converged, which remain for the solver, and how many targets are flat.
     """
-    found: tuple[Localization, int] | None = _engine.localize(lens, seen, row, minimum, start)
+    found: tuple[Localization, int, int] | None = _engine.localize(lens, seen, row, minimum, start)
     return found
 
 

@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
+from fisheye_svp_ros.optics.engines import marquardt
 from fisheye_svp_ros.optics.engines.kernels import (
     BARE,
     OPTIONS,
@@ -20,13 +22,10 @@ from fisheye_svp_ros.optics.engines.kernels import (
     substitute,
     view_equations,
 )
-from fisheye_svp_ros.optics.engines.stopping import (
-    MAX_ITERATIONS,
-    NOISE,
-    ROUNDING,
-    STEP_TOLERANCE,
-    STUCK,
-)
+from fisheye_svp_ros.optics.engines.marquardt import FIRST_DAMPING, FIRST_GROWTH, STUCK
+
+for rule in (marquardt.is_last, marquardt.is_better, marquardt.adjusted):
+    register_jitable(**OPTIONS)(rule)
 
 POSE, NORMAL = (4, 3), (13, 6)
 
@@ -181,19 +180,19 @@ def _moved(normal, cameras, step):
 
 
 @njit(**BARE)
-def minimise(w, left, right, cameras, work):
+def minimise(w, left, right, cameras, work, limit):
     """Move the first state to the minimum; return cost, iterations, how it ended, and where.
 
-    1: converged; 0: not; -1: left to the reference, wherever it got to.  Where: which of the two
-    states, and of the normal equations, are the last.
+    limit: of the iterations.  How: 1: converged; 0: not; -1: given up for the reference, wherever
+    it got to.  Where: which of the two states, and of the normal equations, are the last.
     """
     states, normals, step, eliminated, lower, room = work
-    damping, growth, moved_before, iteration, ended = 1e-4, 2.0, 0.0, 0, 0
-    at = known = 0
+    damping, growth, moved_before = FIRST_DAMPING, FIRST_GROWTH, 0.0
+    iteration = ended = at = known = 0
     total = _equations(w, left, right, cameras, states[at], normals[known], room)
     if not np.isfinite(total):
         return total, 0, -1 if np.isnan(total) else 0, at, known
-    while iteration < MAX_ITERATIONS:
+    while iteration < limit:
         iteration += 1
         moved = _solve(normals[known], cameras, damping, step, eliminated, lower)
         if np.isnan(moved):
@@ -201,22 +200,17 @@ def minimise(w, left, right, cameras, work):
             break
         for v in range(len(step) - 2 + cameras):
             retract(*pose_of(states[at, v]), step[v], *pose_of(states[1 - at, v]))
-        little = moved <= STEP_TOLERANCE**2 + ROUNDING * total
-        little |= moved * moved <= STEP_TOLERANCE**2 * (1.0 + total) * moved_before
-        if little and damping < 1.0:
+        if marquardt.is_last(moved, moved_before, total, damping):
             at, total, ended = 1 - at, max(total - moved, 0.0), 1
             break
         cost = _equations(w, left, right, cameras, states[1 - at], normals[1 - known], room)
         if np.isnan(cost):
             ended = -1
             break
-        if cost <= total * (1.0 + ROUNDING) + NOISE * np.sqrt(total):
-            ratio = (total - cost) / moved if moved > 0.0 else 0.0
-            damping = max(damping * min(max(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0), 1e-15)
-            growth, total, moved_before = 2.0, cost, moved
-            at, known = 1 - at, 1 - known
-        else:
-            damping, growth = max(damping, 1e-9) * growth, 2.0 * growth
-            if damping >= STUCK:
-                break
+        better = marquardt.is_better(cost, total)
+        damping, growth = marquardt.adjusted(damping, growth, better, total - cost, moved)
+        if better:
+            total, moved_before, at, known = cost, moved, 1 - at, 1 - known
+        elif damping >= STUCK:
+            break
     return total, iteration, ended, at, known

@@ -12,7 +12,7 @@ from pathlib import Path
 
 _SOURCES = (
     'optics/formulas.py', 'optics/rays.py', 'optics/engines/kernels.py',
-    'optics/engines/adjustment.py', 'optics/engines/entries.py', 'optics/engines/stopping.py',
+    'optics/engines/adjustment.py', 'optics/engines/entries.py', 'optics/engines/marquardt.py',
 )
 
 

@@ -40,6 +40,8 @@ from fisheye_svp_ros.optics.engines.kernels import (
     meet,
     substitute,
 )
+from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
+from fisheye_svp_ros.optics.engines.results import FLAT
 
 _DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the reference
 
@@ -81,15 +83,41 @@ def _residual(w, points, uv, row, lens, pose, out):
         load(w, n, points[start:], *pose)
         meet(w, n, lens, BEHIND)
         image(w, n, lens)
-        left, off = 0, out[start:]
+        remaining, off = 0, out[start:]
         for i in range(n):
-            left += (rows[i] >= 0) & (w[STATE + i] == LEFT)
+            remaining += (rows[i] >= 0) & (w[STATE + i] == LEFT)
             seen = (rows[i] >= 0) & (w[STATE + i] != INVALID)
             off[i, 0] = measured[i, 0] - w[U + i] if seen else np.nan
             off[i, 1] = measured[i, 1] - w[V + i] if seen else np.nan
-        if left:
+        if remaining:
             return False
     return True
+
+
+@njit(**BARE)
+def _flat(points, weight):
+    """Say whether the weighted points lie near a plane: eigenvalues after Smith (1961)."""
+    total = x = y = z = xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(len(points)):
+        k = weight[i]
+        # Beside the first point, for the digits of a target far from the origin.
+        a, b, c = (points[i, 0] - points[0, 0], points[i, 1] - points[0, 1],
+                   points[i, 2] - points[0, 2])
+        total, x, y, z = total + k, x + k * a, y + k * b, z + k * c
+        xx, xy, xz = xx + k * a * a, xy + k * a * b, xz + k * a * c
+        yy, yz, zz = yy + k * b * b, yz + k * b * c, zz + k * c * c
+    x, y, z = x / total, y / total, z / total
+    xx, yy, zz = xx / total - x * x, yy / total - y * y, zz / total - z * z
+    xy, xz, yz = xy / total - x * y, xz / total - x * z, yz / total - y * z
+    mean = (xx + yy + zz) / 3.0
+    a, b, c = xx - mean, yy - mean, zz - mean
+    size = np.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if not size > 0.0:
+        return False
+    det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
+    turn = np.arccos(min(max(0.5 * det / (size * size * size), -1.0), 1.0)) / 3.0
+    largest = mean + 2.0 * size * np.cos(turn)
+    return mean + 2.0 * size * np.cos(turn + 2.0943951023931953) < FLAT * FLAT * largest
 
 
 def _in(dimensions: int, kind: Any = types.float64) -> types.Array:
@@ -156,12 +184,13 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
 _SEEN = (_in(3), _in(3), _in(2))
 
 
-@_entry(types.int64, _in(1), types.int64, *_SEEN, _in(2, types.int64), _out(3), _out(2), _out(3),
-        _out(3), _out(1), _out(1, types.boolean), _out(1, types.int64))
-def localize(lens, minimum, points, uv, weight, row, rotation, position, covariance, residual,
-             cost, solved, iterations):
-    """Move S poses to their minima; return how many are left to the reference."""
-    w, work, left = np.empty(SCRATCH), workspace(1), 0
+@_entry(types.UniTuple(types.int64, 2), _in(1), types.int64, types.int64, *_SEEN,
+        _in(2, types.int64), _out(3), _out(2), _out(3), _out(3), _out(1), _out(1, types.boolean),
+        _out(1, types.int64))
+def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, covariance,
+             residual, cost, solved, iterations):
+    """Move S poses to their minima; return how many remain for the reference, and flat targets."""
+    w, work, remaining, flat = np.empty(SCRATCH), workspace(1), 0, 0
     states, normals, lower = work[0], work[1], work[4]
     for s in range(len(points)):
         usable, solved[s] = 0, False
@@ -172,7 +201,7 @@ def localize(lens, minimum, points, uv, weight, row, rotation, position, covaria
             copy(rotation[s], pose[0])
             copy(position[s], pose[1])
             seen = (points[s:s + 1], uv[s:s + 1], weight[s:s + 1], lens)
-            cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work)
+            cost[s], iterations[s], ended, at, known = minimise(w, seen, seen, 1, work, limit)
             pose = pose_of(states[at, 0])
             copy(pose[0], rotation[s])
             copy(pose[1], position[s])
@@ -181,27 +210,28 @@ def localize(lens, minimum, points, uv, weight, row, rotation, position, covaria
                 and _inverse(normal_of(normals[known, 0])[0], lower, covariance[s])
                 and _residual(w, points[s], uv[s], row[s], lens, pose, residual[s])
             )
-        left += not solved[s]
-    return left
+        remaining += not solved[s]
+        flat += _flat(points[s], weight[s])
+    return remaining, flat
 
 
 @_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(4), _out(1),
         _out(1, types.int64))
 def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, state,
                 normal, cost, iterations):
-    """Move S rigs of V views to their minima; return how many are left to the reference.
+    """Move S rigs of V views to their minima; return how many remain for the reference.
 
     state (S, V + 1, 4, 3); normal (S, V + 1, 13, 6): see `adjustment`.
     """
-    views, left = state.shape[1] - 1, 0
+    views, remaining = state.shape[1] - 1, 0
     w, work = np.empty(SCRATCH), workspace(views)
     for s in range(len(state)):
         mine = slice(s * views, (s + 1) * views)
         copy(state[s], work[0][0])
         cost[s], iterations[s], ended, at, known = minimise(
             w, (left_points[mine], left_uv[mine], left_weight[mine], left_lens),
-            (points[mine], uv[mine], weight[mine], lens), 2, work)
+            (points[mine], uv[mine], weight[mine], lens), 2, work, MAX_ITERATIONS)
         copy(work[0][at], state[s])
         copy(work[1][known], normal[s])
-        left += ended < 1
-    return left
+        remaining += ended < 1
+    return remaining

@@ -18,6 +18,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.optics.engines import entries, kernels, numpy_engine
 from fisheye_svp_ros.optics.engines.adjustment import NORMAL, POSE
+from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
 from fisheye_svp_ros.optics.engines.results import Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.rays import caustic_range, edge, search_limit
@@ -81,9 +82,9 @@ def linearise_views(
 
 
 def localize(
-    lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose
-) -> tuple[Localization, int] | None:
-    """Do as `engines.localize` says."""
+    lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose, limit: int = MAX_ITERATIONS
+) -> tuple[Localization, int, int] | None:
+    """Do as `engines.localize` says; limit: of the iterations."""
     numbers = packed(lens)
     if numbers is None:
         return None
@@ -95,13 +96,15 @@ def localize(
     )
     arrays = (*_contiguous(*seen, row), *found.pose, *found[1:])
     if systems == 1:  # by the shortest way: it is called for every frame of a camera
-        return found, entries.localize(numbers, minimum, *arrays)
+        return found, *entries.localize(numbers, minimum, limit, *arrays)
 
-    def run(part: slice) -> int:
-        left: int = entries.localize(numbers, minimum, *(array[part] for array in arrays))
-        return left
+    def run(part: slice) -> tuple[int, int]:
+        counts: tuple[int, int] = entries.localize(
+            numbers, minimum, limit, *(array[part] for array in arrays))
+        return counts
 
-    return found, sum(_spread(run, systems, 4 * systems * count))
+    remaining, flat = map(sum, zip(*_spread(run, systems, 4 * systems * count), strict=True))
+    return found, remaining, flat
 
 
 def adjust_rigs(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.pose import Pose
+
+FLAT = 0.1  # thickness of a target relative to its length, below which it counts as flat
 
 # Points (S, N, 3), m; image points (S, N, 2), px; weights (S, N), 1/px
 Seen = tuple[Array, Array, Array]
@@ -22,7 +24,16 @@ class Incidence(NamedTuple):
     valid: Mask
 
 
-class Localization(NamedTuple):
+class _Localization(NamedTuple):
+    pose: Pose
+    covariance: Array
+    residual: Array
+    cost: Array
+    converged: Mask
+    iterations: Index
+
+
+class Localization(_Localization, Batch):
     """Solved poses of S views.
 
     pose: camera in the world; covariance (S, 6, 6), m and rad, of the change in `Pose.retract`;
@@ -31,12 +42,7 @@ class Localization(NamedTuple):
     line, say) has not converged; where that is so the covariance is NaN.
     """
 
-    pose: Pose
-    covariance: Array
-    residual: Array
-    cost: Array
-    converged: Mask
-    iterations: Index
+    __slots__ = ()
 
 
 class Rigs(NamedTuple):

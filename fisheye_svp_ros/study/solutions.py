@@ -1,0 +1,118 @@
+"""One set, or many at once, to a solution and its metrics: the one way there is.
+
+Nodes, sweeps, commands and the paper's evaluation all come by here, so they tell the same numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
+from fisheye_svp_ros.solve.stereo_depth import (
+    epipolar_offset,
+    triangulate,
+    triangulate_optimally,
+)
+from fisheye_svp_ros.study.metrics import (
+    Metrics,
+    localization_metrics,
+    stereo_calibration_metrics,
+    stereo_depth_metrics,
+)
+
+T = TypeVar('T')
+
+_NO_POSE = 'image_points: they do not fix a pose (all near one line?)'
+_NO_RIG = 'image_points: they do not fix a rig'
+_NO_PAIR = 'image_points: no landmark is in both images'
+
+
+class Measurement(NamedTuple):
+    """N matched landmarks of each of S sets, NaN where a camera does not see one.
+
+    points (S, N, 3), m, in the right camera's frame; distance, vertical (S, N), px, of the left
+    image point from the epipolar curve, whose nearest point is foot (S, N, 2).
+    """
+
+    points: Array
+    distance: Array
+    vertical: Array
+    foot: Array
+
+
+class Solved(NamedTuple, Generic[T]):
+    """The solution of S sets and its metrics, arrays (S,) by name.
+
+    solved (S,); unsolved: why the others have no solution.
+    """
+
+    solution: T
+    metrics: Metrics
+    solved: Mask
+    unsolved: str
+
+    def checked(self) -> Solved[T]:
+        """Return it as it is; raise GeometryError where a set has no solution."""
+        if not self.solved.all():
+            raise GeometryError(self.unsolved)
+        return self
+
+
+def localized(
+    model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None
+) -> Solved[Localization]:
+    """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
+
+    Raises GeometryError as `localize` does.
+    """
+    found = localize(model, views, start)
+    metrics = localization_metrics(found.pose, found.residual, true)
+    return Solved(found, metrics, found.converged, _NO_POSE)
+
+
+def calibrated(
+    model: ForwardModel, left: Views, right: Views, systems: int = 1, true: Pose | None = None
+) -> Solved[StereoCalibration]:
+    """Calibrate S rigs of two like cameras from S * V views; true: rigs (S,).
+
+    Raises GeometryError as `calibrate_stereo` does.
+    """
+    found = calibrate_stereo(model, model, left, right, systems)
+    metrics = stereo_calibration_metrics(
+        found.rig, found.left_residual, found.right_residual, true
+    )
+    return Solved(found, metrics, found.converged, _NO_RIG)
+
+
+def measured(
+    model: ForwardModel, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
+    optimal: bool = False,
+) -> Solved[Measurement]:
+    """Measure landmarks with rigs (S,) of two like cameras that are known.
+
+    uv_left, uv_right (S, N, 2), px, of the same landmarks, NaN = unseen; true (S, N, 3), m: where
+    these are in the right camera's frame; optimal: by least reprojection error.
+    """
+    both = np.isfinite(np.concatenate([uv_left, uv_right], axis=-1)).all(axis=-1)
+    pairs = model, model, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
+    offset = epipolar_offset(*pairs)
+    points = (triangulate_optimally if optimal else triangulate)(*pairs).points
+
+    def filled(values: Array) -> Array:
+        whole = np.full((*both.shape, *values.shape[1:]), np.nan)
+        whole[both] = values
+        return whole
+
+    found = Measurement(
+        filled(points), filled(offset.distance), filled(offset.vertical), filled(offset.foot)
+    )
+    metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
+    return Solved(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
