@@ -42,6 +42,7 @@ bench: .venv-bench/ready
 	.venv-bench/bin/python -m benchmark.speed
 
 .venv-bench/ready: setup.py benchmark/requirements.txt
+	@echo "Installing what is compared into .venv-bench: some minutes, this once"
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/pip install --quiet --upgrade pip
 	.venv-bench/bin/pip install --quiet -e '.[standalone]' -r benchmark/requirements.txt
@@ -56,11 +57,13 @@ mutation: $(VENV)/ready
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.
 test-oldest:
+	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/pip install --quiet -e '.[standalone,fast,test]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
 
 $(VENV)/ready: setup.py
+	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
 	$(BIN)/pip install --quiet -e '.[standalone,fast,dask,test,lint]'

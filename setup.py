@@ -1,3 +1,5 @@
+"""The package for pip and for colcon (ament_python)."""
+
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -24,7 +26,9 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=[package_name, f'{package_name}.*']),
-    package_data={package_name: ['py.typed', '*.pyi', 'reporting/templates/*']},
+    package_data={
+        package_name: ['py.typed', '*.pyi'], f'{package_name}.reporting': ['templates/*'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (share, ['package.xml']),

@@ -1,4 +1,4 @@
-"""Mutation study: of a random sample of small faults, how many do the tests find?
+"""Mutation study: how many of a random sample of small faults the tests find.
 
 `python -m benchmark.mutation --sample 300 --workers 2` changes one operator or number at a time in
 a copy of the tree, runs the tests of that room, and writes docs/mutation.md: what died, and each

@@ -43,12 +43,12 @@ AnyObservations = Observations | str | Path
 
 @dataclass(frozen=True)
 class Localized(Result):
-    """A pose a frame: frame (F,); pose (F,) of the camera in the world; covariance (F, 6, 6), m
-    and rad, of the change in `Pose.retract`; rms_px (F,).
+    """A pose a frame: frame (F,), pose (F,) of the camera in the world, rms_px (F,).
 
-    residual (N, 2), px: measured minus predicted, in the order of the observations, NaN where not
-    used; sigma_px: noise of u and v, estimated, None where the observations bring their own;
-    left_out: frames whose points do not fix a pose.
+    covariance (F, 6, 6), m and rad, of the change in `Pose.retract`; residual (N, 2), px: measured
+    minus predicted, in the order of the observations, NaN where not used; sigma_px: noise of u and
+    v, estimated, None where the observations bring their own; left_out: frames whose points do
+    not fix a pose.
     """
 
     frame: Index
@@ -89,8 +89,10 @@ class Calibrated(Result):
 
 @dataclass(frozen=True)
 class CalibratedRig(Result):
-    """A rig, the left camera in the right one: rig; covariance (6, 6), m and rad; frame (V,);
-    pose (V,) of the right camera in the world; rms_px over both cameras; converged.
+    """A rig: the left camera in the right one.
+
+    covariance (6, 6), m and rad; frame (V,); pose (V,) of the right camera in the world; rms_px
+    over both cameras.
     """
 
     rig: Pose
@@ -128,8 +130,10 @@ class StereoDepth(Result):
 
 @dataclass(frozen=True)
 class Simulated(Result):
-    """What cameras see: observations, one frame a pose; pose (F,) of the camera in the world, of
-    the right one of a rig; rig: the left camera in the right one, None for one camera; lens.
+    """What cameras see: observations, one frame a pose.
+
+    pose (F,) of the camera in the world, of the right one of a rig; rig: the left camera in the
+    right one, None for one camera.
     """
 
     lens: Lens
@@ -175,8 +179,9 @@ class Diagnosed(Result):
 
 @dataclass(frozen=True)
 class Budgeted(Result):
-    """SVP errors and what noise causes: spreads (A,), rad; ranges (R,), m; error, noise: arrays
-    (A, R) by quantity, SI and px (`study.budget.Budget`).
+    """SVP errors and what noise causes, by quantity: arrays (A, R), SI and px.
+
+    spreads (A,), rad; ranges (R,), m; see `study.budget.Budget`.
     """
 
     spreads: Array

@@ -12,9 +12,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.nodes import ROOT, Caller, NodeProcess
 
-from fisheye_svp_ros.optics import engines
+# Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
+sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
+
+from helpers.nodes import ROOT, Caller, NodeProcess  # noqa: E402
+
+from fisheye_svp_ros.optics import engines  # noqa: E402
 
 _INSTALL = 'from fisheye_svp_ros import standalone; standalone.install()\n'
 

@@ -1,4 +1,4 @@
-"""Does a solver that stops early explain the one cell of table 1 that is out of line?
+"""Whether a solver that stops early explains the one cell of table 1 that is out of line.
 
 The z of Fish180, Whole, 2.0 m differs by 29 % from the rows below it in the paper itself.  Kita's
 solver is Levenberg-Marquardt from a pose "a little different from true pose"; how it damps and
@@ -36,8 +36,10 @@ _MAX_STEPS = 100
 
 
 class Excess(NamedTuple):
-    """What the published cell costs: the position (3,), mm, less our optimum; its sum of squares,
-    relative to the optimum's (with the best rotation there).
+    """What the published cell costs.
+
+    offset_mm (3,): the position less our optimum; relative_cost: its sum of squares, relative to
+    the optimum's (with the best rotation there).
     """
 
     offset_mm: Array

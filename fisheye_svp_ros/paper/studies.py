@@ -39,8 +39,10 @@ class Member(NamedTuple):
 
 
 class Family(NamedTuple):
-    """members: all fits; low, high (2, 3, 3, 5): tables 3 and 4 over random sets of ten poses,
-    5 % and 95 % quantiles, in the paper's units.
+    """All fits of the search, and what tables 3 and 4 owe to the poses.
+
+    low, high (2, 3, 3, 5): 5 % and 95 % quantiles of tables 3 and 4 over random sets of ten
+    poses, in the paper's units.
     """
 
     members: tuple[Member, ...]

@@ -57,7 +57,7 @@ def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
 
 
 def answer(points: Sequence[Point], asked: Asked) -> str:
-    """Answer: may the viewpoint shift be neglected?"""
+    """Return the answer to whether the viewpoint shift may be neglected, as a sentence."""
     where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
              f'{asked.working_range:g} m')
     judged = asked.judged(points)

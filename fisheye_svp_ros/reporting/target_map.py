@@ -16,8 +16,10 @@ from fisheye_svp_ros.scene.observations import views_of
 
 
 class BoardMap(NamedTuple):
-    """One board: id; place (L, 2), m, of its landmarks on it; height (L,), m, off its plane;
-    slide (L, 2), m, along it.  What a motion or a magnification of the board does is left out.
+    """Where the landmarks of one board are, relative to where they were said to be.
+
+    place (L, 2), m, on the board; height (L,), m, off its plane; slide (L, 2), m, along it.  What
+    a motion or a magnification of the board does is left out.
     """
 
     board: int
