@@ -123,3 +123,18 @@ def test_layouts_are_built_as_the_programs_read_them(layouts: tuple[Any, Any, An
         assert splitter.attrib['orientation'] in ('|', '-')
     assert all([child.tag for child in area] == ['plot'] for area in juggler.iter('DockArea'))
     assert juggler.find('tabbed_widget').attrib['parent'] == 'main_window'
+
+
+def test_architecture_names_every_room_and_what_is_there() -> None:
+    page = (ROOT / 'docs' / 'architecture.md').read_text()
+    paths = re.findall(r'`([\w./]+/[\w./]*|\w+\.(?:py|toml))`', page)
+    assert len(paths) > 40
+    for path in paths:
+        assert (ROOT / path).exists() or (ROOT / 'fisheye_svp_ros' / path).exists(), path
+    for room in (ROOT / 'fisheye_svp_ros').iterdir():
+        if (room / '__init__.py').exists() or room.suffix == '.py' and room.stem != '__init__':
+            assert re.search(rf'\b{re.escape(room.name)}\b', page), room.name
+    for registry, home in (('READERS', 'io/readers.py'), ('COMMANDS', 'cli.py'),
+                           ('_drawings', 'paper/report.py'), ('CATALOGUE', 'effects/catalogue.py'),
+                           ('IMAGE_HEIGHTS', 'optics/curves.py')):
+        assert registry in (ROOT / 'fisheye_svp_ros' / home).read_text()
