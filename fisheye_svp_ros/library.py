@@ -21,7 +21,6 @@ from fisheye_svp_ros.io.parameters import SWEEP, changed, rows
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics import camera
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import Observations, stereo_views
@@ -214,12 +213,14 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 def project(lens: AnyLens, points: Array) -> Image:
     """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
-    return camera.project(load_lens(lens), np.asarray(points, dtype=float))
+    return ForwardModel(load_lens(lens)).project(np.asarray(points, dtype=float))
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
-    return camera.back_project(load_lens(lens), np.asarray(uv, dtype=float))
+    uv = np.asarray(uv, dtype=float)
+    rays = ForwardModel(load_lens(lens)).back_project(uv.reshape(1, -1, 2))
+    return rays.shaped(uv.shape[:-1])
 
 
 def localize(observations: AnyObservations, lens: AnyLens) -> Localized:

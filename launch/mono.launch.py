@@ -10,7 +10,7 @@ PACKAGE = 'fisheye_svp_ros'
 CAMERAS = ['synthetic_camera', 'measured_camera']
 ARGUMENTS = {
     'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
-    'svp': 'true or false: solve with the SVP model; empty: as the parameter file has it',
+    'svp': 'auto, true or false: solve with the SVP model; empty: as the parameter file has it',
     'namespace': 'namespace of the nodes',
 }
 
@@ -21,7 +21,7 @@ def nodes(context):
         return LaunchConfiguration(name).perform(context)
 
     lens = {'lens': value('lens')} if value('lens') else {}
-    svp = {'svp': value('svp').lower() == 'true'} if value('svp') else {}
+    svp = {'svp': value('svp')} if value('svp') else {}
     return [
         Node(package=PACKAGE, executable=name, namespace=value('namespace'), output='screen',
              parameters=[value(f'{name}_params'), given])

@@ -11,7 +11,7 @@ STYLES = ['parallel', 'vergent', 'divergent']
 NODES = ['synthetic_camera', 'stereo_calibrator', 'stereo_depth']
 ARGUMENTS = {
     'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
-    'svp': 'true or false: solve with the SVP model; empty: as the parameter files have it',
+    'svp': 'auto, true or false: solve with the SVP model; empty: as the parameter files have it',
     'namespace': 'namespace of the nodes',
 }
 
@@ -22,7 +22,7 @@ def nodes(context):
         return LaunchConfiguration(name).perform(context)
 
     lens = {'lens': value('lens')} if value('lens') else {}
-    svp = {'svp': value('svp').lower() == 'true'} if value('svp') else {}
+    svp = {'svp': value('svp')} if value('svp') else {}
     rig = {'style': value('style'), 'poses_file': 'calibration'}
     given = {'synthetic_camera': {**lens, **rig}}
     return [

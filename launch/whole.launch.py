@@ -7,7 +7,7 @@ from launch_ros.substitutions import FindPackageShare
 
 SHARED = {
     'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
-    'svp': 'true or false: solve with the SVP model; empty: as the parameter files have it',
+    'svp': 'auto, true or false: solve with the SVP model; empty: as the parameter files have it',
 }
 STYLES = ['parallel', 'vergent', 'divergent']
 

@@ -45,6 +45,7 @@ from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -159,7 +160,7 @@ def diagnose(
         untestable=selection.untestable,
         trace=selection.trace,
         gain=gain_between(measured[0], measured[-1], noise),
-        lens=extended_lens(lens, state),
+        lens=extended_lens(lens, state, observations),
         before=Linearised(data, base, free),
         after=after,
         neighbour_correlation=selection.correlation.coefficient,
@@ -191,14 +192,12 @@ def noise_px(linear: Linearised, nuisance: Nuisance) -> float:
     return float(np.sqrt(variance * np.mean(1 / weight**2)))
 
 
-def extended_lens(lens: Lens, state: State) -> Lens:
+def extended_lens(lens: Lens, state: State, observations: Observations) -> Lens:
     """Return the lens that was fitted, with its effects, for every command and node."""
-    effects = {effect.name: effect.to_dict(values) for effect, values in state.terms}
     # A fitted height curve may turn a little earlier than the one the lens came with.
     limit = min(lens.max_incidence, state.lens.image_height.limit * (1 - 1e-6))
-    return replace(
-        state.lens, effects=effects, calibration=lens.calibration, max_incidence=limit
-    )
+    fitted = replace(state.lens, calibration=lens.calibration, max_incidence=limit)
+    return extend_lens(fitted, state.terms, observations)
 
 
 def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:

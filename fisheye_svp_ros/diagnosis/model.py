@@ -103,7 +103,9 @@ def start(data: Data, lens: Lens) -> State:
         relative = pose.take(data.frame_of[mine]).inverse().compose(solved.take(mine))
         middle = np.argsort(np.linalg.norm(relative.position, axis=1))[len(mine) // 2]
         rig.put(camera, relative.take(middle))
-    return State(pose, rig, replace(lens, effects={}), model.terms)
+    terms = model.terms_for(data.views)
+    target = {} if len(terms) > len(model.terms) else lens.target
+    return State(pose, rig, replace(lens, corrections={}, target=target), terms)
 
 
 def start_poses(data: Data, trained: State) -> State:

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
-class AspectEffect(Effect):
+class AspectEffect(PlaneEffect):
     """A relative difference between fx and fy, their mean kept."""
 
     name: ClassVar[str] = 'aspect'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals outward along one image axis and inward along the other'
     )
@@ -29,6 +29,12 @@ class AspectEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('relative', '1', 0.01),)
 
-    def columns(self, scene: Scene) -> Array:
-        halves = np.array([scene.lens.fx, -scene.lens.fy]) / 2
-        return np.asarray((scene.normalised() * halves)[..., None])
+    def plane_columns(self, scene: Scene) -> Array:
+        return np.asarray((scene.normalised() * [0.5, -0.5])[..., None])
+
+    def extend(self, lens: Lens, values: Array) -> Lens:
+        half = float(values[0]) / 2
+        return replace(lens, fx=lens.fx * (1 + half), fy=lens.fy * (1 - half))
+
+    def refocused(self, values: Array, ratio: float) -> Array:
+        return values

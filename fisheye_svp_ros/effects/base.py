@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -23,6 +23,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.camera import Incidence
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
@@ -133,6 +134,40 @@ class Effect(ABC):
         """Displacement (S, N, D) at this effect's stage."""
         return np.asarray(self.columns(scene) @ values)
 
+    def curved(self, lens: Lens, values: Array) -> Lens:
+        """Return the lens with what this effect adds to its curves; others leave them alone."""
+        return lens
+
+    @property
+    def place(self) -> str:
+        """The field of a lens that holds this effect where nothing else in the lens can."""
+        return 'target' if self.stage == 'target' else 'corrections'
+
+    def extend(self, lens: Lens, values: Array) -> Lens:
+        """Return the lens with this effect in its place, added to what stands there.
+
+        Raises LensError where the lens holds another form of the same effect.
+        """
+        curved = self.curved(lens, values)
+        if curved is not lens and type(curved.image_height) in IMAGE_HEIGHTS.values():
+            return curved
+        held: Mapping[str, Any] = getattr(lens, self.place)
+        if self.name in held:
+            known, before = self.from_dict(held[self.name], lens.name)
+            if known != self:
+                raise LensError(f'lens {lens.name!r} already holds {known.key} in {self.place}; '
+                                f'{self.key} cannot be added')
+            values = values + before
+        changes: dict[str, Any] = {self.place: {**held, self.name: self.to_dict(values)}}
+        return replace(lens, **changes)
+
+    def refocused(self, values: Array, ratio: float) -> Array:
+        """Return the values that leave the effect what it is when fx and fy grow by a ratio.
+
+        What changes the curves grows with them, what moves image points stays what it is, in px.
+        """
+        return values
+
     def joined(self, other: Self) -> Effect:
         """Return the form that holds this one and another of the same effect."""
         return other
@@ -173,6 +208,26 @@ class Effect(ABC):
             odd = next(iter(numbers), 'a value that is not finite')
             raise LensError(f'{where}: effect {cls.name} has {odd}, which does not belong there')
         return effect, values
+
+
+class PlaneEffect(Effect):
+    """An effect that moves image points in proportion to the focal length."""
+
+    stage: ClassVar[str] = 'image'
+
+    @abstractmethod
+    def plane_columns(self, scene: Scene) -> Array:
+        """Derivatives (S, N, 2, P) of the displacement over the focal lengths."""
+
+    def columns(self, scene: Scene) -> Array:
+        focal = np.array([scene.lens.fx, scene.lens.fy])
+        return np.asarray(self.plane_columns(scene) * focal[:, None])
+
+    def refocused(self, values: Array, ratio: float) -> Array:
+        return values / ratio
+
+
+Term = tuple[Effect, Array]
 
 
 class NoiseEffect(Effect):

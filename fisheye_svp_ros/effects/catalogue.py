@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.aspect import AspectEffect
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.effects.board_pose import BoardPoseEffect
 from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.detector_bias import DetectorBiasEffect
@@ -62,7 +61,7 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 
 
-def load_effects(entries: Mapping[str, Any], where: str) -> tuple[tuple[Effect, Array], ...]:
+def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:
     """Return the effects of a lens's mapping and their values.
 
     Raises LensError, naming `where` and the effect, for an unknown or incomplete one.

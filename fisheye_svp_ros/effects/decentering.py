@@ -8,15 +8,14 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 
 
 @dataclass(frozen=True)
-class DecenteringEffect(Effect):
+class DecenteringEffect(PlaneEffect):
     """Brown and Conrady p1, p2, in image points over the focal length."""
 
     name: ClassVar[str] = 'decentering'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals that grow with the square of the image height, strongest along one diameter'
     )
@@ -29,10 +28,9 @@ class DecenteringEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))
 
-    def columns(self, scene: Scene) -> Array:
+    def plane_columns(self, scene: Scene) -> Array:
         x, y = np.moveaxis(scene.normalised(), -1, 0)
         r2 = x * x + y * y
         p1 = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
         p2 = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)
-        focal = np.array([scene.lens.fx, scene.lens.fy])
-        return np.asarray(np.stack([p1, p2], axis=-1) * focal[:, None])
+        return np.stack([p1, p2], axis=-1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -36,14 +36,16 @@ class DotCentroidEffect(Effect):
         return [cls()]
 
     @property
+    def place(self) -> str:
+        return 'target'  # it is the target's dots that are so large
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 
     def columns(self, scene: Scene) -> Array:
         views = scene.views
         column = np.zeros((*views.points.shape[:2], 2, 1))
-        # The dot's shape matters, not the shift of its centre: project with the lens alone.
-        lens = replace(scene.lens, effects={})
         in_camera = scene.pose.into_body(views.points)
         distance = np.linalg.norm(in_camera, axis=-1)
         for board in scene.boards:
@@ -55,8 +57,8 @@ class DotCentroidEffect(Effect):
             rim = np.cos(angle)[:, None] * board.axes[0] + np.sin(angle)[:, None] * board.axes[1]
             turned = rim @ scene.pose.rotation[np.nonzero(mine)[0]]
             points = in_camera[mine][:, None] + (_EQUAL * radius)[:, None, None] * turned
-            centre = project(lens, in_camera[mine], limited=False).uv
-            bias = _polygon_centroid(project(lens, points, limited=False).uv) - centre
+            centre = project(scene.lens, in_camera[mine], limited=False).uv
+            bias = _polygon_centroid(project(scene.lens, points, limited=False).uv) - centre
             column[mine] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]
         return column
 

@@ -11,6 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 from fisheye_svp_ros.optics.curves import FlatPort
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,5 @@ class FlatPortEffect(Effect):
         shift = FlatPort(1.0, self.refractive_index).columns(scene.theta)[..., :1]
         return np.stack([shift, np.zeros_like(shift)], axis=-2)
 
-    def shift(self, values: Array) -> FlatPort:
-        """Return the curve that adds to the lens's viewpoint shift."""
-        return FlatPort(float(values[0]), self.refractive_index)
+    def curved(self, lens: Lens, values: Array) -> Lens:
+        return lens.with_shift(FlatPort(float(values[0]), self.refractive_index))

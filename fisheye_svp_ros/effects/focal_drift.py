@@ -9,11 +9,11 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_time
+from fisheye_svp_ros.effects.base import Effect, Parameter, PlaneEffect, Scene, require_time
 
 
 @dataclass(frozen=True)
-class FocalDriftEffect(Effect):
+class FocalDriftEffect(PlaneEffect):
     """A relative change of the focal length as a polynomial of time, constant left out."""
 
     degree: int = 1
@@ -21,7 +21,6 @@ class FocalDriftEffect(Effect):
     duration: float = field(default=1.0, metadata={'key': False})
 
     name: ClassVar[str] = 'focal_drift'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals in proportion to the image height that change smoothly with time'
     )
@@ -40,9 +39,7 @@ class FocalDriftEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f'relative_t{i + 1}', '1', 0.01) for i in range(self.degree))
 
-    def columns(self, scene: Scene) -> Array:
+    def plane_columns(self, scene: Scene) -> Array:
         x = np.nan_to_num(2 * (scene.times - self.start) / self.duration - 1)
         powers = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
-        focal = np.array([scene.lens.fx, scene.lens.fy])
-        growth = (scene.normalised() * focal)[..., None]
-        return np.asarray(growth * powers[:, None, None, :])
+        return np.asarray(scene.normalised()[..., None] * powers[:, None, None, :])

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
-import numpy as np
-
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
-class FocalLengthEffect(Effect):
+class FocalLengthEffect(PlaneEffect):
     """A relative change of the focal length."""
 
     name: ClassVar[str] = 'focal_length'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals along the radius in proportion to the image height'
     )
@@ -29,6 +27,12 @@ class FocalLengthEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('relative', '1', 0.02),)
 
-    def columns(self, scene: Scene) -> Array:
-        focal = np.array([scene.lens.fx, scene.lens.fy])
-        return np.asarray((scene.normalised() * focal)[..., None])
+    def plane_columns(self, scene: Scene) -> Array:
+        return scene.normalised()[..., None]
+
+    def extend(self, lens: Lens, values: Array) -> Lens:
+        growth = 1 + float(values[0])
+        return replace(lens, fx=lens.fx * growth, fy=lens.fy * growth)
+
+    def refocused(self, values: Array, ratio: float) -> Array:
+        return values

@@ -10,18 +10,15 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
+from fisheye_svp_ros.effects.base import Term as Term
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.flat_port import FlatPortEffect
-from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
-from fisheye_svp_ros.effects.ray_curves import SumOfHeights, SumOfShifts
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.extension import curved_lens
+from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays, back_project, project
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
-
-Term = tuple[Effect, Array]
 
 
 @dataclass(frozen=True)
@@ -60,19 +57,39 @@ class ForwardModel:
     """A lens with its effects, ready to predict and to be solved with."""
 
     def __init__(self, lens: Lens, terms: Sequence[Term] | None = None) -> None:
-        """Take the effects of the lens, or others in their place.
+        """Take the corrections of the lens and of its target, or other effects in their place.
 
         `plain`: what the lens's own curves do is all there is.
         Raises LensError for an effect that is unknown or incomplete.
         """
-        self.terms = load_effects(lens.effects, lens.name) if terms is None else tuple(terms)
-        self.lens = _extended(lens, self.terms)
-        self.plain = not self._of('target', 'pose', 'image', 'detector')
+        own = load_effects(lens.corrections, lens.name) if terms is None else terms
+        self.terms = tuple(own)
+        self._target = Target.of(lens.target, lens.name) if terms is None else None
+        self._given = lens
+        self.lens = curved_lens(lens, self.terms)
+        self.plain = self._target is None and not self._acts('target', 'pose', 'image', 'detector')
+
+    def seeing(self, views: Views) -> ForwardModel:
+        """Return the model without corrections of a target that none of the views shows."""
+        if self._target is None or self._target.shown(views).any():
+            return self
+        return ForwardModel(self._given, self.terms)
+
+    def terms_for(self, views: Views) -> tuple[Term, ...]:
+        """Return the corrections of the lens, and of its target if any of the views shows it."""
+        target = self.seeing(views)._target
+        return self.terms if target is None else (*self.terms, *target.terms)
 
     @property
     def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
         """The effects that move no prediction, and their values."""
         return [(e, values) for e, values in self.terms if isinstance(e, NoiseEffect)]
+
+    def project(self, points: Array) -> Image:
+        """Project points (..., 3), m, in the camera frame."""
+        shape, flat = points.shape[:-1], points.reshape(1, -1, 3)
+        uv, valid = self.predict(identity(1), views_of(flat, np.zeros((1, flat.shape[1], 2))))
+        return Image(uv.reshape(*shape, 2), valid.reshape(shape))
 
     def predict(self, pose: Pose, views: Views, limited: bool = True) -> Image:
         """Predict image points of views (S, N) from poses (S,) of the camera in the world.
@@ -94,7 +111,7 @@ class ForwardModel:
 
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""
-        if not self._of('image', 'detector'):
+        if not self._acts('image', 'detector'):
             return back_project(self.lens, uv)
         ideal = uv
         views = views_of(np.zeros((*uv.shape[:-1], 3)), uv)
@@ -123,19 +140,21 @@ class ForwardModel:
         if effect.stage in ('image', 'detector'):
             return columns
         if effect.stage == 'ray':
-            per_px = linear.image.d_height / _focal(self.lens)
+            per_px = linear.image.d_height / self.lens.focal
             stage = np.stack([linear.image.d_shift, per_px], axis=-1)
         else:
             stage = {'target': linear.d_target, 'pose': linear.d_pose}[effect.stage]
         return np.asarray(stage @ columns)
 
     def _through(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
+        if self._target is not None:
+            views = self._target.labelled(views)
         points = self._seen_points(pose, views)
         ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
         linear = LinearViews(
             ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited
         )
-        if not self._of('image', 'detector'):
+        if not self._acts('image', 'detector'):
             return linear
         uv = [ideal]
         for stage in ('image', 'detector'):
@@ -146,9 +165,9 @@ class ForwardModel:
     def _seen_points(self, pose: Pose, views: Views) -> Array:
         """Return the points (S, N, 3), m, where target and pose effects make them be seen."""
         points = views.points
-        if self._of('target', 'pose'):
+        if self._acts('target', 'pose'):
             points = points + self._moved(Scene(views, self.lens, pose, views.uv), 'target')
-        if self._of('pose'):
+        if self._acts('pose'):
             # When a row was exposed depends on where the point is seen: predict that first.
             seen = project(self.lens, pose.into_body(points), limited=False).uv
             move = np.asarray(self._moved(Scene(views, self.lens, pose, seen), 'pose'))
@@ -157,32 +176,14 @@ class ForwardModel:
             points = place + (turn @ (points - place - move[..., :3])[..., None])[..., 0]
         return points
 
-    def _of(self, *stages: str) -> list[Term]:
-        return [term for term in self.terms if term[0].stage in stages]
+    def _acts(self, *stages: str) -> bool:
+        """Whether there is any effect at some stages."""
+        terms = self.terms if self._target is None else (*self.terms, *self._target.terms)
+        return any(effect.stage in stages for effect, _ in terms)
 
     def _moved(self, scene: Scene, stage: str) -> Array | float:
-        parts = [effect.displacement(scene, values) for effect, values in self._of(stage)]
-        return np.sum(parts, axis=0) if parts else 0.0
-
-
-def _focal(lens: Lens) -> float:
-    return (lens.fx + lens.fy) / 2
-
-
-def _extended(lens: Lens, terms: Sequence[Term]) -> Lens:
-    """Return the lens with the curves that its ray effects add."""
-    shifts = tuple(
-        effect.shift(values) for effect, values in terms
-        if isinstance(effect, ViewpointShiftEffect | FlatPortEffect)
-    )
-    heights = tuple(
-        effect.height(values) for effect, values in terms
-        if isinstance(effect, RadialProfileEffect)
-    )
-    if shifts:
-        lens = replace(lens, viewpoint_shift=SumOfShifts(lens.viewpoint_shift, shifts))
-    if heights:
-        curve = SumOfHeights(lens.image_height, _focal(lens), heights)
-        limit = min(lens.max_incidence, curve.limit)
-        lens = replace(lens, image_height=curve, max_incidence=limit)
-    return lens
+        moved: Array | float = 0.0
+        for effect, values in self.terms:
+            if effect.stage == stage:
+                moved = moved + effect.displacement(scene, values)
+        return moved if self._target is None else moved + self._target.moved(scene, stage)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -33,3 +34,6 @@ class PrincipalPointEffect(Effect):
 
     def columns(self, scene: Scene) -> Array:
         return np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))
+
+    def extend(self, lens: Lens, values: Array) -> Lens:
+        return replace(lens, cx=lens.cx + float(values[0]), cy=lens.cy + float(values[1]))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
-from fisheye_svp_ros.effects.ray_curves import ChebyshevHeight
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,48 @@ class RadialProfileEffect(Effect):
         height = ChebyshevHeight(self.theta_max, (0.0,) * self.terms).columns(scene.theta)
         return np.stack([np.zeros_like(height), height], axis=-2)
 
-    def height(self, values: Array) -> ChebyshevHeight:
-        """Return the curve that adds to the lens's image height, px."""
-        return ChebyshevHeight(self.theta_max, tuple(map(float, values)))
+    def curved(self, lens: Lens, values: Array) -> Lens:
+        change = ChebyshevHeight(self.theta_max, tuple((values / lens.focal).tolist()))
+        return replace(lens, image_height=lens.image_height.plus(change))
+
+    def refocused(self, values: Array, ratio: float) -> Array:
+        return values * ratio
+
+
+@dataclass(frozen=True)
+class ChebyshevHeight:
+    """A change of image height h/f: x times a Chebyshev sum in x = theta / theta_max.
+
+    Zero on the axis; the linear term (a change of focal length) is left out.
+    """
+
+    theta_max: float
+    values: tuple[float, ...]
+
+    def columns(self, theta: Array) -> Array:
+        """Derivatives (..., K) by the values."""
+        x = theta / self.theta_max
+        basis = np.polynomial.chebyshev.chebvander(2 * x * x - 1, len(self.values))
+        # T_k(2x^2 - 1) x, less its value at the axis times x: odd in x and without a linear term.
+        signs = (-1.0) ** np.arange(1, len(self.values) + 1)
+        return np.asarray((basis[..., 1:] - signs) * x[..., None] / 2)
+
+    def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
+        """Return the change and its derivative by theta."""
+        x, series = theta / self.theta_max, self._series()
+        z = 2 * x * x - 1
+        inner = np.polynomial.chebyshev.chebval(z, series)
+        slope = np.polynomial.chebyshev.chebval(z, np.polynomial.chebyshev.chebder(series))
+        return x * inner / 2, (inner + 4 * x * x * slope) / (2 * self.theta_max)
+
+    @property
+    def powers(self) -> tuple[float, ...]:
+        """Factors of theta^3, theta^5, ... of the same polynomial."""
+        z = np.polynomial.Polynomial([-1.0, 2.0])
+        inner = np.polynomial.Polynomial(np.polynomial.chebyshev.cheb2poly(self._series()))(z)
+        scaled = zip(inner.coef[1:].tolist(), itertools.count(3, 2), strict=False)
+        return tuple(factor / (2 * self.theta_max**power) for factor, power in scaled)
+
+    def _series(self) -> Array:
+        signs = (-1.0) ** np.arange(1, len(self.values) + 1)
+        return np.concatenate([[-float(np.dot(signs, self.values))], self.values])

@@ -8,15 +8,14 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 
 
 @dataclass(frozen=True)
-class SensorTiltEffect(Effect):
+class SensorTiltEffect(PlaneEffect):
     """Tilts about the image axes; first order, with the focal length as the image distance."""
 
     name: ClassVar[str] = 'sensor_tilt'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals along the radius, outward on one side of the image and inward on the other'
     )
@@ -29,8 +28,6 @@ class SensorTiltEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('about_x', 'rad', 0.01), Parameter('about_y', 'rad', 0.01))
 
-    def columns(self, scene: Scene) -> Array:
+    def plane_columns(self, scene: Scene) -> Array:
         m = scene.normalised()
-        focal = np.array([scene.lens.fx, scene.lens.fy])
-        about_x, about_y = m * m[..., 1:], -m * m[..., :1]
-        return np.asarray(np.stack([about_x, about_y], axis=-1) * focal[:, None])
+        return np.stack([m * m[..., 1:], -m * m[..., :1]], axis=-1)

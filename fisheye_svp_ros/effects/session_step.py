@@ -45,6 +45,9 @@ class SessionStepEffect(Effect):
     def joined(self, other: Self) -> Effect:
         return replace(self, starts=tuple(dict.fromkeys((*self.starts, *other.starts))))
 
+    def refocused(self, values: Array, ratio: float) -> Array:
+        return np.asarray((values.reshape(-1, len(_STEP)) / [ratio, 1.0, 1.0]).ravel())
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(

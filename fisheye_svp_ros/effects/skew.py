@@ -8,15 +8,14 @@ from typing import ClassVar
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
+from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 
 
 @dataclass(frozen=True)
-class SkewEffect(Effect):
+class SkewEffect(PlaneEffect):
     """A shear: u grows with v."""
 
     name: ClassVar[str] = 'skew'
-    stage: ClassVar[str] = 'image'
     signature: ClassVar[str] = (
         'residuals like a shear of the image: outward along one diagonal, inward along the other'
     )
@@ -29,7 +28,7 @@ class SkewEffect(Effect):
     def parameters(self) -> tuple[Parameter, ...]:
         return (Parameter('shear', '1', 0.01),)
 
-    def columns(self, scene: Scene) -> Array:
+    def plane_columns(self, scene: Scene) -> Array:
         column = np.zeros((*scene.uv.shape, 1))
-        column[..., 0, 0] = scene.normalised()[..., 1] * scene.lens.fx
+        column[..., 0, 0] = scene.normalised()[..., 1]
         return column

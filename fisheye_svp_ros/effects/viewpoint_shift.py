@@ -11,6 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.optics.lens import Lens
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,5 @@ class ViewpointShiftEffect(Effect):
         shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]
         return np.stack([shift, np.zeros_like(shift)], axis=-2)
 
-    def shift(self, values: Array) -> Gennery:
-        """Return the curve that adds to the lens's viewpoint shift."""
-        return Gennery(0.0, *values)
+    def curved(self, lens: Lens, values: Array) -> Lens:
+        return lens.with_shift(Gennery(0.0, *map(float, values)))

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
+from dataclasses import replace
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import yaml
 
+from fisheye_svp_ros.effects.catalogue import load_effects
+from fisheye_svp_ros.effects.extension import extend_lens
+from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import read_yaml, write_text
-from fisheye_svp_ros.optics.curves import (
-    IMAGE_HEIGHTS,
-    VIEWPOINT_SHIFTS,
-    ViewpointShift,
-    curve_name,
-)
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens
+from fisheye_svp_ros.optics.curve_base import Curve, SumOfShifts, ViewpointShift
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS, curve_name
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens, field_of_view
+
+C = TypeVar('C', bound=Curve)
+
+_FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
+           'target', 'calibration', 'provenance'}
+_OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
 def load_lens(path: str | Path) -> Lens:
@@ -27,98 +34,126 @@ def load_lens(path: str | Path) -> Lens:
 
 def save_lens(lens: Lens, path: str | Path) -> None:
     """Write a lens YAML that `load_lens` reads back to the same lens."""
-    write_text(path, yaml.safe_dump(lens_to_dict(lens), sort_keys=False))
+    document = lens_to_dict(lens)
+    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=99))
 
 
 def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
-    """Build a lens from the mapping of its YAML.  Raises LensError naming `where` and field."""
-    known = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'effects',
-             'calibration', 'provenance'}
-    _refuse_unknown(document, known, where)
+    """Build a lens from the mapping of its YAML; corrections go to their places in the lens.
+
+    Raises LensError naming `where` and field.
+    """
+    _refuse_unknown(document, _FIELDS, where, {_OLD})
     image = _section(document, 'image', where)
-    projection = dict(_section(document, 'projection', where))
-    kind = _registered(projection.pop('model', None), IMAGE_HEIGHTS, f'{where}: projection')
-    if 'f' in projection:
-        if 'fx' in projection or 'fy' in projection:
-            raise LensError(f'{where}: projection has both f and fx or fy; keep one of them')
-        projection['fx'] = projection['fy'] = projection.pop('f')
-    height_names = kind.coefficient_names
-    coefficients = _vector(projection.pop('k', []), f'{where}: projection.k')
-    if len(coefficients) > len(height_names):
-        raise LensError(f'{where}: projection.k has {len(coefficients)} values; '
-                        f'this model takes {len(height_names)}')
-    _refuse_unknown(projection, set(INTRINSICS), f'{where}: projection')
-    numbers = {name: _number(projection, name, f'{where}: projection') for name in INTRINSICS}
+    target = _effects(document, 'target', where)
+    Target.of(target, where)
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
         width=_pixels(image, 'width', f'{where}: image'),
         height=_pixels(image, 'height', f'{where}: image'),
-        image_height=kind(**dict(zip(height_names, coefficients, strict=False))),
-        max_incidence=np.radians(_number(document, 'max_incidence_deg', where)).item(),
+        **_projection(_section(document, 'projection', where), f'{where}: projection'),
+        max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
-        effects=_effects(document.get('effects'), where),
+        target=target,
         calibration=_calibration(document.get('calibration'), where),
-        **numbers,
     )
-    return check_lens(lens, where)
+    wrong = lens.check()
+    if wrong:
+        raise LensError(f'{where}: {wrong}')
+    given = document.get('max_incidence_deg')
+    if given is not None:
+        degrees = _number(document, 'max_incidence_deg', where)
+        lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
+    for name in (_OLD, 'corrections'):
+        lens = extend_lens(lens, load_effects(_effects(document, name, where), where))
+    return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
 
 
 def lens_to_dict(lens: Lens) -> dict[str, Any]:
     """Return the mapping of the lens's YAML."""
-    projection: dict[str, Any] = {'model': curve_name(lens.image_height)}
-    if lens.fx == lens.fy:
-        projection['f'] = lens.fx
-    else:
-        projection.update(fx=lens.fx, fy=lens.fy)
-    projection.update(cx=lens.cx, cy=lens.cy)
-    if lens.image_height.coefficients:
-        projection['k'] = list(lens.image_height.coefficients)
+    focal = {'f': lens.fx} if lens.fx == lens.fy else {'fx': lens.fx, 'fy': lens.fy}
+    kind, *k = _curve_to_dict(lens.image_height, 'k').items()
     document: dict[str, Any] = {
         'name': lens.name,
         'image': {'width': lens.width, 'height': lens.height},
-        'projection': projection,
+        'projection': dict([kind, *focal.items(), ('cx', lens.cx), ('cy', lens.cy), *k]),
         'max_incidence_deg': float(np.degrees(lens.max_incidence)),
     }
     if lens.viewpoint_shift is not None:
         document['viewpoint_shift'] = _shift_to_dict(lens.viewpoint_shift)
-    document['effects'] = dict(lens.effects)
+    document |= {'corrections': dict(lens.corrections), 'target': dict(lens.target)}
     if lens.calibration is not None:
         document['calibration'] = dict(lens.calibration)
     return document
 
 
+def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return what an image height and intrinsics are given by, as fields of a lens."""
+    values = dict(section)
+    if 'f' in values:
+        if 'fx' in values or 'fy' in values:
+            raise LensError(f'{where} has both f and fx or fy; keep one of them')
+        values['fx'] = values['fy'] = values.pop('f')
+    numbers = {name: _number(values, name, where) for name in INTRINSICS}
+    curve = {name: value for name, value in values.items() if name not in INTRINSICS}
+    return {**numbers, 'image_height': _curve(curve, IMAGE_HEIGHTS, 'k', 1, where)}
+
+
 def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
+    """Return a viewpoint shift, or the sum of a list of them."""
     if section is None:
         return None
-    if not isinstance(section, dict):
+    parts = section if isinstance(section, list) and section else [section]
+    if not all(isinstance(part, dict) for part in parts):
         raise LensError(f'{where}: viewpoint_shift must be a mapping with a model')
     place = f'{where}: viewpoint_shift'
+    first, *others = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
+    return reduce(ViewpointShift.plus, others, first)
+
+
+def _shift_to_dict(shift: ViewpointShift) -> Any:
+    parts = shift.parts if isinstance(shift, SumOfShifts) else (shift,)
+    entries = [_curve_to_dict(part, 'e') for part in parts]
+    return entries if len(entries) > 1 else entries[0]
+
+
+def _curve(
+    section: Mapping[str, Any], registry: Mapping[str, type[C]], listed: str, first: int,
+    where: str,
+) -> C:
+    """Return the curve of a section; a list stands for coefficients numbered from `first`."""
     values = dict(section)
-    kind = _registered(values.pop('model', None), VIEWPOINT_SHIFTS, place)
-    if 'e' in values:
-        e = _vector(values.pop('e'), f'{place}.e')
-        values.update({f'e{i}': value for i, value in enumerate(e)})
-    _refuse_unknown(values, set(kind.coefficient_names), place)
+    name = values.pop('model', None)
+    if not isinstance(name, str) or name not in registry:
+        raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
+    kind = registry[name]
+    numbered = _vector(values.pop(listed, []), f'{where}.{listed}')
+    known = kind.coefficient_names
+    most = sum(name.removeprefix(listed).isdigit() for name in known)
+    if len(numbered) > most:
+        raise LensError(f'{where}.{listed} has {len(numbered)} values; this model takes {most}')
+    values |= {f'{listed}{i}': value for i, value in enumerate(numbered, start=first)}
+    _refuse_unknown(values, set(known), where)
     try:
-        shift: ViewpointShift = kind(**{name: _number(values, name, place) for name in values})
+        return kind(**{name: _number(values, name, where) for name in values})
     except TypeError as cause:
-        needed = ', '.join(kind.coefficient_names)
-        raise LensError(f'{place}: a coefficient is missing; needed are {needed}') from cause
-    return shift
+        needed = ', '.join(known)
+        raise LensError(f'{where}: a coefficient is missing; needed are {needed}') from cause
 
 
-def _shift_to_dict(shift: ViewpointShift) -> dict[str, Any]:
-    values = dict(zip(shift.coefficient_names, shift.coefficients, strict=True))
-    e = [values.pop(name) for name in ('e0', 'e1', 'e2') if name in values]
-    return {'model': curve_name(shift), **values, **({'e': e} if e else {})}
+def _curve_to_dict(curve: Curve, listed: str) -> dict[str, Any]:
+    values = dict(zip(curve.coefficient_names, curve.coefficients, strict=True))
+    numbered = [values.pop(name) for name in tuple(values) if name.removeprefix(listed).isdigit()]
+    return {'model': curve_name(curve), **values, **({listed: numbered} if numbered else {})}
 
 
-def _effects(section: Any, where: str) -> dict[str, Any]:
-    if section is None:
-        return {}
-    if not isinstance(section, dict) or not all(isinstance(v, dict) for v in section.values()):
-        raise LensError(f'{where}: effects must map each effect name to its parameters')
-    return dict(section)
+def _effects(document: Mapping[str, Any], name: str, where: str) -> dict[str, Any]:
+    section = document.get(name) or {}
+    if not isinstance(section, dict) or not all(
+        isinstance(entry, dict) for key, entry in section.items() if key != LANDMARKS
+    ):
+        raise LensError(f'{where}: {name} must map each effect name to its parameters')
+    return section
 
 
 def _calibration(section: Any, where: str) -> dict[str, Any] | None:
@@ -154,14 +189,10 @@ def _vector(values: Any, where: str) -> list[float]:
     return [float(value) for value in values]
 
 
-def _registered(name: Any, registry: Mapping[str, Any], where: str) -> Any:
-    if not isinstance(name, str) or name not in registry:
-        raise LensError(f'{where}.model is {name!r}; known are {", ".join(registry)}')
-    return registry[name]
-
-
-def _refuse_unknown(mapping: Mapping[str, Any], known: set[str], where: str) -> None:
-    unknown = sorted(set(map(str, mapping)) - known)
+def _refuse_unknown(
+    mapping: Mapping[str, Any], known: set[str], where: str, unsaid: Set[str] = frozenset()
+) -> None:
+    unknown = sorted(set(map(str, mapping)) - known - unsaid)
     if unknown:
         raise LensError(f'{where}: unknown field {unknown[0]!r}; known are '
                         + ', '.join(sorted(known)))

@@ -31,6 +31,11 @@ class Row(NamedTuple):
             return 'one of ' + ', '.join(self.choices)
         return '' if self.low is None else f'{self.low:g} to {self.high:g}'
 
+    @property
+    def takes_booleans(self) -> bool:
+        """Whether a boolean, as YAML reads true and false, stands for one of the choices."""
+        return {'true', 'false'} <= set(self.choices)
+
     def check(self, value: Any) -> Any:
         """Return the value in the type of the default; raise ParameterError if not allowed."""
         if isinstance(self.default, tuple):
@@ -41,6 +46,8 @@ class Row(NamedTuple):
 
     def _check_one(self, value: Any, like: Any) -> Any:
         kind = type(like)
+        if self.takes_booleans and type(value) is bool:
+            value = str(value).lower()
         if kind is float and type(value) is int:
             value = float(value)
         if type(value) is not kind:

@@ -177,6 +177,8 @@ def descriptor(row: Row) -> Any:
     """Return the ParameterDescriptor of a row."""
     unit = f' [{row.unit}]' if row.unit else ''
     message = ParameterDescriptor(name=row.name, description=row.description + unit)
+    # A parameter of one type would not let both `auto` and YAML's true be given.
+    message.dynamic_typing = row.takes_booleans
     if row.choices:
         message.additional_constraints = row.constraint()
     if row.low is None or row.high is None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import parameter
@@ -76,7 +77,7 @@ class MeasuredCamera(CameraNode):
             rows=rows_by_frame(table),
             stamps=frame_stamps(table),
             poses=_true_poses(settings.true_poses, table),
-            lens=None if lens is None else kannala_brandt_equivalent(lens),
+            lens=None if lens is None else kannala_brandt_equivalent(ForwardModel(lens).lens),
         )
 
     def configure(self, recording: Recording) -> None:

@@ -29,6 +29,7 @@ from std_msgs.msg import ColorRGBA, Float64, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.clouds import (
     DATATYPES,
@@ -127,7 +128,7 @@ def read_image_points(message: Any, topic: str = 'image_points') -> ImagePoints:
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
     """Return CameraInfo as an SVP user has it: `equidistant` (Kannala-Brandt), k1 to k4."""
-    svp = kannala_brandt_equivalent(lens)
+    svp = kannala_brandt_equivalent(ForwardModel(lens).lens)
     k = [svp.fx, 0.0, svp.cx, 0.0, svp.fy, svp.cy, 0.0, 0.0, 1.0]
     message = CameraInfo(header=header(stamp, frame), width=lens.width, height=lens.height)
     message.distortion_model = 'equidistant'

@@ -114,7 +114,7 @@ class ModelCritic(SolverNode):
         if scenario != self._scenario:
             self._scenario, self._frames, self._judged = scenario, {}, False
             self._running = self._verdict = None
-        self._simulation = lens.svp() if self.settings.svp else lens
+        self._simulation = lens.svp() if self.settings.solves_svp else lens
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
         for old in sorted(self._frames)[: -self.settings.max_frames]:

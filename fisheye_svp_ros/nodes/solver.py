@@ -78,14 +78,17 @@ class SolverNode(BaseNode):
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
         if settings.lens:
-            model_of(settings.lens, 1.0, settings.svp)
+            model_of(settings.lens, 1.0, settings.solves_svp)
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
-        """Load the lens; do not wait for a scenario that nobody needs."""
-        self._model = model_of(settings.lens, 1.0, settings.svp) if settings.lens else None
+        """Load the lens and say which; do not wait for a scenario that nobody needs."""
+        self._model = model_of(settings.lens, 1.0, settings.solves_svp) if settings.lens else None
         if settings.lens and not self.BY_SCENARIO:
             self._join.expect_no_more('scenario')
+        lens = f'lens {settings.lens}' if settings.lens else 'lens that scenario names'
+        how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
+        self.get_logger().info(f'solving with the {lens} {how} (svp: {settings.svp})')
 
     @abstractmethod
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
@@ -95,7 +98,7 @@ class SolverNode(BaseNode):
         """Return the lens to solve with; raise ParameterError where nobody names one."""
         if self._model is not None:
             return self._model
-        return model_of(*self.lens(items), self.settings.svp)
+        return model_of(*self.lens(items), self.settings.solves_svp)
 
     def lens(self, items: Items) -> tuple[str, float]:
         """Return the lens to solve with, file or name, and the scale of its shift."""

@@ -10,6 +10,7 @@ import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from visualization_msgs.msg import MarkerArray
 
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, sweep_of
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
@@ -97,7 +98,7 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
         for number, swept in enumerate(sweep):
             scenario = changed(settings, swept)
             simulation = simulate_scenario(scenario, number, repetition)
-            svp_lens = kannala_brandt_equivalent(simulation.lens)
+            svp_lens = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
             table = simulation.observations
             rows_of = rows_by_frame(table)
             for frame in range(len(simulation.poses[0].position)):

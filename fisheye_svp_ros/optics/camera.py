@@ -74,6 +74,11 @@ class Rays(NamedTuple):
     theta: Array
     valid: Mask
 
+    def shaped(self, shape: tuple[int, ...]) -> Rays:
+        """Return as many rays in another leading shape."""
+        return Rays(self.origin.reshape(*shape, 3), self.direction.reshape(*shape, 3),
+                    self.theta.reshape(shape), self.valid.reshape(shape))
+
 
 def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     """Solve r cos(theta) - (Z - s(theta)) sin(theta) = 0 for points (..., 3), m.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.optics.curves import ImageHeight, Trigonometric, ViewpointShift, shift_at
+from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift, shift_at
 from fisheye_svp_ros.optics.formulas import approach
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -49,12 +49,13 @@ class Meeting(NamedTuple):
 
     def height(self, curve: ImageHeight) -> tuple[Array, Array]:
         """Return h/f and its derivative by theta."""
-        if not isinstance(curve, Trigonometric):
-            return curve.value_and_slope(self.theta)
+        return curve.from_sine(self.theta, self._sine)
+
+    def _sine(self) -> tuple[Array, Array]:
         if self.bent is not None:
-            return curve.formula(*self.bent[:2])
+            return self.bent[:2]
         inverse = 1.0 / np.sqrt(self.d2)
-        return curve.formula(self.r * inverse, self.z * inverse)
+        return self.r * inverse, self.z * inverse
 
     def change(self, outward: Array) -> Array:
         """Write dtheta/dr, 1/m, and return -dtheta/dZ / r, 1/m^2."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -71,8 +72,7 @@ def scaled_shift(lens: Lens, factor: float) -> Lens:
     shift = lens.viewpoint_shift
     if shift is None:
         return lens
-    names = shift.coefficient_names
-    return lens.with_parameters(names, [factor * value for value in shift.coefficients])
+    return replace(lens, viewpoint_shift=shift.scaled(factor))
 
 
 def calibrated_shift(lens: Lens) -> Lens:

@@ -5,7 +5,7 @@ The synthetic camera and the offline sweep read the same table, so they compute 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -150,12 +150,7 @@ def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
     shift = loaded.viewpoint_shift
     if shift is None or shift_scale == 1.0:
         return loaded
-    if shift_scale == 0.0:
-        return loaded.svp()
-    # Every shift is linear in its lengths; the refractive index is not one of them.
-    lengths = [name for name in shift.coefficient_names if name != 'refractive_index']
-    values = loaded.parameters
-    return loaded.with_parameters(lengths, [shift_scale * values[name] for name in lengths])
+    return replace(loaded, viewpoint_shift=shift.scaled(shift_scale) if shift_scale else None)
 
 
 def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:

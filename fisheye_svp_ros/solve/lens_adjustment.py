@@ -112,7 +112,7 @@ class _Adjustment:
     def _system(self, pose: Pose, values: Array) -> tuple[Array, Array, Array]:
         """Return the cost (V,), H (V, 6 + K, 6 + K) and g (V, 6 + K) of one adjustment."""
         lens = self._lens.with_parameters(self._names, values.tolist())
-        if min(lens.fx, lens.fy) <= 0 or lens.parameters.get('refractive_index', 2.0) <= 1:
+        if lens.check():
             count, columns = len(pose.position), 6 + len(values)
             hessian = np.broadcast_to(np.eye(columns), (count, columns, columns))
             return np.full(count, np.inf), hessian, np.zeros((count, columns))

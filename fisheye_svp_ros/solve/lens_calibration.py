@@ -11,8 +11,15 @@ import numpy as np
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
 from fisheye_svp_ros.optics.camera import back_project, incidence
-from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery, ViewpointShift
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens
+from fisheye_svp_ros.optics.curve_base import ViewpointShift
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery
+from fisheye_svp_ros.optics.lens import (
+    INTRINSICS,
+    Lens,
+    check_lens,
+    field_of_view,
+    monotone_limit,
+)
 from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import (
@@ -21,12 +28,7 @@ from fisheye_svp_ros.solve.lens_adjustment import (
     adjust_batch,
     parameter_values,
 )
-from fisheye_svp_ros.solve.lens_start import (
-    field_of_view,
-    focal_candidates,
-    monotone_limit,
-    thinned,
-)
+from fisheye_svp_ros.solve.lens_start import focal_candidates, thinned
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px, sigma_known
 

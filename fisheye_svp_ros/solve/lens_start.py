@@ -8,7 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics.camera import back_project, project
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, field_of_view, monotone_limit
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views, views_of
 from fisheye_svp_ros.solve.initial_pose import initial_poses
@@ -18,23 +18,6 @@ from fisheye_svp_ros.solve.initial_pose import initial_poses
 _CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
 _VIEWS, _POINTS = 20, 60  # enough for a start
 _GOLDEN = (np.sqrt(5) - 1) / 2
-_INSIDE = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
-
-
-def field_of_view(lens: Lens) -> float:
-    """Return the incidence angle of the farthest image corner, rad, within the monotone range."""
-    u = max(lens.cx + 0.5, lens.width - 0.5 - lens.cx) / lens.fx
-    v = max(lens.cy + 0.5, lens.height - 0.5 - lens.cy) / lens.fy
-    corner = float(lens.image_height.angle(np.asarray(np.hypot(u, v))))
-    return min(corner, monotone_limit(lens))
-
-
-def monotone_limit(lens: Lens) -> float:
-    """Return the angle, rad, just inside which both curves of the lens can be used."""
-    limit = lens.image_height.limit
-    if lens.viewpoint_shift is not None:
-        limit = min(limit, lens.viewpoint_shift.limit)
-    return limit * _INSIDE
 
 
 def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:

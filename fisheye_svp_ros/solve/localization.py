@@ -32,6 +32,7 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
+    model = model.seeing(views)
     if start is None:
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)

@@ -57,6 +57,7 @@ def calibrate_stereo(
     Raises GeometryError, naming the frame, where a view has too few points in both cameras, and
     where no view of a system can be posed in both.
     """
+    left, right = left.seeing(left_views), right.seeing(right_views)
     pose, rig = start or _starts(left, right, left_views, right_views, systems)
     solved = _solved((left, right), (left_views, right_views), (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])

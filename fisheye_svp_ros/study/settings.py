@@ -43,7 +43,11 @@ class SolverSettings(Settings):
         '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
         '`scenario` names'
     )
-    svp: bool = parameter(True, 'Solve with the single-viewpoint approximation of the lens')
+    svp: str = parameter(
+        'auto', 'Solve with the single-viewpoint approximation of the lens; auto: of one that '
+        '`scenario` names, but with a lens named here as it stands',
+        choices=('auto', 'true', 'false')
+    )
     sigma_px: float = parameter(
         1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
     )
@@ -51,6 +55,11 @@ class SolverSettings(Settings):
         2.0, 'How long image points wait for what shares their stamp on other topics', 's',
         (0.0, 3600.0)
     )
+
+    @property
+    def solves_svp(self) -> bool:
+        """Whether to solve without the viewpoint shift of the lens."""
+        return self.svp == 'true' or (self.svp == 'auto' and not self.lens)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
             raise ParameterError(f'{name}: rig is {table.rig!r}; a sweep measures with the true '
                                  'rig, whatever came last on a topic')
         if table.lens:
-            model_of(table.lens, 1.0, table.svp)
+            model_of(table.lens, 1.0, table.solves_svp)
     check_sweep(base, sweep)
     return Plan(base, sweep, tables)
 

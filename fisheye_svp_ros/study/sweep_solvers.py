@@ -79,8 +79,8 @@ def _sets(batch: Batch) -> _Sets:
 
 def _model(batch: Batch, settings: SolverSettings) -> ForwardModel:
     if settings.lens:
-        return model_of(settings.lens, 1.0, settings.svp)
-    return model_of(batch.lens, batch.shift_scale, settings.svp)
+        return model_of(settings.lens, 1.0, settings.solves_svp)
+    return model_of(batch.lens, batch.shift_scale, settings.solves_svp)
 
 
 def _chunks(index: Index) -> list[Index]:

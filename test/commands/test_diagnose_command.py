@@ -14,6 +14,8 @@ from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.points import point_residuals
 from fisheye_svp_ros.diagnosis.structure import Structure
+from fisheye_svp_ros.effects.catalogue import load_effects
+from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.io.csv_table import Table
@@ -46,7 +48,7 @@ def seen(effects, seed=3, frames=FRAMES):
     """Return observations and poses of a camera with hidden effects."""
     rng = np.random.default_rng(seed)
     poses = poses_around(landmarks(), frames, rng, widest=1.4, distance=(0.8, 1.3), tilt=60)
-    model = ForwardModel(replace(LENS, effects=effects))
+    model = ForwardModel(extend_lens(LENS, load_effects(effects, LENS.name)))
     table = simulate(model, landmarks(), poses, 0.05, rng, t=np.arange(frames) / 10)
     return replace(table, sigma=np.full(len(table), np.nan)), poses
 
@@ -108,7 +110,8 @@ class TestFiles:
 
     def test_the_extended_lens_solves_better(self, scene, output, tmp_path):
         lens = load_lens(output / 'extended_lens.yaml')
-        assert list(lens.effects) == ['viewpoint_shift']
+        assert lens.viewpoint_shift.e0 == pytest.approx(0.002, rel=0.05)
+        assert lens.corrections == {}
         figures = []
         for path in (scene / 'lens.yaml', output / 'extended_lens.yaml'):
             assert cli.main(['localize', str(scene / 'shift.csv'), '--lens', str(path),
@@ -264,7 +267,7 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
 
 def test_the_depth_of_a_rig_gains_too():
     rng = np.random.default_rng(5)
-    model = ForwardModel(replace(LENS, effects=SHIFT))
+    model = ForwardModel(extend_lens(LENS, load_effects(SHIFT, LENS.name)))
     rig = Pose(rotation_from_vector(np.array([0.0, 0.1, 0.0])), np.array([-0.15, 0.0, 0.0]))
     poses = poses_around(landmarks(), 8, rng, widest=1.2, distance=(0.8, 1.3), tilt=60)
     table = simulate_stereo(model, model, landmarks(), rig, poses, 0.05, rng)

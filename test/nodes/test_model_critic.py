@@ -20,6 +20,8 @@ from std_msgs.msg import Float64  # isort: skip
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.lock_step import values
 from fisheye_svp_ros.commands.processes import Processes
+from fisheye_svp_ros.effects.catalogue import load_effects
+from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -52,7 +54,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     poses = poses_around(landmarks, FRAMES, rng, widest=1.4, distance=(0.8, 1.2), tilt=60)
     write_poses(folder / 'poses.csv', np.arange(FRAMES), poses)
     save_lens(LENS, folder / 'given.yaml')
-    save_lens(replace(LENS, name='hidden', effects=SHIFT), folder / 'hidden.yaml')
+    hidden = extend_lens(replace(LENS, name='hidden'), load_effects(SHIFT, 'hidden'))
+    save_lens(hidden, folder / 'hidden.yaml')
     return folder
 
 
@@ -173,13 +176,13 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
         processes.wait(['replay'], TIMEOUT)
         assert until(lambda: (a := ask()).success and a).message == str(extended)
         processes.stop('critic')
-        assert 'viewpoint_shift' in load_lens(extended).effects
+        assert load_lens(extended).viewpoint_shift is not None
 
         processes.start('recorder', ['record', '-o', str(errors)])
         for name, lens in (('before', scene / 'given.yaml'), ('after', extended)):
             processes.start(name, [
                 'run', 'localizer', '--ros-args', '-r', f'__node:={name}',
-                *values(lens=lens, svp='false', wait_for_subscribers=2)])
+                *values(lens=lens, wait_for_subscribers=2)])
             processes.start('replay', [*replay, *values(
                 true_poses=scene / 'poses.csv', lock_step=f'{name}/result',
                 wait_for_subscribers=2)])

@@ -15,6 +15,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import Row, changed, rows, sweep_of
 from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.simulate.scenario import Scenario
+from fisheye_svp_ros.study.settings import SolverSettings
 
 OBSERVATIONS = 'frame,landmark,u,v,x,y,z\n' + ''.join(
     f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1\n' for i in range(6)
@@ -115,8 +116,27 @@ def test_a_value_that_cannot_be_used_is_refused_with_the_reason(
 def test_a_good_value_is_taken_into_use(start: Callable[..., Any]) -> None:
     node = start('localizer')
     assert set_parameter(node, 'lens', 'fish180').successful
-    assert set_parameter(node, 'svp', False).successful
-    assert node.settings.lens == 'fish180' and node.settings.svp is False
+    assert set_parameter(node, 'svp', True).successful
+    assert node.settings.lens == 'fish180' and node.settings.svp == 'true'
+
+
+@pytest.mark.parametrize(('arguments', 'solves_svp', 'said'), [
+    ((), True, 'the lens that scenario names without its viewpoint shift (svp: auto)'),
+    (('lens:=fish180',), False, 'the lens fish180 as it stands (svp: auto)'),
+    (('lens:=fish180', 'svp:=true'), True, 'lens fish180 without its viewpoint shift (svp: true)'),
+    (('lens:=fish180', "svp:='true'"), True, 'without its viewpoint shift (svp: true)'),
+    (('svp:=false',), False, 'the lens that scenario names as it stands (svp: false)'),
+])
+def test_a_node_says_which_lens_it_solves_with(
+    arguments: tuple[str, ...], solves_svp: bool, said: str, start: Callable[..., Any],
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    node = start('localizer', *(word for one in arguments for word in ('-p', one)))
+    assert node.settings.solves_svp is solves_svp
+    if node.settings.lens:
+        shift = node.model({}).lens.viewpoint_shift
+        assert (shift is None) is solves_svp
+    assert said in ' '.join(capfd.readouterr().err.split())
 
 
 @pytest.mark.parametrize(('argument', 'reason'), [
@@ -140,6 +160,17 @@ def test_a_node_does_not_start_with_what_it_cannot_use(
     with pytest.raises((FisheyeSvpError, ParameterException)) as caught:
         start('synthetic_camera', '-p', argument)
     assert reason in str(caught.value)
+
+
+def test_svp_is_one_of_three_words(start: Callable[..., Any]) -> None:
+    with pytest.raises(ParameterError, match=r"^svp is 'maybe'; allowed is one of auto, true"):
+        start('localizer', '-p', 'svp:=maybe')
+    table = SolverSettings()
+    assert [changed(table, {'svp': value}).svp for value in (True, False, 'auto')] == [
+        'true', 'false', 'auto'
+    ]
+    with pytest.raises(ParameterError, match='lens is True; str is needed'):
+        changed(table, {'lens': True})
 
 
 def test_an_empty_list_to_sweep_is_refused() -> None:

@@ -290,7 +290,7 @@ class Sets:
 
 @pytest.fixture
 def sets(graph: Callable[..., Graph]) -> Sets:
-    return Sets(graph('lens:=fish214', 'patience:=60.0'))
+    return Sets(graph('lens:=fish214', 'svp:=true', 'patience:=60.0'))
 
 
 def test_the_truth_may_come_first_or_last(sets: Sets) -> None:
@@ -318,7 +318,7 @@ def test_landmarks_of_another_set_never_stand_in(sets: Sets) -> None:
 
 
 def test_landmarks_published_once_hold_for_all_sets(graph: Callable[..., Graph]) -> None:
-    sets = Sets(graph('lens:=fish214', 'patience:=0.2'))
+    sets = Sets(graph('lens:=fish214', 'svp:=true', 'patience:=0.2'))
     sets.tell_landmarks(7, 2.0)
     for stamp in (100, 200):
         sets.tell_points(stamp, 2.0)
@@ -328,7 +328,7 @@ def test_landmarks_published_once_hold_for_all_sets(graph: Callable[..., Graph])
 
 
 def test_without_the_truth_there_are_no_errors_but_a_pose(graph: Callable[..., Graph]) -> None:
-    sets = Sets(graph('lens:=fish214', 'patience:=0.2'))
+    sets = Sets(graph('lens:=fish214', 'svp:=true', 'patience:=0.2'))
     sets.tell_landmarks(0, 2.0)
     sets.tell_points(3, 2.0)
     result = sets.result(3)
@@ -356,7 +356,7 @@ def test_a_camera_that_jumps_is_found_again(graph: Callable[..., Graph]) -> None
 
 
 def test_points_without_landmarks_are_dropped(graph: Callable[..., Graph]) -> None:
-    sets = Sets(graph('lens:=fish214', 'patience:=0.2'))
+    sets = Sets(graph('lens:=fish214', 'svp:=true', 'patience:=0.2'))
     sets.tell_points(3, 2.0)
     assert sets.result(3) == {}
     assert 'no landmarks; publish them on `landmarks`' in sets.results[0].status[0].message

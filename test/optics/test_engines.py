@@ -11,12 +11,12 @@ from helpers.lenses import LENSES, points_around, points_on_rays
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.ray_curves import SumOfShifts
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.camera import project, project_with_jacobian
+from fisheye_svp_ros.optics.curve_base import SumOfShifts
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery
 from fisheye_svp_ros.optics.engines import marquardt, numpy_engine
 from fisheye_svp_ros.optics.lens import Lens
@@ -216,7 +216,7 @@ def test_what_is_not_plain_sailing_goes_to_the_reference(compiled, engine):
 
 
 def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
-    shift = SumOfShifts(FISH214.viewpoint_shift, (Gennery(0.001),))
+    shift = SumOfShifts((FISH214.viewpoint_shift, Gennery(0.001)))
     lens = replace(FISH214, viewpoint_shift=shift)
     points = points_around(np.random.default_rng(96), 50, 0.3, 2.0, 90.0)
     assert compiled.packed(lens) is None

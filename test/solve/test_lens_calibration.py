@@ -13,12 +13,11 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery, KannalaBrandt
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.lens_adjustment import adjust
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.lens_start import field_of_view
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured import localize_measured, posable_views, rms_px
 
