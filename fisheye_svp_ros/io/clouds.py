@@ -1,4 +1,4 @@
-"""Stamps, and sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
+"""sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
 
 Messages come as rclpy, the standalone client or a bag reader made them: only attributes count.
 """
@@ -22,15 +22,13 @@ RESIDUALS = np.dtype([
     *IMAGE_POINTS.descr, ('du', '<f8'), ('dv', '<f8'), ('theta', '<f8'), ('range', '<f8')
 ])
 
+LARGEST = 1e12  # m or px; squares and products of anything larger are soon no numbers
+_LONGEST = 1 << 16  # bytes of a point
+_MOST_FIELDS = 100
+
 # sensor_msgs/PointField: datatype numbers.
 DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 _KINDS = {'u': ('iu', 'a whole number'), 'f': ('f', 'a floating-point number')}
-
-
-def stamp_of(message: Any) -> int:
-    """Return the stamp of a message with a header, ns."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
 def structured(layout: np.dtype[np.void], landmark: Index, *columns: Array) -> Points:
@@ -62,7 +60,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
             bad = int(np.argmin(usable))
             raise ObservationError(
                 f'{what}: field {name!r} of point {bad} is {raw[name][bad]}; leave out '
-                'points without a value'
+                f'points without a value, or beyond {LARGEST:g}'
             )
         points[name] = raw[name]
     if len(set(points['landmark'].tolist())) < len(points):
@@ -73,7 +71,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
 
 def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool_]:
     if kind.kind == 'f':
-        return np.asarray(np.isfinite(values))
+        return np.asarray(np.abs(values) <= LARGEST)  # not so for NaN
     if values.dtype == kind:
         return np.ones(values.shape, dtype=bool)
     return np.asarray((values >= 0) & (values <= np.iinfo(kind).max))
@@ -81,6 +79,11 @@ def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool
 
 def _raw_points(cloud: Any, what: str) -> Points:
     step, count = int(cloud.point_step), int(cloud.width) * int(cloud.height)
+    if step > _LONGEST or len(cloud.fields) > _MOST_FIELDS:
+        raise ObservationError(
+            f'{what}: {len(cloud.fields)} fields in a point of {step} bytes; at most '
+            f'{_MOST_FIELDS} in {_LONGEST} are read'
+        )
     fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields)
     layout = _layout(fields, step, bool(cloud.is_bigendian), what)
     if len(cloud.data) != step * count:

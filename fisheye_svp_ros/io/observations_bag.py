@@ -10,7 +10,12 @@ import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.clouds import IMAGE_POINTS, LANDMARKS, Points, stamp_of, unpack
+from fisheye_svp_ros.io.decoding import (
+    ImagePoints,
+    read_image_points,
+    read_landmarks,
+    stamp_of,
+)
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
@@ -21,7 +26,7 @@ _NAMES = ('landmarks', 'image_points')
 class _Set(NamedTuple):
     stamp: int
     camera: str
-    points: Points
+    points: ImagePoints
 
 
 def read(path: str | Path) -> Observations:
@@ -35,16 +40,14 @@ def read(path: str | Path) -> Observations:
     worlds: set[str] = set()
     sets: list[_Set] = []
     for record in bag.records(_is_wanted):
-        stamp = stamp_of(record.message)
         namespace, _, name = record.topic.rpartition('/')
         where = f'{path}, {record.topic}'
+        stamp = stamp_of(record.message, where)
         if name == 'landmarks':
             worlds.add(namespace)
-            cloud = unpack(record.message, LANDMARKS, where)
-            xyz = np.stack([cloud[axis] for axis in 'xyz'], axis=-1)
-            landmarks[stamp] = Landmarks(cloud['landmark'].astype(np.int64), xyz)
+            landmarks[stamp] = read_landmarks(record.message, where).landmarks
         else:
-            sets.append(_Set(stamp, namespace, unpack(record.message, IMAGE_POINTS, where)))
+            sets.append(_Set(stamp, namespace, read_image_points(record.message, where)))
     if len(worlds) != 1 or not sets:
         found = ', '.join(sorted(worlds)) or 'none'
         raise ObservationError(
@@ -60,14 +63,12 @@ def _table(
     stamps = sorted({one.stamp for one in sets})
     frames = {stamp: frame for frame, stamp in enumerate(stamps)}
     cameras = tuple(dict.fromkeys(one.camera.removeprefix(world).lstrip('/') for one in sets))
-    counts = [len(one.points) for one in sets]
-    ids = np.concatenate([one.points['landmark'] for one in sets]).astype(np.int64)
-    uv = [np.stack([one.points['u'], one.points['v']], axis=-1) for one in sets]
+    counts = [len(one.points.landmark) for one in sets]
     names = [cameras.index(one.camera.removeprefix(world).lstrip('/')) for one in sets]
     return make_observations(
         np.repeat([frames[one.stamp] for one in sets], counts),
-        ids,
-        np.concatenate(uv),
+        np.concatenate([one.points.landmark for one in sets]),
+        np.concatenate([one.points.uv for one in sets]),
         np.concatenate([_places(one, landmarks, source) for one in sets]),
         camera=np.repeat(names, counts),
         t=np.repeat([one.stamp / 1e9 for one in sets], counts),
@@ -80,9 +81,9 @@ def _places(one: _Set, landmarks: dict[int, Landmarks], source: str) -> Any:
     """Return the landmarks (N, 3) of a set: those of its stamp, or the latest before it."""
     known = sorted(landmarks)
     place = max(bisect_right(known, one.stamp) - 1, 0)
-    points, found = landmarks[known[place]].lookup(one.points['landmark'].astype(np.int64))
+    points, found = landmarks[known[place]].lookup(one.points.landmark)
     if not found.all():
-        missing = one.points['landmark'][~found][0]
+        missing = one.points.landmark[~found][0]
         raise ObservationError(
             f'{source}: landmark {missing} of {one.camera}/image_points is not in the landmarks'
         )

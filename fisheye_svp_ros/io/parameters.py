@@ -15,7 +15,10 @@ S = TypeVar('S')
 
 
 class Row(NamedTuple):
-    """One parameter: its default gives the type; low to high is the range, ends included."""
+    """One parameter: its default gives the type; low to high is the range, ends included.
+
+    fixed: it holds for the life of a node; file: it may name a file.
+    """
 
     name: str
     default: Any
@@ -24,6 +27,8 @@ class Row(NamedTuple):
     low: float | None = None
     high: float | None = None
     choices: tuple[str, ...] = ()
+    fixed: bool = False
+    file: bool = False
 
     def constraint(self) -> str:
         """Say what values are allowed beyond the type; empty for any."""
@@ -66,10 +71,13 @@ def parameter(
     unit: str = '',
     span: tuple[float, float] | None = None,
     choices: tuple[str, ...] = (),
+    *,
+    fixed: bool = False,
+    file: bool = False,
 ) -> Any:
     """Return a dataclass field that is a row of the table; span: smallest and largest value."""
     low, high = span or (None, None)
-    row = Row('', default, description, unit, low, high, choices)
+    row = Row('', default, description, unit, low, high, choices, fixed, file)
     return field(default=default, metadata={'row': row})
 
 

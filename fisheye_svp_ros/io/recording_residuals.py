@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.clouds import RESIDUALS, Points, stamp_of, unpack
+from fisheye_svp_ros.io.clouds import Points
+from fisheye_svp_ros.io.decoding import columns, read_key_values, read_residuals, stamp_of
 
 
 class ResidualField(NamedTuple):
@@ -39,12 +38,12 @@ def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
     tags: dict[tuple[str, int], dict[str, str]] = {}
     clouds: dict[tuple[str, int], Points] = {}
     for record in records:
-        when = stamp_of(record.message)
+        when = stamp_of(record.message, record.topic)
         if record.topic.endswith('/scenario'):
             namespace = record.topic.removesuffix('/scenario')
-            tags[namespace, when] = {p.key: p.value for p in record.message.status[0].values}
+            tags[namespace, when] = read_key_values(record.message, record.topic)
         else:
-            clouds[record.topic, when] = unpack(record.message, RESIDUALS, record.topic)
+            clouds[record.topic, when] = read_residuals(record.message, record.topic)
     return [
         ResidualSet(topic, when, points,
                     tags.get((topic.removesuffix('/localizer/residuals'), when), {}))
@@ -57,6 +56,5 @@ def residual_field(one: ResidualSet) -> ResidualField:
     points = one.points
     return ResidualField(
         one.tags['lens'], float(one.tags['radius']),
-        np.stack([points['u'], points['v']], axis=-1),
-        np.stack([points['du'], points['dv']], axis=-1),
+        columns(points, ('u', 'v')), columns(points, ('du', 'dv')),
     )

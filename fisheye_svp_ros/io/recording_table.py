@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
-from fisheye_svp_ros.io.clouds import stamp_of
+from fisheye_svp_ros.io.decoding import stamp_of, statuses
 
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
@@ -40,15 +40,14 @@ def tabulate(records: Iterable[_Record]) -> Columns:
     results: list[tuple[str, int, dict[str, str]]] = []
     for record in records:
         base, _, name = record.topic.rpartition('/')
-        stamp = stamp_of(record.message)
-        values = {pair.key: pair.value for status in record.message.status
-                  for pair in status.values}
+        stamp, told = stamp_of(record.message, record.topic), statuses(record.message)
+        values = {key: value for status in told for key, value in status.values.items()}
         if name == 'scenario':
             tags[base, stamp] = values
         else:
-            level = max((_level(status.level) for status in record.message.status), default=0)
-            note = '; '.join(status.message for status in record.message.status)
-            results.append((base, stamp, {**values, **({'note': note} if level else {})}))
+            note = '; '.join(status.text for status in told)
+            bad = any(status.level for status in told)
+            results.append((base, stamp, {**values, **({'note': note} if bad else {})}))
     bases = {base for base, _ in tags}
     rows = {key: dict(values) for key, values in tags.items()}
     for node, stamp, values in results:
@@ -83,7 +82,3 @@ def _typed(cells: list[str | None]) -> list[Any]:
         except ValueError:
             continue
     return cells
-
-
-def _level(level: Any) -> int:
-    return level[0] if isinstance(level, bytes) else int(level)

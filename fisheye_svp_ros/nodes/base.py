@@ -2,36 +2,51 @@
 
 from __future__ import annotations
 
+import functools
 import signal
+import struct
 import sys
-from collections.abc import Callable
+import traceback
+from collections import deque
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
     ParameterDescriptor,
     SetParametersResult,
 )
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 
-from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.clouds import stamp_of
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.io.decoding import nanoseconds
 from fisheye_svp_ros.io.parameters import Row, changed, rows
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.study.settings import Settings
 
-# All topics are reliable; deep enough for a burst of inputs while a solver is busy.
+# All topics are reliable; inputs are deep enough for what comes while a solver is busy.
 RELIABLE = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+INPUT = QoSProfile(depth=1000)
 LATCHED_INPUT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
+_OF_ROS = ('use_sim_time', 'start_type_description_service')
+_OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
+               QoSPolicyKind.DURABILITY)
+_KINDS_OF_ERRORS = 100  # that are told from each other
+_TWINS = 100  # messages of which one of two subscriptions may be ahead of the other
 
 S = TypeVar('S', bound=Settings)
 T = TypeVar('T')
@@ -47,24 +62,62 @@ class Finished(Exception):
     """A node has done all that it was started for."""
 
 
+class Failed(Finished):
+    """A node cannot go on with what it was started for."""
+
+
+class Unread(NamedTuple):
+    """A message that has come and is not decoded yet."""
+
+    topic: str
+    kind: Any
+    data: bytes
+    decode: Callable[[Any, str], Any]
+
+    @property
+    def stamp(self) -> int:
+        """The stamp of its header, which every message starts with that a node listens to, ns."""
+        order = '<' if self.data[1] & 1 else '>'
+        sec, nanosec = struct.unpack_from(f'{order}iI', self.data, 4)
+        return nanoseconds(sec, nanosec, self.topic)
+
+    def read(self) -> Any:
+        """Return what it holds; raise ObservationError where it cannot be used."""
+        try:
+            message = deserialize_message(self.data, self.kind)
+        except Exception as cause:
+            kind = self.kind.__name__
+            raise ObservationError(f'{self.topic}: not a {kind} ({cause})') from cause
+        return self.decode(message, self.topic)
+
+
 class BaseNode(Node):  # type: ignore[misc]
     """A node whose parameters are the table `SETTINGS`.
 
     A subclass creates its topics, then calls `start()`; `configure` gets every valid new table.
+    Every callback is a boundary: nothing that comes from outside ends the node.
     """
 
     NAME: ClassVar[str]
     SETTINGS: ClassVar[type[Settings]]
 
     def __init__(self) -> None:
-        super().__init__(self.NAME)
+        super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+        # The public way to learn what was given; what is known is declared anew, with its type.
+        self.given = {name: parameter.value
+                      for name, parameter in self.get_parameters_by_prefix('').items()
+                      if name not in _OF_ROS}
+        for name in self.given:
+            self.undeclare_parameter(name)
         self.settings = declare(self, self.SETTINGS)
         self._inputs: dict[str, _Input] = {}
         self._complaint = ''
+        self._unforeseen: set[tuple[object, ...]] = set()
+        self._failures = 0
         self._candidate: tuple[Settings, Any] | None = None
         self._waited_for: list[Any] = []
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', RELIABLE)
-        self.create_timer(1.0, self._publish_diagnostics)
+        self._diagnostics = self.announce(DiagnosticArray, '/diagnostics')
+        self.every(1.0, self._publish_diagnostics)
 
     def start(self) -> None:
         """Take the initial parameters into use, and every later change of them.
@@ -74,22 +127,56 @@ class BaseNode(Node):  # type: ignore[misc]
         self._warn_of_unknown_parameters()
         self.configure(self.prepare(self.settings))
         self.add_on_set_parameters_callback(self._consider)
-        self.add_post_set_parameters_callback(self._adopt)
+        self.add_post_set_parameters_callback(self.guarded(self._adopt))
 
     def prepare(self, settings: Any) -> Any:
         """Return what `configure` needs; raise FisheyeSvpError to refuse the settings."""
         return settings
 
     def configure(self, prepared: Any) -> None:
-        """Take new settings into use."""
+        """Take new settings into use; nothing in it may fail."""
 
-    def knows(self, parameter: str) -> bool:
-        """Say whether a parameter given from outside means something to this node."""
-        return bool(self.has_parameter(parameter))
+    def guarded(self, callback: Callable[..., T]) -> Callable[..., T | None]:
+        """Return a callback that what goes wrong in it does not get out of.
+
+        Bad input is named in the log and on /diagnostics; an error of this package is logged with
+        its traceback, once, and counted.  The callback then returns its last argument, which is
+        the response of a service.
+        """
+
+        @functools.wraps(callback)
+        def run(*arguments: Any) -> T | None:
+            try:
+                return callback(*arguments)
+            except Finished:
+                raise
+            except FisheyeSvpError as error:
+                self._complain(error)
+            except Exception as error:
+                self.unforeseen(error)
+            return arguments[-1] if arguments else None
+
+        return run
+
+    def unforeseen(self, error: Exception) -> None:
+        """Count an error that nobody has thought of; log it once, with its traceback."""
+        if not self.context.ok():
+            return  # a signal ended the context between two calls: what fails then is no failure
+        self._failures += 1
+        last = traceback.extract_tb(error.__traceback__)[-1:]
+        kind = (type(error), *((frame.filename, frame.lineno) for frame in last))
+        if kind not in self._unforeseen and len(self._unforeseen) < _KINDS_OF_ERRORS:
+            self._unforeseen.add(kind)
+            text = ''.join(traceback.format_exception(error)).rstrip()
+            self.get_logger().error(f'internal error, told once: {text}')
+
+    def every(self, period: float, callback: Callable[[], None]) -> Any:
+        """Have a function called every `period` seconds."""
+        return self.create_timer(period, self.guarded(callback))
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""
-        publisher = self.create_publisher(kind, topic, qos)
+        publisher = self._with_qos(self.create_publisher, kind, topic, qos=qos)
         if wait:
             self._waited_for.append(publisher)
         return publisher
@@ -105,35 +192,84 @@ class BaseNode(Node):  # type: ignore[misc]
         topic: str,
         read: Callable[[Any, str], T],
         use: Callable[[int, T], None],
-        qos: Any = RELIABLE,
+        qos: Any = INPUT,
     ) -> None:
         """Subscribe: `read` decodes a message, `use` gets its stamp (ns) and what was read.
 
         A message that either of them refuses is logged, dropped and counted.
         """
-        self._inputs[topic] = _Input()
+        self.collect(kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), qos)
 
-        def receive(message: Any) -> None:
-            self._inputs[topic].received += 1
+    def collect(
+        self,
+        kind: Any,
+        topic: str,
+        read: Callable[[Any, str], Any],
+        use: Callable[[int, Unread], None],
+        qos: Any = INPUT,
+    ) -> None:
+        """Subscribe, as `listen` does, but leave it to `use` whether a message is decoded."""
+        count = self._inputs[topic] = _Input()
+
+        def receive(data: bytes) -> None:
+            count.received += 1
             try:
-                use(stamp_of(message), read(message, topic))
+                unread = Unread(topic, kind, bytes(data), read)
+                use(unread.stamp, unread)
+            except Finished:
+                raise
             except FisheyeSvpError as error:
                 self.drop(topic, error)
+            except Exception as error:
+                count.dropped += 1
+                self.unforeseen(error)
 
-        self.create_subscription(kind, topic, receive, qos)
+        create = functools.partial(self._with_qos, self.create_subscription, kind, topic)
+        if qos.durability != DurabilityPolicy.TRANSIENT_LOCAL:
+            create(receive, qos=qos, raw=True)
+            return
+        # Only what is latched comes late; only a volatile subscription hears what is not.
+        latched, volatile = twins(receive)
+        create(latched, qos=qos, raw=True)
+        create(volatile, qos=QoSProfile(depth=qos.depth), entity='volatile', raw=True)
 
-    def drop(self, topic: str, error: FisheyeSvpError) -> None:
+    def _with_qos(
+        self, create: Callable[..., Any], *arguments: Any, qos: Any, entity: str | None = None,
+        **more: Any,
+    ) -> Any:
+        """Create a publisher or subscription of which parameters may override the QoS."""
+        options = QoSOverridingOptions(_OVERRIDDEN, entity_id=entity)
+        try:
+            # A copy, because rclpy changes the profile that it is given.
+            return create(*arguments, copy(qos), qos_overriding_options=options, **more)
+        except RuntimeError as cause:
+            if not self.context.ok():
+                raise
+            raise ParameterError(f'{arguments[1]}: {cause}') from cause
+
+    def drop(self, topic: str, error: Exception) -> None:
         """Count and log an input that cannot be used."""
         self._inputs[topic].dropped += 1
+        self._complain(error)
+
+    def _complain(self, error: Exception) -> None:
         self._complaint = str(error)
         self.get_logger().warning(f'dropped: {error}', throttle_duration_sec=1.0)
 
     def _consider(self, parameters: list[Any]) -> Any:
+        self._candidate = None
         try:
-            settings = changed(self.settings, {p.name: p.value for p in parameters})
+            values = {p.name: p.value for p in parameters}
+            for row in rows(self.SETTINGS):
+                if row.file and isinstance(values.get(row.name), str):
+                    allowed(values[row.name], self.settings.folder, row.name)
+            settings = changed(self.settings, values)
             self._candidate = settings, self.prepare(settings)
         except FisheyeSvpError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:
+            self.unforeseen(error)
+            return SetParametersResult(successful=False, reason=f'internal error: {error!r:.200}')
         return SetParametersResult(successful=True)
 
     def _adopt(self, parameters: list[Any]) -> None:
@@ -144,21 +280,48 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def _warn_of_unknown_parameters(self) -> None:
         known = ', '.join(row.name for row in rows(self.SETTINGS))
-        for name in self._parameter_overrides:
-            if not (self.knows(name) or name.startswith('qos_overrides.')):
+        for name in self.given:
+            # Those topics come and go with what there is to tell.
+            if not self.has_parameter(name) and '/metrics/' not in name:
                 self.get_logger().warning(
                     f'parameter {name!r} means nothing to this node; it knows {known}'
                 )
+
+    def report(self) -> tuple[Mapping[str, object], str]:
+        """Return what else there is to count, and what is wrong right now."""
+        return {}, ''
 
     def _publish_diagnostics(self) -> None:
         counts: dict[str, object] = {}
         for topic, count in self._inputs.items():
             counts |= {f'{topic}: received': count.received, f'{topic}: dropped': count.dropped}
-        bad = any(count.dropped for count in self._inputs.values())
+        more, trouble = self.report()
+        bad = trouble or any(count.dropped for count in self._inputs.values())
+        text = trouble or (self._complaint if bad else 'all inputs usable')
+        level = DiagnosticStatus.WARN if bad else DiagnosticStatus.OK
+        if self._failures:
+            level, text = DiagnosticStatus.ERROR, f'{self._failures} internal errors; {text}'
         name = f'{self.get_fully_qualified_name()}: inputs'
-        text = self._complaint if bad else 'all inputs usable'
         now = self.get_clock().now().nanoseconds
-        self._diagnostics.publish(messages.key_values_message(name, counts, now, text, bad))
+        self._diagnostics.publish(messages.key_values_message(
+            name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
+
+
+def twins(receive: Callable[[bytes], None]) -> tuple[Callable[[bytes], None], ...]:
+    """Return callbacks for two subscriptions of one topic; what comes to both is received once."""
+    ahead: list[deque[bytes]] = [deque(maxlen=_TWINS), deque(maxlen=_TWINS)]
+
+    def callback(own: int) -> Callable[[bytes], None]:
+        def hear(data: bytes) -> None:
+            with suppress(ValueError):
+                ahead[1 - own].remove(data)
+                return
+            ahead[own].append(data)
+            receive(data)
+
+        return hear
+
+    return callback(0), callback(1)
 
 
 def declare(node: Any, kind: type[S]) -> S:
@@ -176,7 +339,8 @@ def declare(node: Any, kind: type[S]) -> S:
 def descriptor(row: Row) -> Any:
     """Return the ParameterDescriptor of a row."""
     unit = f' [{row.unit}]' if row.unit else ''
-    message = ParameterDescriptor(name=row.name, description=row.description + unit)
+    message = ParameterDescriptor(
+        name=row.name, description=row.description + unit, read_only=row.fixed)
     # A parameter of one type would not let both `auto` and YAML's true be given.
     message.dynamic_typing = row.takes_booleans
     if row.choices:
@@ -193,25 +357,53 @@ def descriptor(row: Row) -> Any:
 
 
 def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
-    """Spin a node until it ends; return the exit status, 2 for unusable parameters."""
+    """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
+    try:
+        try:
+            rclpy.init(args=args)
+        except Exception as error:
+            return _refuse(kind, error)
+        return _run(kind)
+    except KeyboardInterrupt:
+        # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
+        return 0
+
+
+def _run(kind: type[BaseNode]) -> int:
     node = None
     try:
-        rclpy.init(args=args)
         node = kind()
-        rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException, Finished):
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except (FisheyeSvpError, ParameterException) as error:
-        print(f'{kind.NAME}: {error}', file=sys.stderr)
-        return 2
+    except Failed as error:
+        return _refuse(kind, error)
+    except Finished:
+        pass
+    except (FisheyeSvpError, ParameterException, NameValidationException) as error:
+        return _refuse(kind, error)
     except Exception:
         # A signal ends the context between any two calls; what fails then is no failure.
         if rclpy.ok():
             raise
     finally:
-        # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def _spin(node: BaseNode) -> None:
+    while rclpy.ok():
+        try:
+            rclpy.spin(node)
+        except (ExternalShutdownException, Finished):
+            raise
+        except Exception as error:  # of the client library, about what came over the wire
+            node.unforeseen(error)
+
+
+def _refuse(kind: type[BaseNode], error: Exception) -> int:
+    print(f'{kind.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+    return 2

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
@@ -13,8 +14,10 @@ from geometry_msgs.msg import PoseStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Finished
+from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Failed, Finished
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.landmarks import Landmarks
@@ -22,6 +25,8 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 
 WORLD = 'world'
+_TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
+_SET_BACK = 10**9  # ns by which a clock is not early but set back
 _LONG = 15.0  # s without an answer after which a set is published again
 
 
@@ -66,13 +71,24 @@ class CameraNode(BaseNode):
         self._stamp = 0
         self._sent = 0.0
 
+    def prepare(self, settings: Any) -> Any:
+        """Refuse topics to wait for whose names are none."""
+        for topic in settings.lock_step.split():
+            if not _TOPIC.fullmatch(topic):
+                raise ParameterError(f'lock_step: {topic[:100]!r} is not the name of a topic')
+        return settings
+
     @abstractmethod
     def publish_set(self, step: Any, stamp: int) -> None:
         """Publish one set."""
 
     def stamp_of(self, step: Any) -> int:
-        """Return the stamp of a set, ns: the present time, never the same twice."""
-        return int(max(self.get_clock().now().nanoseconds, self._stamp + 1))
+        """Return the stamp of a set, ns: the present time, later than the one before it.
+
+        Where the clock was set back, as by a recording that starts over, stamps follow it.
+        """
+        now = int(self.get_clock().now().nanoseconds)
+        return now if now < self._stamp - _SET_BACK else max(now, self._stamp + 1)
 
     def play(self, steps: Iterator[Any]) -> None:
         """Start stepping through other sets."""
@@ -83,7 +99,7 @@ class CameraNode(BaseNode):
                 self._hear_answers_on(topic)
         if self._timer is not None:
             self.destroy_timer(self._timer)
-        self._timer = self.create_timer(1 / self.settings.rate, self._tick)
+        self._timer = self.every(1 / self.settings.rate, self._tick)
 
     def camera(self, name: str) -> CameraTopics:
         """Return the topics of a camera."""
@@ -107,7 +123,7 @@ class CameraNode(BaseNode):
                     self._advance()
 
         self._answering.add(topic)
-        self.listen(DiagnosticArray, topic, messages.read_key_values, use)
+        self.listen(DiagnosticArray, topic, decoding.read_key_values, use)
 
     def _tick(self) -> None:
         if not self._unanswered:
@@ -120,7 +136,10 @@ class CameraNode(BaseNode):
             self._send()
 
     def _advance(self) -> None:
-        self._step = next(self._steps, None)
+        try:
+            self._step = next(self._steps, None)
+        except FisheyeSvpError as error:  # a file that was there at the start is not any more
+            raise Failed(str(error)) from error
         if self._step is None:
             self._timer.cancel()
             raise Finished('all sets are published')

@@ -8,6 +8,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
@@ -43,9 +44,9 @@ class Localizer(SolverNode):
         self._before: tuple[Pose | None, float] = None, 0.0
         self.start()
 
-    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+    def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
-        seen: messages.ImagePoints = items['image_points']
+        seen: decoding.ImagePoints = items['image_points']
         views, model = self.views(stamp, landmarks, seen), self.model(items)
         true: Pose | None = items.get('true_pose')
         found = self._localized(model, views, true).checked()

@@ -33,12 +33,14 @@ class MeasuredCameraSettings(CameraSettings):
     """Parameters of the measured camera."""
 
     observations: str = parameter(
-        '', 'Observations: a CSV file, a folder of ORPC files, a recording'
+        '', 'Observations: a CSV file, a folder of ORPC files, a recording', file=True
     )
-    true_poses: str = parameter('', 'Poses CSV with the true pose of each frame; empty: unknown')
+    true_poses: str = parameter(
+        '', 'Poses CSV with the true pose of each frame; empty: unknown', file=True
+    )
     lens: str = parameter(
         '', 'Lens for `camera_info` and `scenario`: a file, or a name in config/lenses; empty: '
-        'unknown'
+        'unknown', file=True
     )
 
 
@@ -67,9 +69,13 @@ class MeasuredCamera(CameraNode):
 
     def prepare(self, settings: MeasuredCameraSettings) -> Recording:
         """Read the files; refuse settings with which there is nothing to replay."""
+        super().prepare(settings)
         if not settings.observations:
             raise ParameterError('observations is empty; name the file to replay')
         table = read_observations(settings.observations)
+        for name in table.cameras:
+            if name and not _NAMESPACE.fullmatch(name):
+                raise ObservationError(f'camera {name!r} cannot be the name of a namespace')
         lens = load_lens(lens_path(settings.lens)) if settings.lens else None
         return Recording(
             observations=table,
@@ -83,8 +89,6 @@ class MeasuredCamera(CameraNode):
     def configure(self, recording: Recording) -> None:
         """Start over with another recording."""
         for name in recording.observations.cameras:
-            if name and not _NAMESPACE.fullmatch(name):
-                raise ObservationError(f'camera {name!r} cannot be the name of a namespace')
             self.camera(name)
         self._recording = recording
         self.publish_landmarks(recording.landmarks, 0)

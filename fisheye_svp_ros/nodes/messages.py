@@ -1,8 +1,4 @@
-"""Arrays to and from ROS messages; the only file that knows both.
-
-Stamps are whole nanoseconds.  What reads a message raises ObservationError, in one line that
-names the topic and the field, for anything that cannot be used.
-"""
+"""Arrays to ROS messages; `io.decoding` reads them.  Stamps are whole nanoseconds."""
 
 from __future__ import annotations
 
@@ -30,37 +26,20 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.clouds import (
     DATATYPES,
     IMAGE_POINTS,
     LANDMARKS,
     Points,
     structured,
-    unpack,
 )
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
 _NS = 10**9
 _NUMBERS = {code: number for number, code in DATATYPES.items()}
-
-
-class LandmarkSet(NamedTuple):
-    """Landmarks and the frame_id of the world they stand in."""
-
-    landmarks: Landmarks
-    frame: str
-
-
-class ImagePoints(NamedTuple):
-    """landmark (N,); uv (N, 2), px; frame: the camera's frame_id."""
-
-    landmark: Index
-    uv: Array
-    frame: str
 
 
 class Segments(NamedTuple):
@@ -104,26 +83,9 @@ def landmarks_message(landmarks: Landmarks, stamp: int, frame: str) -> Any:
     return cloud_message(structured(LANDMARKS, landmarks.ids, *landmarks.points.T), stamp, frame)
 
 
-def read_landmarks(message: Any, topic: str = 'landmarks') -> LandmarkSet:
-    """Return the landmarks of a PointCloud2."""
-    points = unpack(message, LANDMARKS, topic)
-    if not len(points):
-        raise ObservationError(f'{topic}: no landmark in it; at least one is needed')
-    xyz = np.stack([points[axis] for axis in 'xyz'], axis=-1)
-    landmarks = Landmarks(points['landmark'].astype(np.int64), xyz)
-    return LandmarkSet(landmarks, str(message.header.frame_id))
-
-
 def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> Any:
     """Return image points as PointCloud2: landmark, u, v (px)."""
     return cloud_message(structured(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
-
-
-def read_image_points(message: Any, topic: str = 'image_points') -> ImagePoints:
-    """Return the image points of a PointCloud2."""
-    points = unpack(message, IMAGE_POINTS, topic)
-    uv = np.array([points['u'], points['v']]).T
-    return ImagePoints(points['landmark'].astype(np.int64), uv, str(message.header.frame_id))
 
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
@@ -150,22 +112,12 @@ def pose_with_covariance_message(pose: Pose, covariance: Array, stamp: int, fram
     return PoseWithCovarianceStamped(header=header(stamp, frame), pose=inner)
 
 
-def read_pose(message: Any, topic: str = 'true_pose') -> Pose:
-    """Return the pose of a PoseStamped."""
-    return _checked_pose(message.pose.position, message.pose.orientation, topic)
-
-
 def transform_message(pose: Pose, stamp: int, frame: str, child: str) -> Any:
     """Return TransformStamped of the pose of `child` in `frame`."""
     message = TransformStamped(header=header(stamp, frame), child_frame_id=child)
     message.transform.translation = _vector(Vector3, pose.position)
     message.transform.rotation = _quaternion(pose)
     return message
-
-
-def read_transform(message: Any, topic: str = 'rig') -> Pose:
-    """Return the pose of a TransformStamped's child in its frame."""
-    return _checked_pose(message.transform.translation, message.transform.rotation, topic)
 
 
 def vector_message(vector: Array, stamp: int, frame: str) -> Any:
@@ -179,20 +131,13 @@ def number_message(value: float) -> Any:
 
 
 def key_values_message(
-    name: str, values: Mapping[str, object], stamp: int, text: str = '', warn: bool = False
+    name: str, values: Mapping[str, object], stamp: int, text: str = '',
+    level: bytes = DiagnosticStatus.OK,
 ) -> Any:
     """Return a DiagnosticArray with one status; numbers are written so that they read back."""
-    level = DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
     pairs = [KeyValue(key=key, value=_text(value)) for key, value in values.items()]
     status = DiagnosticStatus(level=level, name=name, message=text, values=pairs)
     return DiagnosticArray(header=header(stamp), status=[status])
-
-
-def read_key_values(message: Any, topic: str = 'scenario') -> dict[str, str]:
-    """Return the key/values of a DiagnosticArray's only status."""
-    if len(message.status) != 1:
-        raise ObservationError(f'{topic}: {len(message.status)} statuses in it; one is needed')
-    return {pair.key: pair.value for pair in message.status[0].values}
 
 
 def markers_message(shapes: Iterable[Segments], stamp: int, frame: str) -> Any:
@@ -222,16 +167,6 @@ def _quaternion(pose: Pose) -> Any:
 def _vector(kind: Any, values: Array) -> Any:
     x, y, z = values.tolist()
     return kind(x=x, y=y, z=z)
-
-
-def _checked_pose(position: Any, orientation: Any, topic: str) -> Pose:
-    place = np.array([position.x, position.y, position.z], dtype=float)
-    quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
-    if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
-        raise ObservationError(f'{topic}: the pose holds a value that is not a finite number')
-    if abs(np.linalg.norm(quaternion) - 1) > 1e-3:
-        raise ObservationError(f'{topic}: the orientation is not a unit quaternion')
-    return Pose(rotation_from_quaternion(quaternion), place)
 
 
 def _text(value: object) -> str:

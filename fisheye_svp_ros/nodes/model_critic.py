@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
@@ -44,7 +46,7 @@ class ModelCriticSettings(SolverSettings):
         0.0, 'Standard deviation of an image point; 0: unknown, to be estimated', 'px', (0.0, 1e3)
     )
     stereo: bool = parameter(
-        False, 'Judge the cameras left and right of a rig together; only at the start'
+        False, 'Judge the cameras left and right of a rig together', fixed=True
     )
     free_intrinsics: bool = parameter(
         False, 'Fit the intrinsics too; always so for a lens that was calibrated'
@@ -53,7 +55,7 @@ class ModelCriticSettings(SolverSettings):
     every_frames: int = parameter(20, 'Further frames before the next one', span=(1, 100_000))
     max_frames: int = parameter(100, 'Judge at most so many of the last frames', span=(5, 100_000))
     output: str = parameter(
-        'extended_lens.yaml', 'File that the service write_extended_lens writes'
+        'extended_lens.yaml', 'File that the service write_extended_lens writes', fixed=True
     )
 
 
@@ -85,8 +87,9 @@ class ModelCritic(SolverNode):
         self._judged = False
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
-        self.create_service(Trigger, '~/write_extended_lens', self._write_extended_lens)
-        self.create_timer(0.2, self._tick)
+        self.create_service(
+            Trigger, '~/write_extended_lens', self.guarded(self._write_extended_lens))
+        self.every(0.2, self._tick)
         self.start()
 
     @property
@@ -96,8 +99,6 @@ class ModelCritic(SolverNode):
 
     def prepare(self, settings: Any) -> Any:
         """Refuse settings that cannot be used."""
-        if settings.stereo != self.settings.stereo:
-            raise ParameterError('stereo can be set at the start only; start the node anew')
         if settings.min_frames > settings.max_frames:
             raise ParameterError('min_frames is above max_frames; no diagnosis would ever start')
         return super().prepare(settings)
@@ -107,7 +108,7 @@ class ModelCritic(SolverNode):
         super().configure(settings)
         self._judged = False
 
-    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+    def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
         seen = seen_in(stamp, landmarks, items, self.cameras)
         lens, scenario = true_lens(*self.lens(items)), scenario_of(items)
@@ -117,7 +118,7 @@ class ModelCritic(SolverNode):
         self._simulation = lens.svp() if self.settings.solves_svp else lens
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
-        for old in sorted(self._frames)[: -self.settings.max_frames]:
+        for old in list(self._frames)[: -self.settings.max_frames]:
             del self._frames[old]
 
     def _tick(self) -> None:
@@ -132,10 +133,10 @@ class ModelCritic(SolverNode):
             table, lens = self._table(), self._simulation
             free = self.settings.free_intrinsics or lens.calibration is not None
             work = in_background(lambda: judge(table, lens, free))
-            self._running = _Running(work, max(self._frames))
+            self._running = _Running(work, next(reversed(self._frames)))
 
     def _table(self) -> Observations:
-        table = table_of([self._frames[stamp] for stamp in sorted(self._frames)], self.cameras)
+        table = table_of(list(self._frames.values()), self.cameras)
         sigma = self.settings.sigma_px
         return replace(table, sigma=np.full(len(table), sigma)) if sigma else table
 
@@ -144,7 +145,7 @@ class ModelCritic(SolverNode):
             found = done.future.result()
         except FisheyeSvpError as error:
             self.drop(f'{self.cameras[0]}image_points', error)
-            self.publish_result(done.stamp, {}, str(error), warn=True)
+            self.publish_result(done.stamp, {}, str(error))
             return
         self._verdict = found
         numbers = figures(found)
@@ -162,7 +163,8 @@ class ModelCritic(SolverNode):
         words = {'verdict': found.verdict, 'causes': ' '.join(c.effect for c in found.causes)}
         return messages.key_values_message(
             f'{self.get_fully_qualified_name()}: verdict', {**words, **numbers}, stamp,
-            ' '.join(verdict_sentences(found)), warn=found.verdict != 'adequate',
+            ' '.join(verdict_sentences(found)),
+            DiagnosticStatus.OK if found.verdict == 'adequate' else DiagnosticStatus.WARN,
         )
 
     def _publish_diagnostics(self) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes.solver import Items, known_points
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
@@ -27,7 +27,7 @@ class Seen(NamedTuple):
 
 
 def seen_in(
-    stamp: int, landmarks: messages.LandmarkSet, items: Items, cameras: Sequence[str]
+    stamp: int, landmarks: decoding.LandmarkSet, items: Items, cameras: Sequence[str]
 ) -> Seen:
     """Return one set of cameras given by namespace, each with its slash.
 

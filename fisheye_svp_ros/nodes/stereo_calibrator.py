@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
 
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
@@ -34,7 +35,7 @@ class StereoCalibrator(SolverNode):
         self._window: list[Seen] = []
         self.start()
 
-    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+    def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
         model, scenario = self.model(items), scenario_of(items)
         known = self._window if scenario == self._scenario else []

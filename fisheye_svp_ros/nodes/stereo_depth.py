@@ -10,6 +10,7 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
@@ -42,13 +43,13 @@ class StereoDepth(SolverNode):
         self._points = self.announce(PointCloud2, '~/points')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._latest: Pose | None = None
-        self.listen(TransformStamped, 'rig', messages.read_transform, self._hear, LATCHED_INPUT)
+        self.listen(TransformStamped, 'rig', decoding.read_transform, self._hear, LATCHED_INPUT)
         self.start()
 
     def _hear(self, _: int, rig: Pose) -> None:
         self._latest = rig
 
-    def solve(self, stamp: int, landmarks: messages.LandmarkSet, items: Items) -> None:
+    def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Measure one set; raise GeometryError where no landmark is in both images."""
         model, rig = self.model(items), self._rig(items)
         left, right = (items[f'{camera}image_points'] for camera in self.CAMERAS)

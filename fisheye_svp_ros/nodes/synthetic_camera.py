@@ -55,8 +55,7 @@ class SyntheticCamera(CameraNode):
 
     def __init__(self) -> None:
         super().__init__()
-        given = {name: value.value for name, value in self._parameter_overrides.items()}
-        self._sweep = sweep_of(Scenario, given)
+        self._sweep = sweep_of(Scenario, self.given)
         for name, values in self._sweep.lists.items():
             self.declare_parameter(SWEEP + name, values, ParameterDescriptor(read_only=True))
         self._markers = self.announce(MarkerArray, 'markers', LATCHED)
@@ -64,6 +63,7 @@ class SyntheticCamera(CameraNode):
 
     def prepare(self, settings: SyntheticCameraSettings) -> SyntheticCameraSettings:
         """Refuse settings of which a scenario cannot be simulated."""
+        super().prepare(settings)
         check_sweep(settings, self._sweep)
         return settings
 

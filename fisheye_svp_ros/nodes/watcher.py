@@ -12,7 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.nodes.base import RELIABLE
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -74,7 +74,7 @@ class Watcher(Node):  # type: ignore[misc]
 
         def hear(message: DiagnosticArray) -> None:
             try:
-                values = messages.read_key_values(message, f'{node}/result')
+                values = read_key_values(message, f'{node}/result')
                 numbers = {name: float(value) for name, value in values.items()}
             except (ObservationError, ValueError):
                 return

@@ -41,12 +41,12 @@ _READ_FILES = ('lens', 'environment', 'poses_file')
 class Scenario:
     """Parameters of a scenario; all but `poses` can be swept."""
 
-    lens: str = parameter('fish214', 'Lens: a file, or a name in config/lenses')
+    lens: str = parameter('fish214', 'Lens: a file, or a name in config/lenses', file=True)
     shift_scale: float = parameter(
         1.0, 'Factor on the viewpoint shift of the lens; 0 makes it an SVP lens', span=(0.0, 100.0)
     )
     environment: str = parameter(
-        'whole', 'Landmarks: whole, inner or outer, or a CSV with landmark, x, y, z'
+        'whole', 'Landmarks: whole, inner or outer, or a CSV with landmark, x, y, z', file=True
     )
     radius: float = parameter(
         2.0, 'Distance of the landmarks of whole, inner and outer', 'm', (1e-3, 1e6)
@@ -66,7 +66,8 @@ class Scenario:
         'after the other', 'm'
     )
     poses_file: str = parameter(
-        '', 'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from'
+        '', 'Poses CSV in place of `poses`, or `calibration`: ten poses to calibrate a rig from',
+        file=True
     )
     trajectory_steps: int = parameter(
         0, '0: jump from pose to pose; n: move smoothly, in n steps from each pose to the next',

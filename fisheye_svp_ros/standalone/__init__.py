@@ -30,6 +30,8 @@ _MODULES = {
     'rclpy.parameter': 'parameters',
     'rclpy.publisher': 'node',
     'rclpy.qos': 'qos',
+    'rclpy.qos_overriding_options': 'qos',
+    'rclpy.serialization': 'serialization',
     'rclpy.service': 'node',
     'rclpy.subscription': 'node',
     'rclpy.time': 'clock',

@@ -22,6 +22,7 @@ class Context:
     def __init__(self) -> None:
         self.arguments = arguments.Arguments()
         self.nodes: list[Any] = []
+        self.interrupted = False
         self._running = False
         self._wire: tuple[dds.Participant, dds.Graph] | None = None
         self._handlers: dict[signal.Signals, Any] = {}
@@ -39,7 +40,7 @@ class Context:
             raise RCLError(f'ROS_DOMAIN_ID={given} is not a number from 0 to {_LAST_DOMAIN}')
         participant = dds.Participant(int(given))
         self._wire = participant, dds.Graph(participant)
-        self._running = True
+        self._running, self.interrupted = True, False
         if threading.current_thread() is threading.main_thread():
             self._handlers = {s: signal.signal(s, self._on_signal) for s in _SIGNALS}
 
@@ -75,6 +76,7 @@ class Context:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         # As in rclpy: the context ends, and Python's own handler turns SIGINT into an exception.
         self._running = False
+        self.interrupted = number == signal.SIGINT
         previous = self._handlers.get(signal.Signals(number))
         if callable(previous):
             previous(number, frame)

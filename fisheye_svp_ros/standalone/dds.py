@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import socket
 import struct
 import time
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 from uuid import UUID
 
@@ -50,6 +52,7 @@ from fisheye_svp_ros.standalone.qos import (
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 _MANY = 100_000  # endpoints on a domain
+_PATIENCE = duration(milliseconds=50)  # with a subscriber that does not keep up
 _HEADER = struct.Struct('<Qq')  # before requests and replies: client, sequence number
 _IDL = {'bool': bool, 'string': str}
 
@@ -130,12 +133,19 @@ class Participant:
     """One process on a domain, with everything that its nodes write and read."""
 
     def __init__(self, domain_id: int) -> None:
+        if os.getenv('ROS_SECURITY_ENABLE', '').lower() == 'true':
+            raise NotSupportedError('ROS_SECURITY_ENABLE=true: DDS security needs an installation '
+                                    'of ROS 2; without it nothing is encrypted (docs/security.md)')
+        before = _sockets()
         try:
             self._domain = Domain(domain_id, _configuration())
             self.entity = DomainParticipant(domain_id, Qos(Policy.Userdata(b'enclave=/;')))
         except DDSException as error:
             hint = 'too many processes on it, or a faulty CYCLONEDDS_URI?'
             raise RCLError(f'cannot join ROS domain {domain_id}: {hint}') from error
+        if _is_local():
+            now = _sockets()
+            _keep_on_loopback(now[name] for name in now.keys() - before)
         self.guid: UUID = self.entity.guid
         self._service_ids = itertools.count(1)
 
@@ -147,15 +157,15 @@ class Participant:
         """Return the types of every topic that somebody on the domain writes or reads, by name."""
         found: dict[str, set[str]] = {}
         for endpoints in (self._writers, self._readers):
-            for name, typename in endpoints.alive():
+            for name, typename, _ in endpoints.alive():
                 if name.startswith('rt/'):
-                    plain = typename.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
-                    found.setdefault(name[2:], set()).add(plain)
+                    found.setdefault(name[2:], set()).add(_ros_type(typename))
         return found
 
-    def count_writers(self, name: str) -> int:
-        """Return how many on the domain write a DDS topic."""
-        return sum(topic == name for topic, _ in self._writers.alive())
+    def writers_of(self, name: str) -> list[tuple[str, QoSProfile]]:
+        """Return ROS type and QoS of everybody on the domain who writes a DDS topic."""
+        return [(_ros_type(kind), qos) for topic, kind, qos in self._writers.alive()
+                if topic == name]
 
     @cached_property
     def _writers(self) -> _Endpoints:
@@ -176,16 +186,57 @@ class _Endpoints:
 
     def __init__(self, participant: DomainParticipant, kind: Any) -> None:
         self._reader = BuiltinDataReader(participant, kind)
-        self._alive: dict[UUID, tuple[str, str]] = {}
+        self._alive: dict[UUID, tuple[str, str, QoSProfile]] = {}
 
-    def alive(self) -> Collection[tuple[str, str]]:
-        """Return topic and type of every endpoint that is there now."""
+    def alive(self) -> Collection[tuple[str, str, QoSProfile]]:
+        """Return topic, type and QoS of every endpoint that is there now."""
         for endpoint in self._reader.take(_MANY):
             if endpoint.sample_info.instance_state == InstanceState.Alive:
-                self._alive[endpoint.key] = endpoint.topic_name, endpoint.type_name
+                self._alive[endpoint.key] = (
+                    endpoint.topic_name, endpoint.type_name, _ros_qos(endpoint.qos))
             else:
                 self._alive.pop(endpoint.key, None)
         return self._alive.values()
+
+
+def _ros_type(typename: str) -> str:
+    return typename.replace('::dds_::', '/').replace('::', '/').removesuffix('_')
+
+
+def _ros_qos(qos: Qos) -> QoSProfile:
+    """Return what discovery tells of a profile; it tells nothing of the history."""
+    latched = Policy.Durability.Volatile not in qos and Policy.Durability in qos
+    best = Policy.Reliability.BestEffort in qos
+    return QoSProfile(
+        depth=1,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _is_local() -> bool:
+    local = (os.getenv('ROS_AUTOMATIC_DISCOVERY_RANGE') or 'LOCALHOST') == 'LOCALHOST'
+    return local or os.getenv('ROS_LOCALHOST_ONLY') == '1'
+
+
+def _sockets() -> dict[str, int]:
+    """Return the open sockets of this process and their descriptors."""
+    found = {}
+    for entry in Path('/proc/self/fd').glob('*'):
+        with contextlib.suppress(OSError):
+            found[str(entry.readlink())] = int(entry.name)
+    return {name: number for name, number in found.items() if name.startswith('socket:')}
+
+
+def _keep_on_loopback(descriptors: Iterable[int]) -> None:
+    """Have UDP sockets take in nothing from outside this machine.
+
+    Cyclone DDS binds those that receive to every interface, whichever it was told to use.
+    """
+    for descriptor in descriptors:
+        with contextlib.suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.type == socket.SOCK_DGRAM and hasattr(socket, 'SO_BINDTODEVICE'):
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b'lo')
 
 
 def _configuration() -> str:
@@ -193,7 +244,7 @@ def _configuration() -> str:
     if asked not in {'LOCALHOST', 'SUBNET'}:
         raise NotSupportedError(f'ROS_AUTOMATIC_DISCOVERY_RANGE={asked}: use LOCALHOST or SUBNET')
     general, discovery, own = '', _DISCOVERY, os.getenv('CYCLONEDDS_URI', '')
-    if asked == 'LOCALHOST' or os.getenv('ROS_LOCALHOST_ONLY') == '1':
+    if _is_local():
         discovery += _LOCALHOST
         # Cyclone refuses an interface that is named twice, so the user's own choice stands alone.
         general = _UNICAST + ('' if own else _LOOPBACK)
@@ -215,9 +266,9 @@ class Writer:
         dds_topic = participant.topic(topic, typename, service=user_data is not None)
         self.entity = DataWriter(participant.entity, dds_topic, _dds_qos(qos, typename, user_data))
 
-    def write(self, message: messages.Message) -> None:
-        """Send a message."""
-        self._write(messages.serialize(message))
+    def write(self, message: messages.Message) -> bool:
+        """Send a message; False where a subscriber was too slow for it."""
+        return self._write(messages.serialize(message))
 
     def write_call(self, header: Header, message: messages.Message) -> None:
         """Send a request or a reply."""
@@ -241,8 +292,14 @@ class Writer:
                     return
             time.sleep(0.005)
 
-    def _write(self, data: bytes) -> None:
-        self.entity.write(self.entity.data_type(data))
+    def _write(self, data: bytes) -> bool:
+        try:
+            self.entity.write(self.entity.data_type(data))
+        except DDSException as error:
+            if error.code != DDSException.DDS_RETCODE_TIMEOUT:
+                raise
+            return False
+        return True
 
 
 class Reader:
@@ -309,7 +366,7 @@ def _dds_qos(qos: QoSProfile, typename: str, user_data: str | None) -> Qos:
         history,
         Policy.Reliability.BestEffort
         if qos.reliability == ReliabilityPolicy.BEST_EFFORT
-        else Policy.Reliability.Reliable(max_blocking_time=duration(infinite=True)),
+        else Policy.Reliability.Reliable(max_blocking_time=_PATIENCE),
         Policy.WriterDataLifecycle(autodispose=False),
         Policy.DataRepresentation(use_cdrv0_representation=True),
         Policy.Userdata(f'{user_data or ""}typehash={messages.type_hash(typename)};'.encode()),

@@ -53,6 +53,9 @@ class SingleThreadedExecutor:
         """Run callbacks until the context or this executor is shut down."""
         while self.context.ok() and not self._stopped:
             self.spin_once()
+        # An exception that a signal raises is lost where Python was in a finalizer.
+        if self.context.interrupted:
+            raise KeyboardInterrupt
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Run one callback, or return after a while without any."""
@@ -68,9 +71,12 @@ class SingleThreadedExecutor:
         forever = timeout_sec is None or timeout_sec < 0
         end = None if forever else time.monotonic_ns() + int((timeout_sec or 0) * 1e9)
         while not self._stopped:
+            if self.context.interrupted:
+                raise KeyboardInterrupt
             if not self.context.ok():
                 raise ExternalShutdownException('the context was shut down')
-            entities = [e for n in self._nodes for e in (*n.timers, *n.subscriptions, *n.services)]
+            entities = [e for n in self._nodes for e in (
+                *n.timers, *n.subscriptions, *n.guards, *n.services)]
             self._ready.extend(entity for entity in entities if entity.is_ready())
             now = time.monotonic_ns()
             if self._ready or (end is not None and now >= end):

@@ -8,6 +8,7 @@ node reads and writes the same values in both worlds, and large data never becom
 from __future__ import annotations
 
 import array
+import codecs
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -56,6 +57,9 @@ _EMPTY = 'structure_needs_at_least_one_member'
 
 Convert = Callable[[Any], Any]
 
+_BAD_STRINGS = 100  # of one message that are mended
+codecs.register_error('mark', lambda e: ('?' * (e.end - e.start), e.end))  # type: ignore[attr-defined]
+
 
 class UnknownFieldError(StandaloneError, AttributeError):
     """A message has no field of that name."""
@@ -63,6 +67,10 @@ class UnknownFieldError(StandaloneError, AttributeError):
 
 class FieldValueError(StandaloneError, TypeError, ValueError):
     """A value does not fit the field it is assigned to."""
+
+
+class UnreadableError(StandaloneError, ValueError):
+    """Bytes from the wire are not a message of the type they claim to be."""
 
 
 class Field(NamedTuple):
@@ -184,8 +192,19 @@ def serialize(message: Message) -> bytes:
 
 
 def deserialize(data: bytes, cls: type[Message]) -> Message:
-    """Return the message of a class that CDR bytes with encapsulation header hold."""
-    return cast('Message', _store().deserialize_cdr(data, cls.TYPENAME))
+    """Return the message of a class that CDR bytes with encapsulation header hold.
+
+    What is not UTF-8 in a string becomes question marks; anything else raises UnreadableError.
+    """
+    for _ in range(_BAD_STRINGS):
+        try:
+            return cast('Message', _store().deserialize_cdr(data, cls.TYPENAME))
+        except UnicodeDecodeError as error:
+            # As long as before, so that everything else stays where it is.
+            data = data.replace(error.object, error.object.decode('utf-8', 'mark').encode())
+        except Exception as error:
+            raise UnreadableError(f'not a {cls.TYPENAME} ({error!r:.80})') from error
+    raise UnreadableError(f'{cls.TYPENAME} with more than {_BAD_STRINGS} strings not in UTF-8')
 
 
 def _to_wire(message: Message) -> object:

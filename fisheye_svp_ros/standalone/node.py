@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from copy import copy
 from typing import Any
 
 from fisheye_svp_ros.standalone import dds, logging, names
@@ -15,11 +16,15 @@ from fisheye_svp_ros.standalone.exceptions import (
     NotSupportedError,
     RCLError,
 )
-from fisheye_svp_ros.standalone.messages import Message, message_class
+from fisheye_svp_ros.standalone.messages import Message, UnreadableError, message_class
 from fisheye_svp_ros.standalone.parameter_services import ParameterServices
 from fisheye_svp_ros.standalone.parameters import Parameter, ParameterHolder
 from fisheye_svp_ros.standalone.qos import (
+    QoSOverridingOptions,
     QoSProfile,
+    TopicEndpointInfo,
+    policy_text,
+    policy_value,
     profile,
     qos_profile_parameter_events,
     qos_profile_rosout_default,
@@ -37,12 +42,17 @@ class Publisher:
         self.writer: dds.Writer | None = writer
         self.msg_type = msg_type
         self.topic_name = topic
+        self.lost = 0
 
     def publish(self, msg: Message) -> None:
         """Send a message to all subscribers."""
         if not isinstance(msg, self.msg_type):
             raise TypeError(f'Expected {self.msg_type.TYPENAME}, got {type(msg).__name__}')
-        self._alive().write(msg)
+        if not self._alive().write(msg):
+            self.lost += 1
+            logging.get_logger('rclpy.publisher').warning(
+                f'{self.topic_name}: a subscriber is too slow; {self.lost} messages are lost',
+                throttle_duration_sec=5.0)
 
     def get_subscription_count(self) -> int:
         """Return how many subscribers are connected."""
@@ -114,6 +124,23 @@ class Timer(Entity):
         return self.next_call is None
 
 
+class GuardCondition(Entity):
+    """Calls a function once after each time that it was triggered."""
+
+    def trigger(self) -> None:
+        """Have the function called, after whatever is ready by now."""
+        self.next_call = time.monotonic_ns()
+
+    def is_ready(self) -> bool:
+        """Say whether it was triggered."""
+        return self.next_call is not None
+
+    def execute(self) -> None:
+        """Call the function."""
+        self.next_call = None
+        self.callback()
+
+
 class Subscription(Entity):
     """Calls a function with each message on a topic."""
 
@@ -129,7 +156,11 @@ class Subscription(Entity):
         """Call the function with one message."""
         if self.reader is None:
             return
-        message = self.reader.take_raw() if self.raw else self.reader.take()
+        try:
+            message = self.reader.take_raw() if self.raw else self.reader.take()
+        except UnreadableError as error:
+            self.node.get_logger().error(f'{self.topic_name}: {error}', throttle_duration_sec=1.0)
+            return
         if message is not None:
             self.callback(message)
 
@@ -154,7 +185,11 @@ class Service(Entity):
 
     def execute(self) -> None:
         """Answer one request."""
-        taken = self.reader.take_call() if self.reader else None
+        try:
+            taken = self.reader.take_call() if self.reader else None
+        except UnreadableError as error:
+            self.node.get_logger().error(f'{self.srv_name}: {error}', throttle_duration_sec=1.0)
+            return
         if self.reader is None or taken is None:
             return
         header, request = taken
@@ -200,6 +235,7 @@ class Node(ParameterHolder):
         self._subscriptions: list[Subscription] = []
         self._services: list[Service] = []
         self._timers: list[Timer] = []
+        self._guards: list[GuardCondition] = []
         self._clock = Clock(clock_type=ClockType.ROS_TIME)
         dotted = self.get_fully_qualified_name()[1:].replace('/', '.')
         self._logger = logging.get_logger(dotted)
@@ -262,15 +298,26 @@ class Node(ParameterHolder):
 
     def count_publishers(self, topic_name: str) -> int:
         """Return how many publishers a topic has on the domain."""
-        return self.context.participant.count_writers(f'rt{self.resolve_topic_name(topic_name)}')
+        return len(self.get_publishers_info_by_topic(topic_name))
+
+    def get_publishers_info_by_topic(self, topic_name: str) -> list[TopicEndpointInfo]:
+        """Return type and QoS of everybody who publishes on a topic."""
+        name = f'rt{self.resolve_topic_name(topic_name)}'
+        return [TopicEndpointInfo(kind, qos)
+                for kind, qos in self.context.participant.writers_of(name)]
 
     def create_publisher(
-        self, msg_type: type[Message], topic: str, qos_profile: QoSProfile | int
+        self,
+        msg_type: type[Message],
+        topic: str,
+        qos_profile: QoSProfile | int,
+        *,
+        qos_overriding_options: QoSOverridingOptions | None = None,
     ) -> Publisher:
         """Publish on a topic."""
         name = self.resolve_topic_name(topic)
-        writer = dds.Writer(
-            self.context.participant, f'rt{name}', msg_type.TYPENAME, profile(qos_profile))
+        qos = self.__overridden(qos_profile, name, 'publisher', qos_overriding_options)
+        writer = dds.Writer(self.context.participant, f'rt{name}', msg_type.TYPENAME, qos)
         publisher = Publisher(writer, msg_type, name)
         self._publishers.append(publisher)
         self.__announce()
@@ -284,10 +331,12 @@ class Node(ParameterHolder):
         qos_profile: QoSProfile | int,
         *,
         raw: bool = False,
+        qos_overriding_options: QoSOverridingOptions | None = None,
     ) -> Subscription:
         """Have a function called with each message on a topic; raw: with its bytes as CDR."""
         name = self.resolve_topic_name(topic)
-        reader = dds.Reader(self.context.participant, f'rt{name}', msg_type, profile(qos_profile))
+        qos = self.__overridden(qos_profile, name, 'subscription', qos_overriding_options)
+        reader = dds.Reader(self.context.participant, f'rt{name}', msg_type, qos)
         subscription = Subscription(self, callback, reader, name, raw)
         self._subscriptions.append(subscription)
         self.__announce()
@@ -313,6 +362,12 @@ class Node(ParameterHolder):
         self._services.append(service)
         self.__announce()
         return service
+
+    def create_guard_condition(self, callback: Callable[[], Any]) -> GuardCondition:
+        """Have a function called whenever it is triggered."""
+        guard = GuardCondition(self, callback)
+        self._guards.append(guard)
+        return guard
 
     def create_timer(self, timer_period_sec: float, callback: Callable[[], Any]) -> Timer:
         """Have a function called periodically."""
@@ -342,7 +397,8 @@ class Node(ParameterHolder):
             return
         self.context.nodes.remove(self)
         logging.attach_sink(self._logger.name, None)
-        for things in (self._publishers, self._subscriptions, self._services, self._timers):
+        for things in (self._publishers, self._subscriptions, self._services, self._timers,
+                       self._guards):
             for thing in things:
                 thing.destroy()
             things.clear()
@@ -359,9 +415,32 @@ class Node(ParameterHolder):
         yield from self._subscriptions
 
     @property
+    def guards(self) -> Iterator[GuardCondition]:
+        """The guard conditions of this node."""
+        yield from self._guards
+
+    @property
     def services(self) -> Iterator[Service]:
         """The services of this node."""
         yield from self._services
+
+    def __overridden(
+        self, qos: QoSProfile | int, topic: str, kind: str, options: QoSOverridingOptions | None
+    ) -> QoSProfile:
+        """Return a profile after the parameters `qos_overrides.<topic>.<kind>.<policy>`."""
+        result = copy(profile(qos))
+        suffix = f'_{options.entity_id}' if options and options.entity_id else ''
+        for kind_of_policy in options.policy_kinds if options else ():
+            policy = kind_of_policy.name.lower()
+            name = f'qos_overrides.{topic}.{kind}{suffix}.{policy}'
+            if not self.has_parameter(name):
+                description = f'{policy} of the {kind} of {topic}'
+                self.declare_parameter(
+                    name, policy_text(getattr(result, policy)),
+                    message_class('rcl_interfaces/msg/ParameterDescriptor')(
+                        description=description, read_only=True))
+            setattr(result, policy, policy_value(policy, self.get_parameter(name).value, name))
+        return result
 
     def __destroy(self, things: list[Any], thing: Any) -> bool:
         if thing not in things:

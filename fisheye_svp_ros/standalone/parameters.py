@@ -165,6 +165,12 @@ class ParameterHolder:
                 parameter.name, parameter.value, parameter.type_.name, expected)
         raise InvalidParameterValueException(parameter.name, parameter.value, reason)
 
+    def undeclare_parameter(self, name: str) -> None:
+        """Forget a parameter."""
+        if name not in self._parameters:
+            raise ParameterNotDeclaredException(name)
+        del self._parameters[name], self._descriptors[name]
+
     def has_parameter(self, name: str) -> bool:
         """Say whether a parameter is declared."""
         return name in self._parameters

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
-from fisheye_svp_ros.standalone.exceptions import NotSupportedError
+from fisheye_svp_ros.standalone.exceptions import (
+    InvalidParameterValueException,
+    NotSupportedError,
+)
 
 
 class InvalidQoSProfileException(Exception):
@@ -76,6 +80,50 @@ qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)
 qos_profile_parameter_events = QoSProfile(depth=1000)
 qos_profile_rosout_default = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+_POLICIES: dict[str, type[IntEnum]] = {
+    'history': HistoryPolicy, 'reliability': ReliabilityPolicy, 'durability': DurabilityPolicy,
+}
+
+
+class QoSPolicyKind(IntEnum):
+    """Names of policies, in the numbering of rmw."""
+
+    DURABILITY = 1
+    HISTORY = 4
+    RELIABILITY = 16
+    DEPTH = 64
+
+
+class QoSOverridingOptions(NamedTuple):
+    """Which policies of a topic parameters may override: `rclpy.qos_overriding_options`."""
+
+    policy_kinds: tuple[QoSPolicyKind, ...]
+    entity_id: str | None = None
+
+
+class TopicEndpointInfo(NamedTuple):
+    """Who publishes on a topic: type and profile."""
+
+    topic_type: str
+    qos_profile: QoSProfile
+
+
+def policy_text(value: int) -> str | int:
+    """Return a policy as a parameter holds it."""
+    return value.name.lower() if isinstance(value, IntEnum) else value
+
+
+def policy_value(policy: str, given: str | int, parameter: str) -> int:
+    """Return the policy that a parameter names."""
+    if policy not in _POLICIES:
+        return int(given)
+    try:
+        return _POLICIES[policy][str(given).upper()]
+    except KeyError:
+        known = ', '.join(name.lower() for name in _POLICIES[policy].__members__)
+        raise InvalidParameterValueException(parameter, given, f'one of {known}') from None
 
 
 def profile(qos: QoSProfile | int) -> QoSProfile:

@@ -16,6 +16,10 @@ class Settings:
         0, 'Hold back what this node has to tell until so many listen to its image points (a '
         'camera) or results (a solver), so that nobody misses the first', span=(0, 1000)
     )
+    folder: str = parameter(
+        '', 'Folder below which files may be named while the node runs, by `scenario` or a new '
+        'value of a parameter; empty: none, only names in config/', fixed=True
+    )
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class SolverSettings(Settings):
 
     lens: str = parameter(
         '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
-        '`scenario` names'
+        '`scenario` names', file=True
     )
     svp: str = parameter(
         'auto', 'Solve with the single-viewpoint approximation of the lens; auto: of one that '
@@ -54,6 +58,10 @@ class SolverSettings(Settings):
     patience: float = parameter(
         2.0, 'How long image points wait for what shares their stamp on other topics', 's',
         (0.0, 3600.0)
+    )
+    backlog: int = parameter(
+        100, 'Sets that may wait to be solved; beyond them the oldest are dropped and counted',
+        span=(1, 10_000)
     )
 
     @property

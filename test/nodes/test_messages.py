@@ -19,7 +19,9 @@ from sensor_msgs.msg import PointCloud2, PointField  # noqa: E402
 
 from fisheye_svp_ros import messages  # noqa: E402
 from fisheye_svp_ros.errors import ObservationError  # noqa: E402
-from fisheye_svp_ros.io.clouds import RESIDUALS, stamp_of, structured, unpack  # noqa: E402
+from fisheye_svp_ros.io import decoding  # noqa: E402
+from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack  # noqa: E402
+from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
 from fisheye_svp_ros.io.landmark_files import environment  # noqa: E402
 from fisheye_svp_ros.io.lens_files import load_lens  # noqa: E402
 from fisheye_svp_ros.io.share import lens_path  # noqa: E402
@@ -41,7 +43,7 @@ def test_image_points_survive_bit_by_bit() -> None:
     assert [f.datatype for f in message.fields] == [
         PointField.UINT32, PointField.FLOAT64, PointField.FLOAT64
     ]
-    back = messages.read_image_points(message)
+    back = decoding.read_image_points(message)
     assert back.landmark.tolist() == [7, 4_294_967_295, 0]
     assert back.uv.tolist() == [[0.1, 1e-300], [1535.9, -3.25], [1 / 3, 7.0]]
     assert back.frame == 'camera' and stamp_of(message) == STAMP
@@ -49,7 +51,7 @@ def test_image_points_survive_bit_by_bit() -> None:
 
 def test_landmarks_survive_bit_by_bit() -> None:
     landmarks = environment('outer', 0.2)
-    back = messages.read_landmarks(messages.landmarks_message(landmarks, STAMP, 'world'))
+    back = decoding.read_landmarks(messages.landmarks_message(landmarks, STAMP, 'world'))
     assert back.landmarks.ids.tolist() == landmarks.ids.tolist()
     assert np.array_equal(back.landmarks.points, landmarks.points) and back.frame == 'world'
 
@@ -73,13 +75,13 @@ def test_other_field_order_width_and_endianness_are_read() -> None:
                                    ('landmark', 10, 5))
     ]
     message.data = array('B', raw.tobytes())
-    back = messages.read_image_points(message)
+    back = decoding.read_image_points(message)
     assert back.uv.tolist() == [[2.5, 1.5]] and back.landmark.tolist() == [7]
 
 
 def test_an_empty_cloud_holds_no_image_points() -> None:
     message = messages.image_points_message(np.array([], dtype=int), np.empty((0, 2)), 1, '')
-    assert len(messages.read_image_points(message).landmark) == 0
+    assert len(decoding.read_image_points(message).landmark) == 0
 
 
 def without_field(message: Any) -> Any:
@@ -158,7 +160,7 @@ def landmark_twice(_: Any) -> Any:
 ])
 def test_image_points_that_cannot_be_used(spoil: Any, reason: str) -> None:
     with pytest.raises(ObservationError, match=r'^left/image_points: ') as caught:
-        messages.read_image_points(spoil(image_points()), 'left/image_points')
+        decoding.read_image_points(spoil(image_points()), 'left/image_points')
     assert reason in str(caught.value) and '\n' not in str(caught.value)
 
 
@@ -169,22 +171,22 @@ def test_landmarks_need_at_least_one() -> None:
         for name, kind in (('landmark', 6), ('x', 8), ('y', 8), ('z', 8))
     ]
     with pytest.raises(ObservationError, match='landmarks: no landmark in it'):
-        messages.read_landmarks(message)
+        decoding.read_landmarks(message)
 
 
 def test_a_negative_landmark_is_refused() -> None:
     message = image_points()
     message.fields[0].datatype = PointField.INT32
     with pytest.raises(ObservationError, match="field 'landmark' of point 1 is -1"):
-        messages.read_image_points(message)
+        decoding.read_image_points(message)
 
 
 def test_poses_and_transforms_survive() -> None:
-    back = messages.read_pose(messages.pose_message(POSE, STAMP, 'world'))
+    back = decoding.read_pose(messages.pose_message(POSE, STAMP, 'world'))
     assert np.abs(back.difference(POSE)).max() < 1e-15
     message = messages.transform_message(POSE, STAMP, 'right', 'left')
     assert message.child_frame_id == 'left'
-    assert np.abs(messages.read_transform(message).difference(POSE)).max() < 1e-15
+    assert np.abs(decoding.read_transform(message).difference(POSE)).max() < 1e-15
 
 
 @pytest.mark.parametrize(('field', 'value', 'reason'), [
@@ -197,7 +199,7 @@ def test_poses_that_cannot_be_used(field: str, value: float, reason: str) -> Non
     part, axis = field.split('.')
     setattr(getattr(message.pose, part), axis, value)
     with pytest.raises(ObservationError, match=f'true_pose: .*{reason}'):
-        messages.read_pose(message)
+        decoding.read_pose(message)
 
 
 def test_covariance_is_row_by_row() -> None:
@@ -209,17 +211,17 @@ def test_covariance_is_row_by_row() -> None:
 def test_key_values_read_back_exactly() -> None:
     values = {'error_m': 1 / 3, 'tiny_px': 5e-324, 'count': 3, 'name': 'a b', 'flag': True}
     message = messages.key_values_message('n', values, STAMP)
-    back = messages.read_key_values(message)
+    back = decoding.read_key_values(message)
     assert float(back['error_m']) == 1 / 3 and float(back['tiny_px']) == 5e-324
     assert back['count'] == '3' and back['name'] == 'a b' and back['flag'] == 'True'
     message.status = []
     with pytest.raises(ObservationError, match='scenario: 0 statuses in it; one is needed'):
-        messages.read_key_values(message)
+        decoding.read_key_values(message)
 
 
 def test_key_values_take_numpy_numbers() -> None:
     message = messages.key_values_message('n', {'x_m': np.float64(0.1)}, 1)
-    assert messages.read_key_values(message) == {'x_m': '0.1'}
+    assert decoding.read_key_values(message) == {'x_m': '0.1'}
 
 
 @pytest.mark.parametrize('name', ['fish180', 'fish214'])
@@ -252,4 +254,4 @@ def test_markers_keep_every_point() -> None:
 
 def test_the_default_topic_names_the_input() -> None:
     with pytest.raises(ObservationError, match=r'^landmarks: '):
-        messages.read_landmarks(PointCloud2())
+        decoding.read_landmarks(PointCloud2())

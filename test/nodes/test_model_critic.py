@@ -23,11 +23,11 @@ from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
-from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -78,7 +78,7 @@ def graph(ros_domain: int, scene: Path) -> Iterator[Callable[..., Graph]]:
 
 
 def numbers(message: Any) -> dict[str, str]:
-    return messages.read_key_values(message)
+    return decoding.read_key_values(message)
 
 
 def test_the_verdict_is_published(graph: Callable[..., Graph], scene: Path) -> None:

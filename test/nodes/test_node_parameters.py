@@ -82,20 +82,21 @@ def test_every_parameter_is_described_and_refuses_what_breaks_it(
             result = set_parameter(node, row.name, value)
             assert not result.successful, (row.name, value)
             assert row.name in result.reason or 'type' in result.reason
+        assert described.read_only == row.fixed
             assert node.get_parameter(row.name).value == before
 
 
 @pytest.mark.parametrize(('name', 'parameter', 'value', 'reason'), [
     ('synthetic_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
     ('synthetic_camera', 'environment', 'cellar', "environment 'cellar' is unknown"),
-    ('synthetic_camera', 'environment', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('synthetic_camera', 'environment', 'nothere.csv', 'start it with folder:=DIR'),
     ('synthetic_camera', 'poses', [0.0] * 6, 'poses holds 6 numbers; seven a pose are needed'),
     ('synthetic_camera', 'poses', [0.0] * 7, 'the quaternion of pose 0 has norm 0, not 1'),
     ('synthetic_camera', 'poses', [math.nan] * 7, 'poses is nan; a finite number is needed'),
-    ('synthetic_camera', 'poses_file', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('synthetic_camera', 'poses_file', 'nothere.csv', 'start it with folder:=DIR'),
     ('measured_camera', 'observations', '', 'observations is empty; name the file to replay'),
-    ('measured_camera', 'observations', 'nothere.csv', 'nothere.csv: cannot be read'),
-    ('measured_camera', 'true_poses', 'nothere.csv', 'nothere.csv: cannot be read'),
+    ('measured_camera', 'observations', 'nothere.csv', 'start it with folder:=DIR'),
+    ('measured_camera', 'true_poses', 'nothere.csv', 'start it with folder:=DIR'),
     ('measured_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
     ('localizer', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
     ('stereo_calibrator', 'lens', 'nothere', 'nothere.yaml: cannot be read'),

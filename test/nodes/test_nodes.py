@@ -19,8 +19,10 @@ from std_msgs.msg import Float64  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import BagWriter
-from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, stamp_of, unpack
+from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, unpack
+from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -61,7 +63,7 @@ def run_to_the_end(graph: Graph) -> None:
 
 
 def values(message: Any) -> dict[str, str]:
-    return messages.read_key_values(message)
+    return decoding.read_key_values(message)
 
 
 def stamps(heard: list[Any]) -> list[int]:
@@ -84,7 +86,7 @@ def test_one_set_carries_one_stamp_on_all_topics(graph: Callable[..., Graph]) ->
     for heard in (scenarios, poses, landmarks, info):
         assert stamps(heard) == stamps(points)
     assert [values(m)['set'] for m in scenarios] == ['0', '1']
-    assert messages.read_pose(poses[1]).position.tolist() == [0.1, 0.0, 0.0]
+    assert decoding.read_pose(poses[1]).position.tolist() == [0.1, 0.0, 0.0]
     assert points[0].header.frame_id == 'camera_optical_frame'
     assert poses[0].header.frame_id == landmarks[0].header.frame_id == 'world'
     assert info[0].distortion_model == 'equidistant' and info[0].width == 1536
@@ -98,7 +100,7 @@ def test_a_rig_has_its_cameras_below_left_and_right(graph: Callable[..., Graph])
     run_to_the_end(g)
     g.until(lambda: clouds[0] and clouds[1] and left and right)
     assert len({*stamps(left), *stamps(right), *stamps(clouds[0]), *stamps(clouds[1])}) == 1
-    rig = messages.read_pose(right[0]).inverse().compose(messages.read_pose(left[0]))
+    rig = decoding.read_pose(right[0]).inverse().compose(decoding.read_pose(left[0]))
     assert rig.position == pytest.approx([-0.15, 0, 0])
     assert clouds[0][0].header.frame_id == 'left_camera_optical_frame'
 
@@ -112,7 +114,7 @@ def test_the_noise_is_that_of_the_seed_and_new_in_each_repetition(
     g.until(lambda: len(points) >= 3)
     for repetition in range(3):
         wanted = simulate_scenario(Scenario(noise_px=0.5, seed=7), 0, repetition).observations.uv
-        assert np.array_equal(messages.read_image_points(points[repetition]).uv, wanted)
+        assert np.array_equal(decoding.read_image_points(points[repetition]).uv, wanted)
 
 
 def test_a_trajectory_moves_in_even_steps(graph: Callable[..., Graph]) -> None:
@@ -124,7 +126,7 @@ def test_a_trajectory_moves_in_even_steps(graph: Callable[..., Graph]) -> None:
     g.start(SyntheticCamera)
     run_to_the_end(g)
     g.until(lambda: len(poses) == 5 and len(points) == 5)
-    read = [messages.read_pose(m) for m in poses]
+    read = [decoding.read_pose(m) for m in poses]
     assert [p.position[0] for p in read] == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
     turns = [np.arctan2(p.rotation[1, 0], p.rotation[0, 0]) for p in read]
     assert turns == pytest.approx(np.arange(5) * np.pi / 16)
@@ -176,7 +178,7 @@ def test_a_set_without_an_answer_comes_again(
     g.start(SyntheticCamera)
     g.until(lambda: len(points) >= 3)
     assert len(set(stamps(points))) == 1 and set(stamps(scenarios)) == set(stamps(points))
-    first, *others = (messages.read_image_points(message).uv for message in points)
+    first, *others = (decoding.read_image_points(message).uv for message in points)
     assert all(np.array_equal(first, other) for other in others)
     answer = g.tell(DiagnosticArray, 'somebody/result')
     answer.publish(messages.key_values_message('n', {}, stamps(points)[0]))

@@ -24,9 +24,9 @@ from helpers import graph  # noqa: F401 - supplies the message packages
 from fisheye_svp_ros import standalone
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
-from fisheye_svp_ros.io import bags
+from fisheye_svp_ros.io import bags, decoding
 from fisheye_svp_ros.io.bags import Bag, BagWriter
-from fisheye_svp_ros.io.clouds import stamp_of
+from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
@@ -301,7 +301,7 @@ def test_measured_camera_and_localizer_agree_with_the_command(
     ):
         stamp = stamp_of(record.message)
         if record.topic == '/scenario':
-            frames[stamp] = int(messages.read_key_values(record.message)['frame'])
+            frames[stamp] = int(decoding.read_key_values(record.message)['frame'])
         else:
             poses[stamp] = record.message.pose.pose
     assert sorted(frames.values()) == sorted(wanted) and set(poses) == set(frames)
