@@ -106,7 +106,7 @@ def test_the_verdict_is_published(graph: Callable[..., Graph], scene: Path) -> N
 def test_a_right_lens_is_adequate_and_another_scenario_starts_anew(
     graph: Callable[..., Graph], scene: Path
 ) -> None:
-    g = graph(f'synthetic_camera:lens:={scene}/given.yaml')
+    g = graph(f'synthetic_camera:lens:={scene}/given.yaml', f'folder:={scene}')
     results = g.hear(DiagnosticArray, 'model_critic/result')
     critic = g.start(ModelCritic)
     camera = g.start(SyntheticCamera)

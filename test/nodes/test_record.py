@@ -80,7 +80,7 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
         for node, value in (('/x/left/localizer', 1.0), ('/x/stereo_depth', 2.0)):
             message = messages.key_values_message('n', {'rms_px': value}, 5)
             bag.write(f'{node}/result', DIAGNOSTICS, cdr(message))
-        failed = messages.key_values_message('n', {}, 6, 'too few points', warn=True)
+        failed = messages.key_values_message('n', {}, 6, 'too few points', b'\x01')
         bag.write('/x/stereo_depth/result', DIAGNOSTICS, cdr(failed))
     columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
     assert columns['namespace'] == ['/x', '/x', '/x/left'] and columns['stamp_ns'] == [5, 6, 5]
