@@ -67,7 +67,7 @@ setup(
     entry_points={
         'console_scripts': [
             f'fisheye-svp = {package_name}.cli:main',
-            *(f'{node} = {package_name}.nodes.{node}:main' for node in nodes),
+            *(f'{node} = {package_name}.nodes.executables:{node}' for node in nodes),
         ],
     },
 )

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 
 from fisheye_svp_ros.errors import StandaloneError
-from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.nodes import NODES, executables
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,8 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Spin the node until it ends; exit with its status."""
     supply_rclpy()
-    node = import_module(f'fisheye_svp_ros.nodes.{args.node}')
-    raise SystemExit(node.main(args.arguments))
+    raise SystemExit(executables.run(args.node, args.arguments))
 
 
 def supply_rclpy() -> None:

@@ -1,0 +1,31 @@
+"""What the executables of the package call: a node by its name.
+
+It loads a node only when it is run, so that a signal while that takes place ends it quietly.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+
+from fisheye_svp_ros.nodes import NODES
+
+
+def run(name: str, args: list[str] | None = None) -> int:
+    """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
+    # There is nothing to clean up yet.
+    before = {number: signal.signal(number, lambda *_: os._exit(0))
+              for number in (signal.SIGINT, signal.SIGTERM)}
+    module = import_module(f'fisheye_svp_ros.nodes.{name}')
+    for number, handler in before.items():
+        signal.signal(number, handler)
+    return int(module.main(args))
+
+
+def __getattr__(name: str) -> Callable[..., int]:
+    if name not in NODES:
+        raise AttributeError(f'no node is called {name!r}')
+    return partial(run, name)

@@ -1,0 +1,78 @@
+"""How executables start, refuse and end, as `ros2 run` and launch see it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from helpers.nodes import ROOT, NodeProcess
+
+from fisheye_svp_ros import standalone
+
+if not standalone.is_genuine():
+    pytest.importorskip('cyclonedds')
+_CODE = """
+import sys
+from fisheye_svp_ros import cli
+print('loading', flush=True)
+sys.exit(cli.main(['run', *sys.argv[1:]]))
+"""
+
+
+@pytest.fixture
+def start(ros_domain: int):  # type: ignore[no-untyped-def]
+    """Return a function that starts a node as its executable does."""
+    started = []
+
+    def run(node: str, *arguments: str) -> NodeProcess:
+        path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
+        env = os.environ | {'ROS_DOMAIN_ID': str(ros_domain), 'PYTHONPATH': path}
+        started.append(NodeProcess([sys.executable, '-c', _CODE, node, *arguments], env))
+        return started[-1]
+
+    yield run
+    for one in started:
+        if one.process.poll() is None:
+            one.process.kill()
+            one.process.wait()
+
+
+@pytest.mark.parametrize('arguments', [
+    ['--params-file', 'nosuch.yaml'],
+    ['--params-file', 'BROKEN'],
+    ['-r', 'foo'],
+    ['-p', 'svp'],
+    ['-r', '__node:=9x'],
+    ['--nosuch'],
+    ['-p', 'lens:=nothere'],
+    ['-p', 'patience:=-1.0'],
+    ['-p', 'qos_overrides./image_points.subscription.reliability:=sometimes'],
+])
+def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
+    start, arguments: list[str], tmp_path: Path  # type: ignore[no-untyped-def]
+) -> None:
+    broken = tmp_path / 'broken.yaml'
+    broken.write_text('/**:\n  ros__parameters: {lens: [fish214\n')
+    given = [str(broken) if word == 'BROKEN' else word for word in arguments]
+    node = start('localizer', '--ros-args', *given)
+    assert node.finish() == 2
+    told = [line for line in node.lines if line.startswith('localizer: ')]
+    assert len(told) == 1 and len(told[0]) > 20, node.lines
+    assert 'Traceback' not in '\n'.join(node.lines)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('after', [0.0, 0.3, 0.6, 1.0, 1.5, 2.2])
+def test_a_signal_while_a_node_starts_ends_it_quietly(
+    start, number: signal.Signals, after: float  # type: ignore[no-untyped-def]
+) -> None:
+    node = start('localizer', '--ros-args', '-p', 'lens:=fish214')
+    node.wait_for('loading')
+    time.sleep(after)
+    status = node.finish(number)
+    assert 'Traceback' not in '\n'.join(node.lines), node.lines
+    assert status in (0, 130, -number)
