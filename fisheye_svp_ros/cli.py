@@ -44,28 +44,8 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code: 2, after one line on stderr, for bad input."""
-    arguments = sys.argv[1:] if arguments is None else arguments
-    parser = _Parser(
-        prog='fisheye-svp',
-        description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
-        'simulation gets wrong about measured image points.',
-    )
-    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    for name, purpose in COMMANDS.items():
-        commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
-    named = next((word for word in arguments if not word.startswith('-')), '')
     try:
-        if named in COMMANDS:
-            module = import_module(f'fisheye_svp_ros.commands.{named}')
-            module.add_arguments(commands.choices[named])
-            commands.choices[named].set_defaults(run=module.run)
-        if named in _SOLVING:
-            _add_engine(commands.choices[named])
-        parsed = parser.parse_args(arguments)
-        if named in _SOLVING and parsed.engine:
-            import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
-        parsed.run(parsed)
-        sys.stdout.flush()
+        _run(sys.argv[1:] if arguments is None else arguments)
     except FisheyeSvpError as error:
         print(f'fisheye-svp: {error}', file=sys.stderr)
         return _BAD_INPUT
@@ -82,6 +62,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
     return 0
+
+
+def _run(arguments: Sequence[str]) -> None:
+    parser = _Parser(
+        prog='fisheye-svp',
+        description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
+        'simulation gets wrong about measured image points.',
+    )
+    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    for name, purpose in COMMANDS.items():
+        commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
+    named = next((word for word in arguments if not word.startswith('-')), '')
+    if named in COMMANDS:
+        module = import_module(f'fisheye_svp_ros.commands.{named}')
+        module.add_arguments(commands.choices[named])
+        commands.choices[named].set_defaults(run=module.run)
+    if named in _SOLVING:
+        _add_engine(commands.choices[named])
+    parsed = parser.parse_args(arguments)
+    if named in _SOLVING and parsed.engine:
+        import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
+    parsed.run(parsed)
+    sys.stdout.flush()
 
 
 def _add_engine(parser: argparse.ArgumentParser) -> None:

@@ -30,7 +30,8 @@ def start(ros_domain: int):  # type: ignore[no-untyped-def]
 
     def run(node: str, *arguments: str) -> NodeProcess:
         path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
-        env = os.environ | {'ROS_DOMAIN_ID': str(ros_domain), 'PYTHONPATH': path}
+        env = os.environ | {'ROS_DOMAIN_ID': str(ros_domain), 'PYTHONPATH': path,
+                            'FISHEYE_SVP_ENGINE': 'numpy'}
         started.append(NodeProcess([sys.executable, '-c', _CODE, node, *arguments], env))
         return started[-1]
 
