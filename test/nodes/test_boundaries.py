@@ -140,7 +140,7 @@ def many_fields(count: int) -> Any:
 def test_a_hostile_message_is_refused_with_a_reason_and_counted(
     graph: Callable[..., Graph], topic: str, message: Callable[[], Any], reason: str
 ) -> None:
-    attack = Attack(graph('patience:=0.3', 'lens:=fish214'))
+    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true'))
     getattr(attack, topic).publish(message())
     name = {'points': 'image_points', 'truth': 'true_pose'}.get(topic, topic)
     attack.graph.until(lambda: attack.counts()[f'{name}: dropped'] == '1')
@@ -156,7 +156,7 @@ def test_what_nobody_thought_of_is_told_once_counted_and_survived(
     def fail(*_: Any) -> None:
         raise np.linalg.LinAlgError('SVD did not converge')
 
-    attack = Attack(graph('patience:=0.3', 'lens:=fish214'))
+    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true'))
     with monkeypatch.context() as patch:
         patch.setattr(Localizer, 'solve', fail)
         attack.landmarks.publish(attack.cloud)
@@ -203,7 +203,7 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
         time.sleep(0.02)
         solve(*arguments)
 
-    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'backlog:=5'))
+    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true', 'backlog:=5'))
     attack.solves(1)
     attack.counts()
     monkeypatch.setattr(Localizer, 'solve', slowly)
@@ -224,13 +224,13 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
 
 
 def test_landmarks_that_are_not_latched_are_heard(graph: Callable[..., Graph]) -> None:
-    attack = Attack(graph('patience:=0.3', 'lens:=fish214'), landmarks=RELIABLE)
+    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true'), landmarks=RELIABLE)
     attack.solves(3)
     assert attack.counts()['landmarks: received'] == '1'
 
 
 def test_landmarks_that_are_latched_are_heard_late_and_once(graph: Callable[..., Graph]) -> None:
-    g = graph('patience:=0.3', 'lens:=fish214')
+    g = graph('patience:=0.3', 'lens:=fish214', 'svp:=true')
     early = g.probe.create_publisher(PointCloud2, 'landmarks', LATCHED)
     early.publish(messages.landmarks_message(environment('whole', 2.0), 0, 'world'))
     attack = Attack(g)
