@@ -19,6 +19,7 @@ COMMANDS = {
     'budget': 'at which range and angle the SVP error passes what the application allows',
     'calibrate': 'a lens from measured observations: poses unknown, no start values',
     'demo': 'the whole node graph as processes, recorded, summarised and plotted',
+    'detect': 'photographs, video or recordings of a board to observations',
     'diagnose': 'what a simulation gets wrong about measured observations, and why',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'paper': "Kita's tables and figures beside the published ones, and past them",
@@ -29,7 +30,7 @@ COMMANDS = {
     'table': 'a recording to a table, one row an input stamp',
     'watch': 'the results of running nodes, live, in the terminal',
 }
-_SOLVING = ('budget', 'calibrate', 'demo', 'diagnose', 'localize', 'paper', 'sweep')
+_SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 _BROKEN_PIPE = 141  # 128 + SIGPIPE

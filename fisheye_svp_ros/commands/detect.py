@@ -1,0 +1,81 @@
+"""`fisheye-svp detect`: photographs of a board to observations."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.detect.detection import Detection
+
+_SHOWN = 12
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    from fisheye_svp_ros.commands.photographs import add_board_arguments
+
+    parser.add_argument('photographs', nargs='+', metavar='PHOTOS',
+                        help='image files, folders of them (left/ and right/ for a rig), videos, '
+                        'rosbag2 recordings with Image or CompressedImage')
+    add_board_arguments(parser, required=True)
+    parser.add_argument('-o', '--output', type=Path, metavar='OBS.csv',
+                        help='observations to write; what was found where goes beside them as '
+                        '.detect.json')
+    parser.add_argument('--overlays', type=Path, metavar='DIR',
+                        help='folder for each photograph with its corners, and a coverage map')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Search all photographs, say what was found, write the observations."""
+    from fisheye_svp_ros.commands.photographs import search
+    from fisheye_svp_ros.detect.photographs import find_photographs
+    from fisheye_svp_ros.io.readers import write_observations
+    from fisheye_svp_ros.io.results import write_json
+
+    detection = search(args.photographs, args)
+    _print(detection, args.board)
+    if args.output:
+        write_observations(args.output, detection.observations)
+        write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))
+    if args.overlays:
+        from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
+
+        write_overlays(find_photographs(args.photographs, args.every), detection, args.overlays)
+        write_coverage(detection, args.overlays / 'coverage.png')
+
+
+def _print(detection: Detection, board: str) -> None:
+    import numpy as np
+
+    table, found = detection.observations, [one for one in detection.searched if one.points]
+    print(f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
+          f'{len(table)} points, sigma {np.median(table.sigma):.3f} px (median)')
+    sure = detection.certainty[[one.points is not None for one in detection.searched]]
+    if np.isnan(sure).any():
+        print('  the board looks the same when turned, and too few photographs tell how it lies')
+    elif (sure < 1).any():
+        print('  the board looks the same when turned; photographs were turned until their '
+              f'residuals agree: {100 * sure.mean():.1f} % sure on average, '
+              f'{100 * sure.min():.0f} % at worst')
+
+
+def _document(detection: Detection, board: str) -> dict[str, Any]:
+    rows = zip(detection.searched, detection.frames.tolist(), detection.certainty.tolist(),
+               strict=True)
+    return {
+        'board': board,
+        'image_size': list(detection.image_size),
+        'photographs': [
+            {
+                'name': one.name, 'camera': one.camera, 'frame': frame,
+                'points': len(one.points.ids) if one.points else 0,
+                'reason': one.reason, 'notes': list(one.notes),
+                'blur_px': one.points.blur if one.points else None,
+                'sigma_px': float(one.points.sigma.mean()) if one.points else None,
+                'full_scale': one.bright, 'order_certainty': sure if one.points else None,
+            }
+            for one, frame, sure in rows
+        ],
+    }

@@ -1,0 +1,78 @@
+"""Photographs in place of observations: the arguments for it, the search, what it says."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fisheye_svp_ros.errors import ParameterError
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.detect.detection import Detection
+    from fisheye_svp_ros.scene.observations import Observations
+
+_SHOWN = 12
+
+
+def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
+    """Declare what a search for a board in photographs needs."""
+    from fisheye_svp_ros.detect.finders import DETECTORS
+
+    parser.add_argument('--board', required=required, metavar='SPEC',
+                        help='what the photographs show: chessboard:9x6:24.23mm (inner corners), '
+                        'charuco:7x5:30mm:22mm:DICT_5X5_100, aprilgrid:target.yaml, '
+                        'circles:7x5:20mm[:asymmetric], squares:3x4:30mm:30mm (side, gap)')
+    parser.add_argument('--detector', choices=DETECTORS, default='',
+                        help='what finds the points; by default the best for the board')
+    parser.add_argument('--every', type=_count, default=1, metavar='N',
+                        help='take one of N photographs or video frames')
+
+
+def measured(path: str, args: argparse.Namespace) -> tuple[Observations, tuple[int, int] | None]:
+    """Return observations from a file, or from photographs, with the size of their images.
+
+    Raises ObservationError for anything missing or malformed, ParameterError for photographs
+    without a board.
+    """
+    from fisheye_svp_ros.detect.photographs import is_photographs
+    from fisheye_svp_ros.io.readers import read_observations
+
+    if args.board:
+        detection = search([path], args)
+        return detection.observations, detection.image_size
+    if is_photographs(Path(path)):
+        raise ParameterError(f'{path}: these are photographs; say what they show, for example '
+                             '--board chessboard:9x6:24mm')
+    return read_observations(path), None
+
+
+def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
+    """Search photographs for the board; say which have none, and which are odd."""
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.detect.detection import detect
+    from fisheye_svp_ros.detect.finders import DETECTORS
+    from fisheye_svp_ros.detect.patterns import parse_pattern
+    from fisheye_svp_ros.detect.photographs import count_photographs, find_photographs
+    from fisheye_svp_ros.reporting.progress import progress
+
+    pattern = parse_pattern(args.board)
+    if args.detector and pattern.kind not in DETECTORS[args.detector][0]:
+        raise ParameterError(f'--detector {args.detector} does not find {args.board}')
+    with progress('searching', count_photographs(paths, args.every)) as done:
+        detection = detect(find_photographs(paths, args.every), pattern, args.detector,
+                           progress=done, source=', '.join(paths))
+    odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
+           for one in detection.searched if one.reason or one.notes]
+    for line in odd[:_SHOWN]:
+        say(line)
+    if len(odd) > _SHOWN:
+        say(f'and {len(odd) - _SHOWN} more such photographs')
+    return detection
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not int(text):
+        raise argparse.ArgumentTypeError(f'{text!r} is not a whole number above 0')
+    return int(text)

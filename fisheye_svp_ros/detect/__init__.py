@@ -1,0 +1,1 @@
+"""Photographs to observations: sources, detectors, the order of corners, their uncertainty."""

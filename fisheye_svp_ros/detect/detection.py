@@ -1,0 +1,268 @@
+"""From photographs to observations: every photograph searched, the odd ones named."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.finders import default_detector
+from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals
+from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.photographs import Photograph, Pixels, exif_turned
+from fisheye_svp_ros.detect.points import Points, find_points
+from fisheye_svp_ros.detect.workers import Late, bounded_map
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.solve.lens_calibration import calibrate
+
+SECONDS = 30.0  # a photograph
+_BLURRED = 1.5  # times the median blur, and px
+_BURNT = 0.02  # of the board's pixels as bright as pixels can be
+_SAME_PLACE = 0.3  # px
+_UNCERTAIN = 0.9
+_UNTURNED = 'asks to be shown turned; taken as the sensor lay'
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """One photograph after the search; points: None where there is no board, `reason` says why.
+
+    notes: what is odd about it; bright: share of the board's pixels at the end of the scale.
+    """
+
+    name: str
+    key: str
+    camera: str
+    t: float
+    size: tuple[int, int] = (0, 0)
+    points: Points | None = None
+    reason: str = ''
+    notes: tuple[str, ...] = ()
+    bright: float = 0.0
+    digest: str = ''
+
+
+class Detection(NamedTuple):
+    """observations of all photographs with a board; searched: all of them, in their order.
+
+    frame of each is that of its row in `frames` (S,), -1 without a board; image_size: width,
+    height; certainty (S,): of the order of corners, 1 where the board tells it, NaN unknown.
+    """
+
+    observations: Observations
+    searched: tuple[Searched, ...]
+    frames: Index
+    image_size: tuple[int, int]
+    certainty: Array
+
+
+class _Task(NamedTuple):
+    photograph: Photograph
+    pattern: Pattern
+    detector: str
+
+
+def detect(
+    photographs: Iterable[Photograph],
+    pattern: Pattern,
+    detector: str = '',
+    seconds: float = SECONDS,
+    progress: Callable[[], object] = lambda: None,
+    source: str = 'photographs',
+) -> Detection:
+    """Search photographs for a board, in processes of their own, `seconds` at most for each.
+
+    progress is called after each.  Raises ObservationError where no photograph shows the board.
+    """
+    taken: list[Photograph] = []
+    results: dict[int, Searched] = {}
+
+    def tasks() -> Iterable[_Task]:
+        for photograph in photographs:
+            # Pixels of a video would fill the memory.
+            taken.append(replace(photograph, data=b''))
+            yield _Task(photograph, pattern, detector or default_detector(pattern))
+
+    for number, result in bounded_map(examine, tasks(), seconds):
+        if isinstance(result, Late):
+            one = taken[number]
+            why = f'no board within {seconds:g} s' if result.timed_out else 'the search crashed'
+            result = Searched(one.name, one.key, one.camera, one.t, reason=why)
+        results[number] = result
+        progress()
+    searched = _noted(_one_size([results[number] for number in sorted(results)]))
+    if not any(one.points for one in searched):
+        reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
+        said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
+        raise ObservationError(f'{source}: no {pattern.spec} in {len(searched)} photographs: '
+                               f'{said}; check kind and size of the board')
+    return _table(searched, pattern, source)
+
+
+def examine(task: _Task) -> Searched:
+    """Search one photograph; what is wrong with it becomes its reason."""
+    photograph, pattern, detector = task
+    blank = Searched(photograph.name, photograph.key, photograph.camera, photograph.t)
+    try:
+        pixels = photograph.pixels()
+        notes = (_UNTURNED,) if _turned(photograph) else ()
+        points = find_points(pixels, pattern, detector)
+    except (FisheyeSvpError, cv2.error, MemoryError) as cause:
+        text = str(cause).removeprefix(f'{photograph.name}: ')
+        return replace(blank, reason=text.splitlines()[0] if text else 'not enough memory')
+    size = (int(pixels.shape[1]), int(pixels.shape[0]))
+    if isinstance(points, str):
+        return replace(blank, size=size, reason=points, notes=notes)
+    digest = hashlib.sha1(pixels.tobytes()).hexdigest()
+    return replace(blank, size=size, points=points, notes=notes, digest=digest,
+                   bright=_bright(pixels, points))
+
+
+def _turned(photograph: Photograph) -> bool:
+    data = photograph.data
+    if isinstance(data, Path):
+        with data.open('rb') as stream:
+            data = stream.read(65536)
+    return isinstance(data, bytes) and exif_turned(data)
+
+
+def _bright(pixels: Pixels, points: Points) -> float:
+    mask = np.zeros(pixels.shape, np.uint8)
+    hull = cv2.convexHull(np.round(points.uv).astype(np.int32).reshape(-1, 1, 2))
+    cv2.fillConvexPoly(mask, hull, 1)
+    board = pixels[mask > 0]
+    return float((board >= np.iinfo(pixels.dtype).max).mean()) if board.size else 0.0
+
+
+def _one_size(searched: list[Searched]) -> list[Searched]:
+    """Leave out photographs of another size than the others of their camera."""
+    sizes = {
+        camera: Counter(one.size for one in searched if one.camera == camera and one.size[0])
+        for camera in {one.camera for one in searched}
+    }
+    usual = {camera: count.most_common(1)[0][0] if count else (0, 0)
+             for camera, count in sizes.items()}
+    return [
+        one if not one.size[0] or one.size == usual[one.camera] else replace(
+            one, points=None,
+            reason='is {}x{} px; the others are {}x{}'.format(*one.size, *usual[one.camera]))
+        for one in searched
+    ]
+
+
+def _noted(searched: list[Searched]) -> tuple[Searched, ...]:
+    """Leave out copies; name photographs that are blurred, burnt out or from the same place."""
+    blur = float(np.median([one.points.blur for one in searched if one.points] or [0.0]))
+    done: list[Searched] = []
+    for one in searched:
+        if one.points is None:
+            done.append(one)
+            continue
+        notes = list(one.notes)
+        if one.points.blur > max(_BLURRED, _BLURRED * blur):
+            notes.append(f'blurred by {one.points.blur:.1f} px')
+        if one.bright > _BURNT:
+            notes.append(f'over-exposed: {100 * one.bright:.0f} % of the board at full scale')
+        for other in (o for o in done if o.points is not None and o.camera == one.camera):
+            if one.digest == other.digest:
+                one = replace(one, points=None, reason=f'a copy of {other.name}')
+                break
+            if _together(one, other):
+                notes.append(f'from the same place as {Path(other.name).name}')
+                break
+        done.append(replace(one, notes=tuple(notes)))
+    return tuple(done)
+
+
+def _together(one: Searched, other: Searched) -> bool:
+    a, b = one.points, other.points
+    if a is None or b is None:
+        return False
+    _, mine, theirs = np.intersect1d(a.ids, b.ids, return_indices=True)
+    return len(mine) > 3 and float(np.abs(a.uv[mine] - b.uv[theirs]).max()) < _SAME_PLACE
+
+
+def _table(searched: tuple[Searched, ...], pattern: Pattern, source: str) -> Detection:
+    keys = sorted({one.key for one in searched}, key=[o.key for o in searched].index)
+    number = {key: i for i, key in enumerate(keys)}
+    cameras = tuple(sorted({one.camera for one in searched if one.points}))
+    found = [one for one in searched if one.points is not None]
+    certainty = np.ones(len(searched))
+    if len(pattern.symmetries) > 1:
+        found, sure = _agreed(found, pattern, cameras, number, source)
+        certainty[[one.points is not None for one in searched]] = sure
+        again = iter(found)
+        searched = tuple(next(again) if one.points is not None else one for one in searched)
+    frames = np.array([number[one.key] if one.points else -1 for one in searched])
+    observations = _observations(found, pattern, cameras, number, source)
+    return Detection(observations, searched, frames, found[0].size, certainty)
+
+
+def _agreed(
+    found: list[Searched], pattern: Pattern, cameras: tuple[str, ...], number: dict[str, int],
+    source: str,
+) -> tuple[list[Searched], Array]:
+    """Return the photographs with their corners in one order, and how sure that is."""
+    table = _observations(found, pattern, cameras, number, source)
+    field = np.full((len(found), len(pattern.points), 2), np.nan)
+    for camera, name in enumerate(cameras):
+        mine = {number[one.key]: i for i, one in enumerate(found) if one.camera == name}
+        size = next(one.size for one in found if one.camera == name)
+        try:
+            fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt', size)
+        except FisheyeSvpError:
+            continue
+        views = fitted.views
+        for view, frame in enumerate(views.frame.tolist()):
+            used = views.used[view]
+            field[mine[frame], views.landmark[view, used]] = board_residuals(
+                views.points[view, used, :2], views.uv[view, used],
+                fitted.adjusted.residual[view, used])
+    seen = np.isfinite(field).any(axis=(1, 2))
+    sure = np.full(len(found), np.nan)
+    if seen.sum() < 3:
+        return found, sure
+    agreement: Agreement = agree(field[seen], pattern.symmetries)
+    sure[seen] = agreement.certainty
+    done = list(found)
+    for i, turn in zip(np.flatnonzero(seen), agreement.turn, strict=True):
+        points = found[i].points
+        assert points is not None
+        source_of = pattern.symmetries[turn].source
+        where = np.argsort(source_of)
+        order = np.argsort(where[points.ids], kind='stable')
+        turned = points._replace(ids=where[points.ids][order], uv=points.uv[order],
+                                 sigma=points.sigma[order], reach=points.reach[order])
+        notes = found[i].notes
+        if sure[i] < _UNCERTAIN:
+            notes = (*notes, f'order of corners {100 * sure[i]:.0f} % sure')
+        done[i] = replace(found[i], points=turned, notes=notes)
+    return done, sure
+
+
+def _observations(
+    found: list[Searched], pattern: Pattern, cameras: tuple[str, ...], number: dict[str, int],
+    source: str,
+) -> Observations:
+    points = [one.points for one in found if one.points is not None]
+    count = [len(one.ids) for one in points]
+    index = np.concatenate([one.ids for one in points])
+
+    def column(values: list[float]) -> Array:
+        return np.repeat(np.array(values, dtype=float), count)
+
+    return make_observations(
+        column([number[one.key] for one in found]).astype(np.int64), index,
+        np.concatenate([one.uv for one in points]), pattern.points[index],
+        camera=column([cameras.index(one.camera) for one in found]).astype(np.int64),
+        t=column([one.t for one in found]), cameras=cameras, source=source,
+        sigma=np.concatenate([one.sigma for one in points]),
+    )

@@ -1,0 +1,173 @@
+"""Finders: where the points of a pattern are, roughly, in a grey 8-bit image.
+
+A finder returns None, or which points it found (M,) and where, (M, 2), px.  OpenCV's own; its
+aruco module changed its interface in 4.7.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.square_grid import find_squares
+from fisheye_svp_ros.errors import ParameterError
+
+Grey = NDArray[np.uint8]
+Found = tuple[Index, Array]
+Finder = Callable[[Grey, Pattern], Found | None]
+
+_ARUCO: Any = cv2.aruco
+_SEARCHED = 1600  # px; larger images are searched smaller first
+_CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+_SB = cv2.CALIB_CB_ACCURACY
+_SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
+
+
+def _smaller(find: Finder) -> Finder:
+    """Return a finder that searches large images at a smaller scale first."""
+    def search(image: Grey, pattern: Pattern) -> Found | None:
+        scale = _SEARCHED / max(image.shape)
+        if scale < 1:
+            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            found = find(small, pattern)
+            if found is not None:
+                return found[0], (found[1] + 0.5) / scale - 0.5
+        return find(image, pattern)
+
+    return search
+
+
+def classic(image: Grey, pattern: Pattern) -> Found | None:
+    """cv2.findChessboardCorners."""
+    ok, corners = cv2.findChessboardCorners(
+        image, (pattern.columns, pattern.rows), flags=_CLASSIC
+    )
+    return _all(ok, corners)
+
+
+def sector_based(image: Grey, pattern: Pattern) -> Found | None:
+    """cv2.findChessboardCornersSB (Duda and Frese, BMVC 2018), thoroughly where need be."""
+    for flags in (_SB, _SB_HARD):
+        ok, corners = cv2.findChessboardCornersSB(
+            image, (pattern.columns, pattern.rows), flags=flags
+        )
+        if ok:
+            return _all(ok, corners)
+    return None
+
+
+def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
+    """cv2.findChessboardCorners and cv2.cornerSubPix, as most programs do it."""
+    found = classic(image, pattern)
+    if found is None:
+        return None
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
+    corners = found[1].astype(np.float32).reshape(-1, 1, 2)
+    refined = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), criteria)
+    return _all(True, refined)
+
+
+def chessboard(image: Grey, pattern: Pattern) -> Found | None:
+    """The classic search, which is fast, and where it fails the sector-based one."""
+    return classic(image, pattern) or sector_based(image, pattern)
+
+
+def circles(image: Grey, pattern: Pattern) -> Found | None:
+    """cv2.findCirclesGrid, bright on dark as well."""
+    asymmetric = pattern.kind == 'asymmetric_circles'
+    flags = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    for picture in (image, cv2.bitwise_not(image)):
+        ok, centres = cv2.findCirclesGrid(
+            picture, (pattern.columns, pattern.rows), flags=flags | cv2.CALIB_CB_CLUSTERING
+        )
+        if ok:
+            return _all(ok, centres)
+    return None
+
+
+def charuco(image: Grey, pattern: Pattern) -> Found | None:
+    """Chessboard corners between ArUco markers, by cv2.aruco; parts of a board as well."""
+    dictionary = _dictionary(pattern)
+    size = (pattern.columns, pattern.rows)
+    if hasattr(_ARUCO, 'CharucoDetector'):
+        board = _ARUCO.CharucoBoard(size, pattern.size, pattern.marker, dictionary)
+        corners, ids, _, _ = _ARUCO.CharucoDetector(board).detectBoard(image)
+    else:
+        board = _ARUCO.CharucoBoard_create(*size, pattern.size, pattern.marker, dictionary)
+        tags, tag_ids, _ = _ARUCO.detectMarkers(image, dictionary)
+        if tag_ids is None:
+            return None
+        _, corners, ids = _ARUCO.interpolateCornersCharuco(tags, tag_ids, image, board)
+    if ids is None or len(ids) < 4:
+        return None
+    return ids.ravel().astype(np.int64), corners.reshape(-1, 2).astype(float)
+
+
+def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
+    """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
+    dictionary = _dictionary(pattern)
+    if hasattr(_ARUCO, 'ArucoDetector'):
+        parameters = _ARUCO.DetectorParameters()
+        parameters.markerBorderBits = 2
+        tags, ids, _ = _ARUCO.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    else:
+        parameters = _ARUCO.DetectorParameters_create()
+        parameters.markerBorderBits = 2
+        tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
+    if ids is None:
+        return None
+    known = {int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)
+             if tag < pattern.columns * pattern.rows}
+    if not known:
+        return None
+    index = np.concatenate([4 * tag + np.arange(4) for tag in known])
+    # OpenCV goes clockwise from a tag's upper left, Kalibr the other way from its lower left.
+    uv = np.concatenate([corners.reshape(4, 2)[[3, 2, 1, 0]] for corners in known.values()])
+    return index, uv.astype(float)
+
+
+def squares(image: Grey, pattern: Pattern) -> Found | None:
+    """Separate dark squares: four-cornered contours, put into a grid from square to square."""
+    return find_squares(image, pattern)
+
+
+DETECTORS: dict[str, tuple[tuple[str, ...], Finder]] = {
+    'saddle': (('chessboard',), _smaller(chessboard)),
+    'sb': (('chessboard',), sector_based),
+    'classic': (('chessboard',), classic_subpixel),
+    'charuco': (('charuco',), charuco),
+    'aprilgrid': (('aprilgrid',), aprilgrid),
+    'circles': (('circles', 'asymmetric_circles'), _smaller(circles)),
+    'squares': (('squares',), squares),
+}
+AS_FOUND = ('sb', 'classic', 'circles')  # take their own points; the others are fitted
+
+
+def default_detector(pattern: Pattern) -> str:
+    """Return the name of the detector that a pattern is searched with."""
+    return next(name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds)
+
+
+def _all(ok: bool, corners: Any) -> Found | None:
+    if not ok:
+        return None
+    uv = np.asarray(corners, dtype=float).reshape(-1, 2)
+    return np.arange(len(uv)), uv
+
+
+def _dictionary(pattern: Pattern) -> Any:
+    number = getattr(_ARUCO, pattern.dictionary, None)
+    number = getattr(_ARUCO, pattern.dictionary.lower().replace('dict_apriltag',
+                     'DICT_APRILTAG'), None) if number is None else number
+    if number is None:
+        raise ParameterError(f'board {pattern.spec!r}: OpenCV has no dictionary '
+                             f'{pattern.dictionary}')
+    if hasattr(_ARUCO, 'getPredefinedDictionary'):
+        return _ARUCO.getPredefinedDictionary(number)
+    return _ARUCO.Dictionary_get(number)

@@ -1,0 +1,78 @@
+"""The same order of corners in every photograph of a board that looks the same when turned.
+
+Single corners are never quite where they should be, and what is wrong with them turns with the
+board.  After a calibration that believes them, each view's residuals are a picture of those
+errors; views are turned until their pictures agree.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.patterns import Turn
+from fisheye_svp_ros.detect.points import local_axes
+
+_ROUNDS = 30
+
+
+class Agreement(NamedTuple):
+    """Which turn each view (V,) needs, and how likely it is the right one of two, 0.5 to 1."""
+
+    turn: Index
+    certainty: Array
+
+
+def board_residuals(points: Array, uv: Array, residual: Array) -> Array:
+    """Return residuals (M, 2), px, of points (M, 2), m, seen at uv (M, 2), as m on the board."""
+    axes = local_axes(points, uv)
+    return np.asarray(np.linalg.solve(np.swapaxes(axes, -1, -2), residual[..., None])[..., 0])
+
+
+def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
+    """Return how views must be turned to agree on residuals (V, N, 2) on the board, NaN unseen.
+
+    turns: those that nothing in the print tells apart, the first of them none.
+    """
+    field = np.nan_to_num(field)
+    turned = np.stack([field[:, turn.source] @ turn.matrix.T for turn in turns])
+    turned = turned.reshape(len(turns), len(field), -1)
+    turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
+    # Views alike in all turns say nothing: start from each view in turn, keep the best agreement.
+    found = [_settled(turned, turned[0, seed]) for seed in range(len(field))]
+    choice = max(found, key=lambda one: _likeness(turned, one)[one, np.arange(len(one))].sum())
+    likeness = _likeness(turned, choice)
+    ranked = np.sort(likeness, axis=0)
+    margin = (ranked[-1] - ranked[-2]) / 2
+    return Agreement(choice, _certainty(margin))
+
+
+def _settled(turned: Array, first: Array) -> Index:
+    choice: Index = (turned @ first).argmax(axis=0)
+    for _ in range(_ROUNDS):
+        better = _likeness(turned, choice).argmax(axis=0)
+        if np.array_equal(better, choice):
+            break
+        choice = better
+    return choice
+
+
+def _likeness(turned: Array, choice: Index) -> Array:
+    """Likeness (G, V) of each view, in each turn, to the mean of all others."""
+    chosen = turned[choice, np.arange(len(choice))]
+    others = chosen.sum(axis=0) - chosen
+    others /= np.maximum(np.linalg.norm(others, axis=-1, keepdims=True), 1e-30)
+    return np.asarray((turned * others).sum(axis=-1))
+
+
+def _certainty(margin: Array) -> Array:
+    """Chances, from margins that are +-mean with Gaussian scatter, by their moments.
+
+    The fourth moment tells a mean from scatter, although every view was turned to agree.
+    """
+    second, fourth = (margin**2).mean(), (margin**4).mean()
+    mean2 = np.sqrt(max((3 * second**2 - fourth) / 2, 0.0))
+    scatter2 = max(second - mean2, 1e-3 * second, 1e-30)
+    return np.asarray(1 / (1 + np.exp(-np.minimum(2 * np.sqrt(mean2) * margin / scatter2, 50))))

@@ -1,0 +1,208 @@
+"""Patterns: what is printed on a board, given by one line of text such as chessboard:9x6:24mm."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.files import read_yaml
+
+_UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
+_LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
+_SIZE = re.compile(r'([0-9]+)x([0-9]+)', re.IGNORECASE)
+_LARGEST = 10_000  # points
+_FURTHEST = 10.0  # m; a larger spacing is a slip of the unit
+
+
+class Turn(NamedTuple):
+    """A turn of a board: source (N,), the point that lands on each; matrix (2, 2); same print."""
+
+    source: Index
+    matrix: Array
+    same: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """The points of a flat board, and what a detector must know of them.
+
+    points (N, 3), m, z = 0; columns, rows: as written in `spec`; clearance: how far around a
+    point, m, nothing but its own edges is printed; inward (N, 2): towards the dark corner of a
+    square grid, along the board's axes; tint (N,): 1 where the square towards +x, +y is bright,
+    -1 where it is dark, 0 where there is none; marker: side of a tag, m; dictionary: of tags.
+    """
+
+    kind: str
+    spec: str
+    columns: int
+    rows: int
+    points: Array
+    clearance: float
+    inward: Array
+    tint: Array
+    size: float
+    marker: float = 0.0
+    dictionary: str = ''
+
+    @cached_property
+    def turns(self) -> tuple[Turn, ...]:
+        """The quarter turns that put every point on a point; the first is none."""
+        if self.marker:
+            return (Turn(np.arange(len(self.points)), np.eye(2), True),)
+        low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
+        xy = self.points[:, :2] - (low + high) / 2
+        found = []
+        for quarter, (cos, sin) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
+            turn = np.array([[cos, -sin], [sin, cos]], dtype=float)
+            distance = np.abs((xy @ turn.T)[None] - xy[:, None]).max(axis=-1)
+            source = np.argmin(distance, axis=1)
+            if distance[np.arange(len(xy)), source].max() > 1e-6 * self.size:
+                continue
+            # A quarter turn carries the square towards +x, +y to the one towards -x, +y.
+            same = np.array_equal(self.tint[source] * (-1) ** quarter, self.tint)
+            if np.allclose(self.inward[source] @ turn.T, self.inward):
+                found.append(Turn(source, turn, same))
+        return tuple(found)
+
+    @property
+    def symmetries(self) -> tuple[Turn, ...]:
+        """The turns that nothing in the print tells apart."""
+        return tuple(turn for turn in self.turns if turn.same)
+
+
+def parse_pattern(spec: str) -> Pattern:
+    """Return the pattern that a line of text names.
+
+    chessboard:9x6:24mm (inner corners, spacing); charuco:7x5:30mm:22mm:DICT_5X5_100 (squares, side
+    of a square and of a marker, ArUco dictionary); aprilgrid:target.yaml (Kalibr's target file);
+    circles:7x5:20mm and circles:4x11:20mm:asymmetric (spacing as OpenCV counts it: half of that
+    within a row of the asymmetric grid); squares:3x4:30mm:30mm (separate squares, side and gap).
+    Raises ParameterError, with what is expected, for anything else.
+    """
+    kind, _, rest = spec.partition(':')
+    if kind not in PATTERNS:
+        raise ParameterError(f'board {spec!r}: known kinds are {", ".join(PATTERNS)}; for example '
+                             'chessboard:9x6:24mm, which counts inner corners')
+    return PATTERNS[kind](spec, rest.split(':') if rest else [])
+
+
+def _chessboard(spec: str, words: list[str]) -> Pattern:
+    (columns, rows), (size,) = _numbers(spec, words, 1, least=3)
+    points = _grid(columns, rows, size)
+    return Pattern('chessboard', spec, columns, rows, points, size, _none(points),
+                   _checks(columns, rows), size)
+
+
+def _charuco(spec: str, words: list[str]) -> Pattern:
+    dictionary = words.pop().upper() if len(words) > 3 else 'DICT_5X5_100'
+    (columns, rows), (size, marker) = _numbers(spec, words, 2, least=3)
+    if marker >= size:
+        raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
+    points = _grid(columns - 1, rows - 1, size)
+    return Pattern('charuco', spec, columns, rows, points, (size - marker) / 2, _none(points),
+                   _checks(columns - 1, rows - 1), size, marker, dictionary)
+
+
+def _circles(spec: str, words: list[str]) -> Pattern:
+    asymmetric = words[-1:] == ['asymmetric']
+    (columns, rows), (size,) = _numbers(spec, words[:-1] if asymmetric else words, 1, least=3)
+    points = _grid(columns, rows, size)
+    if asymmetric:
+        row = np.repeat(np.arange(rows), columns)
+        points[:, 0] = 2 * points[:, 0] + (row % 2) * size
+    kind = 'asymmetric_circles' if asymmetric else 'circles'
+    return Pattern(kind, spec, columns, rows, points, 0.5 * size, _none(points),
+                   np.zeros(len(points)), size)
+
+
+def _squares(spec: str, words: list[str]) -> Pattern:
+    (columns, rows), (side, gap) = _numbers(spec, words, 2, least=1)
+    corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
+    tiles = _grid(columns, rows, side + gap)[:, None, :2] + side * corner
+    points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
+    inward = np.tile(1 - 2 * corner, (columns * rows, 1))
+    return Pattern('squares', spec, columns, rows, points, min(side, gap), inward,
+                   np.zeros(len(points)), side)
+
+
+def _aprilgrid(spec: str, words: list[str]) -> Pattern:
+    path = Path(':'.join(words))
+    document = read_yaml(path, ParameterError)
+    if document.get('target_type') != 'aprilgrid':
+        raise ParameterError(f'{path}: target_type is {document.get("target_type")!r}; the YAML '
+                             'of a Kalibr aprilgrid is needed')
+    columns, rows = (int(_positive(document, name, path)) for name in ('tagCols', 'tagRows'))
+    tag, ratio = (_positive(document, name, path) for name in ('tagSize', 'tagSpacing'))
+    # As Kalibr has it: x right, y up, tags and the corners of each from the lower left.
+    corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
+    tiles = _grid(columns, rows, tag * (1 + ratio))[:, None, :2] + tag * corner
+    points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
+    clearance = tag * min(ratio, 0.2)  # the border of a tag is two of its ten cells
+    return Pattern('aprilgrid', spec, columns, rows, points, clearance, _none(points),
+                   np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, 'DICT_APRILTAG_36H11')
+
+
+PATTERNS: dict[str, Callable[[str, list[str]], Pattern]] = {
+    'chessboard': _chessboard,
+    'charuco': _charuco,
+    'aprilgrid': _aprilgrid,
+    'circles': _circles,
+    'squares': _squares,
+}
+
+
+def _numbers(
+    spec: str, words: list[str], lengths: int, least: int
+) -> tuple[tuple[int, int], list[float]]:
+    size = _SIZE.fullmatch(words[0]) if words else None
+    if size is None or len(words) != 1 + lengths:
+        raise ParameterError(f'board {spec!r}: columns x rows and {lengths} '
+                             f'length{"s"[:lengths - 1]} are needed, as in chessboard:9x6:24mm')
+    columns, rows = int(size[1]), int(size[2])
+    if min(columns, rows) < least or columns * rows > _LARGEST:
+        raise ParameterError(f'board {spec!r}: {words[0]} points; at least {least} each way and '
+                             f'{_LARGEST} in all are needed')
+    return (columns, rows), [_length(spec, word) for word in words[1:]]
+
+
+def _length(spec: str, word: str) -> float:
+    match = _LENGTH.fullmatch(word)
+    try:
+        value = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
+    except ValueError:
+        value = 0.0
+    if not 0 < value < _FURTHEST:
+        raise ParameterError(f'board {spec!r}: {word!r} is not a length above 0 and below '
+                             f'{_FURTHEST:g} m with its unit, as in 24.23mm')
+    return value
+
+
+def _positive(document: dict[str, Any], name: str, path: Path) -> float:
+    value = document.get(name)
+    if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
+        raise ParameterError(f'{path}: {name} is {value!r}; a number above 0 is needed')
+    return float(value)
+
+
+def _grid(columns: int, rows: int, size: float) -> Array:
+    """Return points (columns * rows, 3), m, row by row: x right, y down, z into the board."""
+    y, x = np.mgrid[:rows, :columns]
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * size
+
+
+def _none(points: Array) -> Array:
+    return np.zeros((len(points), 2))
+
+
+def _checks(columns: int, rows: int) -> Array:
+    """Return the tint of inner corners: the print's first square is dark, as OpenCV prints it."""
+    y, x = np.mgrid[:rows, :columns]
+    return np.asarray(-((-1.0) ** (x + y)).ravel())

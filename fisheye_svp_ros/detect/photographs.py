@@ -1,0 +1,206 @@
+"""Photographs: from files, folders, videos and recordings; decoded to grey, one line if not."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.bags import Bag
+
+Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
+
+IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp', '.jp2')
+VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
+RECORDINGS = ('.mcap', '.db3')
+# Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
+_ORIENTATION = re.compile(
+    rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL)
+# Image encodings of sensor_msgs: type, channels, and what makes grey of them
+_ENCODINGS: dict[str, tuple[type, int, int | None]] = {
+    'mono8': (np.uint8, 1, None), '8UC1': (np.uint8, 1, None),
+    'mono16': (np.uint16, 1, None), '16UC1': (np.uint16, 1, None),
+    'rgb8': (np.uint8, 3, cv2.COLOR_RGB2GRAY), 'bgr8': (np.uint8, 3, cv2.COLOR_BGR2GRAY),
+    'rgba8': (np.uint8, 4, cv2.COLOR_RGBA2GRAY), 'bgra8': (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
+    'bayer_rggb8': (np.uint8, 1, cv2.COLOR_BayerBG2GRAY),
+    'bayer_bggr8': (np.uint8, 1, cv2.COLOR_BayerRG2GRAY),
+    'bayer_gbrg8': (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
+    'bayer_grbg8': (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
+    'yuv422': (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    'uyvy': (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
+    'yuv422_yuy2': (np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One photograph: its name for people, which instant and camera, t in s (NaN: unknown).
+
+    data: a path or bytes of an image file, or pixels.
+    """
+
+    name: str
+    key: str
+    camera: str
+    t: float
+    data: Path | bytes | Pixels
+
+    def pixels(self) -> Pixels:
+        """Return the image in grey; raise ObservationError, one line, where there is none."""
+        if isinstance(self.data, np.ndarray):
+            return self.data
+        return decoded(_read(self.data) if isinstance(self.data, Path) else self.data, self.name)
+
+
+def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
+    """Yield the photographs of files, folders, videos and rosbag2 recordings, in their order.
+
+    Subfolders left/ and right/, or topics in those namespaces, are the cameras of a rig; equal
+    file names, and equal stamps, are the same instant.  every: take one of so many.
+    Raises ObservationError for a path without any.
+    """
+    for path in map(Path, paths):
+        number = -1
+        for number, photograph in enumerate(_source(path)):
+            if number % every == 0:
+                yield photograph
+        if number < 0:
+            raise ObservationError(f'{path}: no photograph in it; images are {" ".join(IMAGES)}')
+
+
+def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
+    """Return how many photographs `find_photographs` yields; None for videos and recordings."""
+    count = 0
+    for path in map(Path, paths):
+        if path.suffix.lower() in (*VIDEOS, *RECORDINGS) or _is_recording(path):
+            return None
+        count += -(-sum(1 for _ in _source(path)) // every)
+    return count
+
+
+def is_photographs(path: Path) -> bool:
+    """Say whether a path is taken for photographs rather than for observations."""
+    if path.is_dir():
+        return any(p.suffix.lower() in IMAGES for p in (*path.glob('*'), *path.glob('*/*')))
+    return path.suffix.lower() in (*IMAGES, *VIDEOS)
+
+
+def decoded(data: bytes, name: str) -> Pixels:
+    """Return an image file in grey, at its own depth and as its sensor lay: unturned.
+
+    Raises ObservationError where it is none, or only part of one.
+    """
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+    except cv2.error as cause:
+        raise ObservationError(f'{name}: too large, or broken ({cause.err})') from cause
+    if pixels is None:
+        raise ObservationError(f'{name}: not an image that can be read; check the file')
+    if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
+        raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise ObservationError(f'{name}: pixels are {pixels.dtype}; 8 or 16 bit are needed')
+    return np.asarray(pixels)
+
+
+def exif_turned(data: bytes) -> bool:
+    """Say whether a JPEG asks viewers to turn it."""
+    match = _ORIENTATION.search(data[:65536]) if data[:2] == b'\xff\xd8' else None
+    return match is not None and int.from_bytes(match[2], 'little' if match[1] else 'big') > 1
+
+
+def message_pixels(message: Any, typename: str, name: str) -> Pixels:
+    """Return a sensor_msgs Image or CompressedImage in grey.
+
+    Raises ObservationError for an encoding without one, or data that are too short.
+    """
+    data = bytes(message.data)
+    if typename.endswith('CompressedImage'):
+        return decoded(data, name)
+    if message.encoding not in _ENCODINGS:
+        raise ObservationError(f'{name}: encoding {message.encoding!r} is not one of '
+                               f'{", ".join(_ENCODINGS)}')
+    kind, channels, grey = _ENCODINGS[message.encoding]
+    dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
+    width = message.width * channels * dtype.itemsize
+    if message.step < width or len(data) < message.step * message.height or not data:
+        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
+                               f'{message.width}x{message.height} {message.encoding}')
+    rows = np.frombuffer(data, np.uint8)[:message.step * message.height]
+    rows = np.ascontiguousarray(rows.reshape(message.height, message.step)[:, :width])
+    pixels: Pixels = rows.view(dtype).astype(kind, copy=False)
+    if grey is None:
+        return pixels
+    shape = pixels.shape if channels == 1 else (message.height, message.width, channels)
+    return np.asarray(cv2.cvtColor(pixels.reshape(shape), grey))
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as cause:
+        raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
+
+
+def _source(path: Path) -> Iterator[Photograph]:
+    if not path.exists():
+        raise ObservationError(f'{path}: there is no such file or folder; check the path')
+    if path.is_dir() and not _is_recording(path):
+        return _folder(path)
+    suffix = path.suffix.lower()
+    if path.is_dir() or suffix in RECORDINGS:
+        return _recording(path)
+    return _video(path) if suffix in VIDEOS else iter([_file(path)])
+
+
+def _is_recording(path: Path) -> bool:
+    return path.is_dir() and any(p.suffix in RECORDINGS for p in path.iterdir())
+
+
+def _file(path: Path, camera: str = '') -> Photograph:
+    return Photograph(str(path), path.stem, camera, np.nan, path)
+
+
+def _folder(path: Path) -> Iterator[Photograph]:
+    cameras = [name for name in ('left', 'right') if (path / name).is_dir()]
+    for camera in cameras or ['']:
+        files = (p for p in (path / camera).iterdir() if p.suffix.lower() in IMAGES)
+        yield from (_file(p, camera) for p in sorted(files, key=_natural))
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(w), '') if w.isdigit() else (-1, w) for w in re.split(r'(\d+)', path.name)]
+
+
+def _video(path: Path) -> Iterator[Photograph]:
+    video = cv2.VideoCapture(str(path))
+    rate = video.get(cv2.CAP_PROP_FPS) or 30.0
+    number = 0
+    while True:
+        ok, image = video.read()
+        if not ok:
+            break
+        grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        yield Photograph(f'{path} #{number}', f'{number:09d}', '', number / rate, grey)
+        number += 1
+    video.release()
+
+
+def _recording(path: Path) -> Iterator[Photograph]:
+    kinds = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+    for record in Bag(path).records(lambda _, kind: kind in kinds):
+        stamp = record.message.header.stamp
+        t = stamp.sec + 1e-9 * stamp.nanosec
+        name = f'{path} {record.topic} {t:.9f}'
+        words = record.topic.split('/')
+        camera = next((word for word in words if word in ('left', 'right')), '')
+        data = message_pixels(record.message, record.typename, name)
+        yield Photograph(name, f'{stamp.sec:012d}.{stamp.nanosec:09d}', camera, t, data)

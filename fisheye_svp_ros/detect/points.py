@@ -1,0 +1,130 @@
+"""The points of a pattern in one image: found, brought into the pattern's order, fitted."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
+from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey
+from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.photographs import Pixels
+
+_NEIGHBOURS = 6
+_ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
+_MARGIN = 0.3  # of its size, around the place where a board was last
+_LEAST = 4
+
+
+class Points(NamedTuple):
+    """Points (M,) of a pattern: which; uv (M, 2) and sigma (M,), px; blur and reach, px.
+
+    reach (M,): distance to the next edge of the print in the image.
+    """
+
+    ids: Index
+    uv: Array
+    sigma: Array
+    blur: float
+    reach: Array
+
+
+def find_points(
+    pixels: Pixels, pattern: Pattern, detector: str, near: Array | None = None
+) -> Points | str:
+    """Return the points of a pattern in a grey image, or why there are none.
+
+    near (M, 2): image points of the board in the image before; its surroundings are searched
+    first, and the rest only where the board is not there any more.
+    """
+    grey, finder = _eight_bit(pixels), DETECTORS[detector][1]
+    found = _near(grey, pattern, finder, near) if near is not None else None
+    found = found or finder(grey, pattern)
+    if found is None:
+        return 'no board found'
+    index, uv = found
+    if len(index) < _LEAST:
+        return f'{len(index)} points found; {_LEAST} are needed'
+    if not pattern.marker and len(index) == len(pattern.points):
+        uv = _right_handed(uv, pattern)
+    axes = local_axes(pattern.points[index, :2], uv)
+    reach = pattern.clearance * _height(axes)
+    square = bool(np.any(pattern.inward))
+    towards = pattern.inward[index, :, None] if square else 1.0
+    corners = fit_corners(pixels, uv, axes * towards, reach, square)
+    if detector in AS_FOUND:
+        corners = corners._replace(uv=uv)
+    return _checked(index, corners, pattern, reach)
+
+
+def local_axes(points: Array, uv: Array) -> Array:
+    """Return derivatives (M, 2, 2), px/m, of uv (M, 2) by points (M, 2): rows are the axes."""
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1:_NEIGHBOURS + 1]
+    here, there = points[nearest] - points[:, None], uv[nearest] - uv[:, None]
+    weight = 1 / (here**2).sum(axis=-1, keepdims=True)
+    transposed = np.swapaxes(here * weight, -1, -2)
+    # A little towards the isotropic: neighbours may lie on one line.
+    ridge = 1e-6 * np.eye(2)
+    return np.asarray(np.linalg.solve(transposed @ here + ridge, transposed @ there))
+
+
+def _height(axes: Array) -> Array:
+    """Distance, px, of neighbouring parallel lines a metre apart on the board."""
+    longer = np.linalg.norm(axes, axis=-1).max(axis=-1)
+    return np.asarray(np.abs(np.linalg.det(axes)) / np.maximum(longer, 1e-9))
+
+
+def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | None:
+    low, high = near.min(axis=0), near.max(axis=0)
+    margin = _MARGIN * float((high - low).max()) + 10
+    height, width = grey.shape
+    left, top = np.clip(low - margin, 0, (width, height)).astype(int)
+    right, bottom = np.clip(high + margin, 0, (width, height)).astype(int)
+    if min(right - left, bottom - top) < 10:
+        return None
+    crop = np.ascontiguousarray(grey[top:bottom, left:right])
+    found: Found | None = finder(crop, pattern)  # type: ignore[operator]
+    return None if found is None else (found[0], found[1] + (left, top))
+
+
+def _right_handed(uv: Array, pattern: Pattern) -> Array:
+    """Return image points of a whole grid, mirrored where its columns run the wrong way."""
+    if np.median(np.linalg.det(local_axes(pattern.points[:, :2], uv))) > 0:
+        return uv
+    if pattern.kind == 'squares':
+        grid = uv.reshape(pattern.rows, pattern.columns, 4, 2)[:, ::-1]
+        return grid[:, :, [1, 0, 3, 2]].reshape(-1, 2)
+    return uv.reshape(pattern.rows, pattern.columns, 2)[:, ::-1].reshape(-1, 2)
+
+
+def _checked(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> Points | str:
+    """Turn the points into the pattern's order; leave out those that are not what they must be."""
+    ok, tint = corners.ok, np.sign(corners.contrast) * pattern.tint[index]
+    if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
+        return f'{int(ok.sum())} of {len(ok)} points are corners that can be fitted'
+    if pattern.kind == 'chessboard' or pattern.marker:
+        agreed = np.sign(tint[ok].sum())
+        ok &= tint == agreed
+        if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
+            return 'bright and dark squares do not take turns; check the size of the board'
+    if not pattern.marker and len(index) == len(pattern.points):
+        keep = pattern.kind != 'chessboard' or agreed > 0
+        turns = [turn for turn in pattern.turns if turn.same == keep] or list(pattern.symmetries)
+        # Of turns that look the same, the one that begins at the upper left of the image.
+        best = min(turns, key=lambda turn: float(corners.uv[turn.source[0]].sum()))
+        order = best.source
+        corners = Corners._make(array[order] for array in corners)
+        ok, reach = ok[order], reach[order]
+    blur = float(np.median(corners.blur[ok]))
+    return Points(index[ok], corners.uv[ok], corners.sigma[ok], blur, reach[ok])
+
+
+def _eight_bit(pixels: Pixels) -> Grey:
+    if pixels.dtype == np.uint8:
+        return pixels
+    top = max(float(np.percentile(pixels[::4, ::4], 99.8)), 1.0)
+    return np.asarray(cv2.convertScaleAbs(pixels, alpha=255 / top))

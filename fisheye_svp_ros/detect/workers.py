@@ -1,0 +1,89 @@
+"""Work on many items in processes of their own, each item bounded in time."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator
+from multiprocessing.connection import Connection, wait
+from typing import Any, NamedTuple
+
+_START = 60.0  # s a process may take to start
+
+
+class Late(NamedTuple):
+    """What comes in place of a result: the item took too long, or its process died."""
+
+    timed_out: bool
+
+
+class _Worker:
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        context = multiprocessing.get_context('spawn')
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_serve, args=(function, theirs), daemon=True)
+        self.process.start()
+        theirs.close()
+        self.number, self.deadline = -1, 0.0
+
+    def give(self, number: int, item: Any, seconds: float) -> None:
+        self.number, self.deadline = number, time.monotonic() + seconds
+        self.pipe.send(item)
+
+    def stop(self) -> None:
+        self.pipe.close()
+        self.process.kill()
+        self.process.join()
+
+
+def bounded_map(
+    function: Callable[[Any], Any], items: Iterable[Any], seconds: float
+) -> Iterator[tuple[int, Any]]:
+    """Yield (number of the item, function(item)) as they are done, or (number, Late).
+
+    function: importable; a process that takes longer than `seconds` over an item is replaced.
+    """
+    waiting = enumerate(items)
+    fresh = seconds + _START
+    busy: list[_Worker] = []
+    try:
+        while True:
+            while len(busy) < (os.cpu_count() or 1) and (item := next(waiting, None)):
+                busy.append(_Worker(function))
+                busy[-1].give(*item, fresh)
+            if not busy:
+                return
+            remaining = min(worker.deadline for worker in busy) - time.monotonic()
+            ready = wait([worker.pipe for worker in busy], max(remaining, 0.0))
+            for worker in list(busy):
+                late = time.monotonic() > worker.deadline
+                if worker.pipe not in ready and not late:
+                    continue
+                result: Any = Late(late)
+                if worker.pipe in ready:
+                    try:
+                        result = worker.pipe.recv()
+                    except (EOFError, OSError):
+                        result = Late(False)
+                yield worker.number, result
+                following = None if isinstance(result, Late) else next(waiting, None)
+                if following is None:
+                    busy.remove(worker)
+                    worker.stop()
+                else:
+                    worker.give(*following, seconds)
+    finally:
+        for worker in busy:
+            worker.stop()
+
+
+def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
+    import cv2
+
+    cv2.setNumThreads(1)  # the processes share the cores
+    try:
+        while True:
+            pipe.send(function(pipe.recv()))
+    except (EOFError, OSError, KeyboardInterrupt):
+        return

@@ -1,0 +1,86 @@
+"""What was found in photographs, drawn: corners on each, and the part of the image covered."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.detect.detection import Detection, Searched
+from fisheye_svp_ros.detect.photographs import Photograph
+from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
+from fisheye_svp_ros.io.files import replacing
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, picture
+from fisheye_svp_ros.solve.lens_calibration import calibrate
+
+_BLUE, _ORANGE = (168, 95, 31), (40, 123, 224)  # BGR
+_LARGEST = 1600  # px, of an overlay
+
+
+def write_overlays(
+    photographs: Iterable[Photograph], detection: Detection, folder: Path
+) -> None:
+    """Draw each photograph with its corners in their order, the first of them ringed.
+
+    Raises OutputError where a picture cannot be written.
+    """
+    for photograph, searched in zip(photographs, detection.searched, strict=True):
+        try:
+            pixels = photograph.pixels()
+        except FisheyeSvpError:
+            continue
+        name = '_'.join(filter(None, (searched.camera, photograph.key)))
+        with replacing(folder / f'{name}.png') as path:
+            if not cv2.imwrite(str(path), _overlay(np.asarray(pixels), searched)):
+                raise OutputError(f'{folder}: {name}.png cannot be written')
+
+
+def _overlay(pixels: np.ndarray, searched: Searched) -> np.ndarray:
+    scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
+    grey = cv2.convertScaleAbs(pixels, alpha=scale)
+    zoom = _LARGEST / max(grey.shape)
+    image = cv2.cvtColor(
+        cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
+    )
+    points = searched.points
+    if points is None:
+        cv2.putText(image, searched.reason, (20, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.0, _ORANGE, 2)
+        return np.asarray(image)
+    # In sixteenths of a pixel; the centre of the first pixel is at half a pixel of the picture.
+    places = np.round(((points.uv + 0.5) * zoom - 0.5) * 16).astype(int)
+    cv2.polylines(image, [places.astype(np.int32)], False, _BLUE, 1, cv2.LINE_AA, 4)
+    for i, (u, v) in enumerate(places.tolist()):
+        cv2.circle(image, (u, v), 16 * (14 if i == 0 else 5), _ORANGE, 2, cv2.LINE_AA, 4)
+    return np.asarray(image)
+
+
+def write_coverage(detection: Detection, path: Path) -> None:
+    """Draw all corners on the image, and, as a first calibration has them, angles and ranges."""
+    table, (width, height) = detection.observations, detection.image_size
+    with picture(path, 10.0, 4.5) as figure:
+        image, field = figure.subplots(1, 2)
+        image.plot(table.uv[:, 0], table.uv[:, 1], '.', color=OURS, markersize=2)
+        image.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect='equal',
+                  xlabel='u, px', ylabel='v, px',
+                  title=f'{len(table)} corners in {len(table.frames)} photographs')
+        for camera, name in enumerate(table.cameras):
+            _angles(field, detection, camera, name)
+        field.set(xlabel='incidence angle, deg', ylabel='range, m',
+                  title='angles and ranges, by a first calibration')
+
+
+def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:
+    table = detection.observations
+    try:
+        fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt',
+                           detection.image_size)
+    except FisheyeSvpError:
+        return
+    views, lens = fitted.views, fitted.adjusted.lens
+    points = fitted.adjusted.pose.into_body(views.points)[views.used]
+    distance = np.linalg.norm(points, axis=-1)
+    theta = np.degrees(np.arccos(points[:, 2] / distance))
+    axes.plot(theta, distance, '.', markersize=2,  # type: ignore[attr-defined]
+              color=(OURS, FAINT)[camera % 2], label=name or lens.name)
