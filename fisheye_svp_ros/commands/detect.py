@@ -51,7 +51,8 @@ def _print(detection: Detection, board: str) -> None:
 
     table, found = detection.observations, [one for one in detection.searched if one.points]
     print(f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
-          f'{len(table)} points, sigma {np.median(table.sigma):.3f} px (median)')
+          f'{len(table)} points'
+          + ('' if np.isnan(table.sigma).any() else f', sigma {np.median(table.sigma):.3f} px'))
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
         print('  the board looks the same when turned, and too few photographs tell how it lies')

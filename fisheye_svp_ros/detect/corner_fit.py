@@ -27,6 +27,7 @@ _CONTRAST = 6.0  # over the noise, below which a corner is not one
 _SMOOTHING = 0.8  # px; sharpened photographs have edges that would fall between pixels
 _PIXEL = 1 / 12 + _SMOOTHING**2  # px^2: what pixels and smoothing add to the blur
 _KEPT = 1 / (4 * np.pi * _SMOOTHING**2)  # of the variance of white noise, after smoothing
+_NEXT = float(np.exp(-1 / (4 * _SMOOTHING**2)))  # correlation of neighbours, after smoothing
 _ROOT = float(np.sqrt(2 / np.pi))
 
 
@@ -110,17 +111,25 @@ def _noise(residual: Array, weight: Array, corner: Array, side: int, square: boo
     if square:
         return np.asarray((weight * residual**2).sum(1)
                           / np.maximum(weight.sum(1) - _UNKNOWNS, 1.0))
-    steps = np.arange(side)
-    opposite = np.round(2 * corner).astype(np.int64)[:, ::-1, None] + side - 1 - steps
-    inside = (opposite >= 0) & (opposite < side)
-    rows, columns = np.moveaxis(np.clip(opposite, 0, side - 1), 1, 0)
-    pair = (rows[:, :, None] * side + columns[:, None]).reshape(len(residual), -1)
-    both = (inside[:, 0, :, None] & inside[:, 1, None]).reshape(pair.shape)
-    weight = weight * np.take_along_axis(weight, pair, axis=1) * both
-    odd = (residual - np.take_along_axis(residual, pair, axis=1)) / 2
+    # The mirror image of each pixel lies between four others.
+    opposite = 2 * corner[:, ::-1, None] + side - 1 - np.arange(side)
+    first = np.floor(opposite).astype(np.int64)
+    part = opposite[..., 0] - first[..., 0]
+    inside = (first >= 0) & (first < side - 1)
+    first = np.clip(first, 0, side - 2)
+    grid = np.stack([residual, weight]).reshape(2, -1, side, side)
+    system = np.arange(len(corner))[:, None, None]
+    mirrored = np.zeros_like(grid)
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = (np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1]))[:, None, None]
+        mirrored += share * grid[:, system, first[:, 0, :, None] + down, first[:, 1, None] + right]
+    pairs = grid[1] * mirrored[1] * (inside[:, 0, :, None] & inside[:, 1, None])
+    odd2 = (pairs * (grid[0] - mirrored[0]) ** 2).sum(axis=(1, 2)) / 4
+    # What lies between pixels scatters less, though smoothed ones less so.
+    left = (1 - 2 * part * (1 - part) * (1 - _NEXT)).prod(axis=1)
     # Half of the pixels are the others' mirror images, half of the unknowns are odd.
-    spare = np.maximum((weight.sum(axis=1) - _UNKNOWNS) / 2, 1.0)
-    return np.asarray((weight * odd**2).sum(axis=1) / spare)
+    spare = np.maximum((pairs.sum(axis=(1, 2)) - _UNKNOWNS) / 2, 1.0)
+    return np.asarray(odd2 * 2 / (1 + left) / spare)
 
 
 class _Problem:

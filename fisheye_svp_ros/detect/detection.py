@@ -28,6 +28,7 @@ _BLURRED = 1.5  # times the median blur, and px
 _BURNT = 0.02  # of the board's pixels as bright as pixels can be
 _SAME_PLACE = 0.3  # px
 _UNCERTAIN = 0.9
+_FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
 _UNTURNED = 'asks to be shown turned; taken as the sensor lay'
 
 
@@ -217,7 +218,8 @@ def _agreed(
         mine = {number[one.key]: i for i, one in enumerate(found) if one.camera == name}
         size = next(one.size for one in found if one.camera == name)
         try:
-            fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt', size)
+            # With a viewpoint shift, lest that be taken for the board's errors.
+            fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt', size, _FREE)
         except FisheyeSvpError:
             continue
         views = fitted.views

@@ -146,7 +146,7 @@ DETECTORS: dict[str, tuple[tuple[str, ...], Finder]] = {
     'circles': (('circles', 'asymmetric_circles'), _smaller(circles)),
     'squares': (('squares',), squares),
 }
-AS_FOUND = ('sb', 'classic', 'circles')  # take their own points; the others are fitted
+AS_FOUND = ('sb', 'classic')  # keep their own points; the others are fitted
 
 
 def default_detector(pattern: Pattern) -> str:

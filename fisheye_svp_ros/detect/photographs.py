@@ -98,14 +98,14 @@ def decoded(data: bytes, name: str) -> Pixels:
     Raises ObservationError where it is none, or only part of one.
     """
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
+        raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as cause:
         raise ObservationError(f'{name}: too large, or broken ({cause.err})') from cause
     if pixels is None:
         raise ObservationError(f'{name}: not an image that can be read; check the file')
-    if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
-        raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ObservationError(f'{name}: pixels are {pixels.dtype}; 8 or 16 bit are needed')
     return np.asarray(pixels)

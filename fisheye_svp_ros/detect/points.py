@@ -17,12 +17,14 @@ _NEIGHBOURS = 6
 _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _LEAST = 4
+_ODD = 6.0  # times the median sigma
 
 
 class Points(NamedTuple):
     """Points (M,) of a pattern: which; uv (M, 2) and sigma (M,), px; blur and reach, px.
 
-    reach (M,): distance to the next edge of the print in the image.
+    sigma is NaN where the image does not tell it (circles); reach (M,): distance to the next edge
+    of the print in the image.
     """
 
     ids: Index
@@ -52,6 +54,10 @@ def find_points(
         uv = _right_handed(uv, pattern)
     axes = local_axes(pattern.points[index, :2], uv)
     reach = pattern.clearance * _height(axes)
+    if detector == 'circles':
+        none = np.zeros(len(uv))
+        whole = Corners(uv, none + np.nan, none, none, np.ones(len(uv), dtype=bool))
+        return _checked(index, whole, pattern, reach)
     square = bool(np.any(pattern.inward))
     towards = pattern.inward[index, :, None] if square else 1.0
     corners = fit_corners(pixels, uv, axes * towards, reach, square)
@@ -106,6 +112,9 @@ def _checked(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> 
     ok, tint = corners.ok, np.sign(corners.contrast) * pattern.tint[index]
     if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
         return f'{int(ok.sum())} of {len(ok)} points are corners that can be fitted'
+    if np.isfinite(corners.sigma).all():
+        # One by the edge of the field, or half hidden, is not as its neighbours.
+        ok &= corners.sigma < _ODD * np.median(corners.sigma[ok])
     if pattern.kind == 'chessboard' or pattern.marker:
         agreed = np.sign(tint[ok].sum())
         ok &= tint == agreed

@@ -1,0 +1,54 @@
+"""`fisheye-svp example`: photographs of a bent board through a shifting lens, to try it all on."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+_README = """# Thirty photographs of a bent board
+
+Rendered, with noise, through a fisheye lens whose viewpoint moves (e0 = 4 mm), of a chessboard
+that stands out by 1.5 mm in the middle.  `truth/` holds lens, poses and true corners.
+
+```bash
+fisheye-svp detect photographs --board chessboard:9x6:25mm -o observations.csv --overlays overlays
+fisheye-svp calibrate observations.csv -o lens.yaml
+fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
+```
+
+`calibrate`, `localize` and `diagnose` take photographs as well: add `--board chessboard:9x6:25mm`.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+                        help='folder for the photographs, the truth and a README')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Render the photographs, write the truth and a README."""
+    import numpy as np
+
+    from fisheye_svp_ros.commands.render import bowed, write_photographs
+    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.io.lens_files import save_lens
+    from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
+    from fisheye_svp_ros.optics.lens import Lens
+    from fisheye_svp_ros.simulate.board_views import board_views
+    from fisheye_svp_ros.simulate.render import Exposure, Print
+
+    lens = Lens('example', 848, 800, 285.0, 285.3, 424.7, 398.2,
+                KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
+    printed = Print(9, 6, 0.025)
+    printed = Print(9, 6, 0.025, bow=bowed(printed.corners, 0.0015))
+    poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
+    folder = args.output / 'photographs'
+    write_photographs(lens, printed, poses, Exposure(), 0, folder)
+    truth = args.output / 'truth'
+    truth.mkdir(exist_ok=True)
+    for name in ('observations.csv', 'poses.csv'):
+        (folder / name).replace(truth / name)
+    save_lens(lens, truth / 'lens.yaml')
+    write_text(args.output / 'README.md', _README)
+    print(f'{args.output}: README.md says which three commands explain them')

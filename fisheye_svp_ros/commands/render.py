@@ -1,0 +1,106 @@
+"""`fisheye-svp render`: photographs of a chessboard through a lens, and the truth about them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fisheye_svp_ros.errors import ParameterError
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.arrays import Array
+    from fisheye_svp_ros.optics.lens import Lens
+    from fisheye_svp_ros.pose import Pose
+    from fisheye_svp_ros.simulate.render import Exposure, Field, Print
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('--lens', required=True, metavar='LENS',
+                        help='a lens file, or the name of one that comes with the package')
+    parser.add_argument('--board', required=True, metavar='SPEC',
+                        help='the board: chessboard:9x6:25mm (inner corners)')
+    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+                        help='folder for the photographs, observations.csv (the true corners) and '
+                        'poses.csv')
+    parser.add_argument('--poses', metavar='POSES.csv',
+                        help="poses of the camera in the board's frame; at random by default")
+    parser.add_argument('--count', type=int, default=30, metavar='N',
+                        help='how many photographs from random poses (30)')
+    parser.add_argument('--ranges', type=float, nargs=2, default=(0.12, 0.35), metavar='M',
+                        help='nearest and furthest, m, of random poses (0.12 0.35)')
+    parser.add_argument('--bow', type=float, default=0.0, metavar='MM',
+                        help='how far the middle of the board stands out from its ends, mm')
+    parser.add_argument('--blur', type=float, default=0.6, metavar='PX',
+                        help='blur of the lens, px (0.6)')
+    parser.add_argument('--noise', type=float, default=1.5, metavar='LEVELS',
+                        help='noise of a pixel, grey levels of 255 (1.5)')
+    parser.add_argument('--seed', type=int, default=0, help='of poses and noise (0)')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Render the photographs, write them and the truth."""
+    import numpy as np
+
+    from fisheye_svp_ros.detect.patterns import parse_pattern
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.readers import read_poses
+    from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.simulate.board_views import board_views
+    from fisheye_svp_ros.simulate.render import Exposure, Print
+
+    pattern = parse_pattern(args.board)
+    if pattern.kind != 'chessboard':
+        raise ParameterError(f'--board {args.board}: chessboards alone can be rendered')
+    if args.count < 1 or not 0 < args.ranges[0] <= args.ranges[1]:
+        raise ParameterError('--count must be above 0, --ranges two distances above 0 in order')
+    lens, rng = load_lens(lens_path(args.lens)), np.random.default_rng(args.seed)
+    printed = Print(pattern.columns, pattern.rows, pattern.size)
+    if args.bow:
+        printed = Print(pattern.columns, pattern.rows, pattern.size,
+                        bow=bowed(printed.corners, 1e-3 * args.bow))
+    poses = read_poses(args.poses).pose if args.poses else board_views(
+        lens, printed, args.count, tuple(args.ranges), rng)
+    write_photographs(lens, printed, poses, Exposure(blur=args.blur, noise=args.noise),
+                      args.seed, args.output)
+
+
+def bowed(corners: Array, height: float) -> Field:
+    """Return a board's height, m: a parabola across its longer side, `height` from end to top."""
+    import numpy as np
+
+    low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
+    longer = int(np.argmax(high - low))
+    middle, half = (low + high)[longer] / 2, (high - low)[longer] / 2
+    return lambda place: np.asarray(height * ((place[..., longer] - middle) / half) ** 2)
+
+
+def write_photographs(
+    lens: Lens, printed: Print, poses: Pose, exposure: Exposure, seed: int, folder: Path
+) -> None:
+    """Write a photograph a pose (P,), the true corners as observations.csv, and poses.csv."""
+    import cv2
+    import numpy as np
+
+    from fisheye_svp_ros.io.files import replacing
+    from fisheye_svp_ros.io.readers import write_observations, write_poses
+    from fisheye_svp_ros.optics.camera import project
+    from fisheye_svp_ros.reporting.progress import progress
+    from fisheye_svp_ros.scene.observations import make_observations
+    from fisheye_svp_ros.simulate.render import render
+
+    count, corners = len(poses.position), printed.corners
+    with progress('rendering', count) as done:
+        for number in range(count):
+            rng = np.random.default_rng([seed, number])
+            image = render(lens, printed, poses.take(number), exposure, rng)
+            with replacing(folder / f'{number:03d}.png') as path:
+                cv2.imwrite(str(path), image)
+            done()
+    seen = project(lens, poses.into_body(printed.true_corners()))
+    frame, corner = np.nonzero(seen.valid)
+    write_observations(folder / 'observations.csv', make_observations(
+        frame, corner, seen.uv[frame, corner], corners[corner]))
+    write_poses(folder / 'poses.csv', np.arange(count), poses)
+    print(f'{folder}: {count} photographs, observations.csv with their true corners, poses.csv')

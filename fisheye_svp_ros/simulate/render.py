@@ -1,0 +1,243 @@
+"""Photographs of a board as a lens with a moving viewpoint takes them.
+
+Each pixel's own ray, with its origin on the axis, is met with the board, which may be bowed; what
+is printed there is averaged over the pixel exactly for straight edges.  Blur, vignetting, gain,
+noise, rolling shutter and errors of the print are what a camera and a printer add.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.optics.camera import back_project, project
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+
+_BETWEEN = 3  # samples along each side of a pixel
+_ROUNDS = 6  # to meet a bowed board
+_DARK, _BRIGHT, _ROOM = 0.08, 0.85, 0.30  # reflectance of ink, paper, what is behind
+_AROUND = 12.0  # px around the sheet that may see it once it is moved
+_CHUNK = 200_000  # pixels whose rays are computed at once
+
+Field = Callable[[Array], Array]  # of places (..., 2), m, on a board
+
+
+@dataclass(frozen=True)
+class Print:
+    """A chessboard: columns, rows of inner corners, size of a square, m; margin of white, squares.
+
+    bow: height (...), m, over the board's plane at places (..., 2), towards +z; shift: where the
+    print of a place really is, minus that place, (..., 2), m.  The first inner corner is the
+    origin, x right, y down, z into the board.
+    """
+
+    columns: int
+    rows: int
+    size: float
+    margin: float = 0.6
+    bow: Field | None = None
+    shift: Field | None = None
+
+    @property
+    def corners(self) -> Array:
+        """Nominal inner corners (N, 3), m, row by row."""
+        y, x = np.mgrid[:self.rows, :self.columns]
+        return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * self.size
+
+    def true_corners(self) -> Array:
+        """Where the inner corners really are (N, 3), m, in the board's frame."""
+        points = self.corners
+        if self.shift is not None:
+            points[:, :2] += self.shift(points[:, :2])
+        if self.bow is not None:
+            points[:, 2] = self.bow(points[:, :2])
+        return points
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """What a camera makes of the light.
+
+    gain: on reflectance, for a full scale of 1; blur, px, at the axis, and blur_edge, px, which
+    is added (in squares) in proportion to the angle; vignetting: loss at the edge of the field;
+    slope (2,): uneven light, relative change per image width; noise: of a pixel, in grey levels
+    of 255, half of it shot noise at mid-grey; twist (6,), m/s and rad/s, of the camera in the
+    board's frame and line_time, s: a rolling shutter, from the row in the middle.
+    """
+
+    gain: float = 1.0
+    blur: float = 0.6
+    blur_edge: float = 0.0
+    vignetting: float = 0.3
+    slope: tuple[float, float] = (0.0, 0.0)
+    noise: float = 1.5
+    twist: tuple[float, ...] = ()
+    line_time: float = 0.0
+
+
+def render(
+    lens: Lens,
+    printed: Print,
+    camera: Pose,
+    exposure: Exposure,
+    rng: np.random.Generator,
+    moved: Field | None = None,
+) -> NDArray[np.uint8]:
+    """Return a photograph (H, W) of a board from a camera's pose in the board's frame.
+
+    moved: what else moves the image of a place (..., 2), m, on the board, px (..., 2): effects
+    that are not among the lens's own.  The same rng gives the same photograph.
+    """
+    v, u = np.mgrid[:lens.height, :lens.width].astype(float)
+    uv = np.stack([u, v], axis=-1)
+    theta = back_project(lens, uv).theta
+    light = np.full(theta.shape, _ROOM)
+    window = _window(lens, printed, camera)
+    part = uv[window]
+    if part.size:
+        places = _seen_places(lens, printed, camera, exposure, part)
+        for _ in range(3 if moved is not None else 0):
+            # The image of a place is moved: look where the unmoved image of what is seen lies.
+            off = moved(_near(places, printed)) if moved is not None else 0.0
+            places = _seen_places(lens, printed, camera, exposure, part - off)
+        light[window] = _light(printed, places)
+    light = _blurred(light, theta, exposure, lens.max_incidence)
+    outwards = np.nan_to_num(theta / lens.max_incidence)
+    light *= exposure.gain * (1 - exposure.vignetting * outwards**2)
+    light *= 1 + (uv / lens.width - 0.5) @ np.array(exposure.slope)
+    light[np.isnan(theta)] = 0.0
+    level = 255 * light
+    scatter = exposure.noise * np.sqrt(0.5 + np.clip(level, 0, 255) / 255)
+    level = np.round(level + scatter * rng.standard_normal(level.shape))
+    return np.clip(level, 0, 255).astype(np.uint8)
+
+
+def _window(lens: Lens, printed: Print, camera: Pose) -> tuple[slice, slice]:
+    """Return the rows and columns in which the sheet lies, and a little more."""
+    low, high = np.array([-1.0, -1.0]) - printed.margin, printed.margin + np.array(
+        [printed.columns, printed.rows], dtype=float)
+    steps = np.linspace(0.0, 1.0, 25)
+    sheet = np.stack(np.meshgrid(*(low + steps[:, None] * (high - low)).T), axis=-1) * printed.size
+    height = np.zeros(sheet.shape[:2]) if printed.bow is None else printed.bow(sheet)
+    points = np.concatenate([sheet, height[..., None]], axis=-1).reshape(-1, 3)
+    image = project(lens, camera.into_body(points))
+    if not image.valid.all():
+        return slice(None), slice(None)
+    first = np.floor(image.uv.min(axis=0) - _AROUND).astype(int).clip(0)
+    last = np.ceil(image.uv.max(axis=0) + _AROUND).astype(int).clip(0)
+    return slice(first[1], last[1]), slice(first[0], last[0])
+
+
+def _seen_places(
+    lens: Lens, printed: Print, camera: Pose, exposure: Exposure, uv: Array
+) -> Array:
+    """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
+    flat = uv.reshape(-1, 2)
+    parts = [
+        _seen_part(lens, printed, camera, exposure, flat[i:i + _CHUNK])
+        for i in range(0, len(flat), _CHUNK)
+    ]
+    return np.concatenate(parts).reshape(uv.shape)
+
+
+def _seen_part(
+    lens: Lens, printed: Print, camera: Pose, exposure: Exposure, uv: Array
+) -> Array:
+    rays = back_project(lens, uv)
+    origin, direction = rays.origin, rays.direction
+    if exposure.line_time:
+        time = exposure.line_time * (uv[:, 1] - (lens.height - 1) / 2)
+        twist = time[:, None] * np.array(exposure.twist)
+        place = camera.position + twist[:, :3]
+        turn = rotation_from_vector(twist[:, 3:]) @ camera.rotation
+        origin = (turn @ origin[..., None])[..., 0] + place
+        direction = (turn @ direction[..., None])[..., 0]
+    else:
+        origin = origin @ camera.rotation.T + camera.position
+        direction = direction @ camera.rotation.T
+    height: Array | float = 0.0
+    with np.errstate(divide='ignore', invalid='ignore'):
+        for _ in range(_ROUNDS if printed.bow is not None else 1):
+            reach = (height - origin[:, 2]) / direction[:, 2]
+            places = origin[:, :2] + reach[:, None] * direction[:, :2]
+            if printed.bow is not None:
+                height = printed.bow(_near(places, printed))
+    # Only the printed side is seen, and only ahead.
+    places[~((reach > 0) & (direction[:, 2] > 0))] = np.nan
+    if printed.shift is not None:
+        nominal = places
+        for _ in range(3):
+            nominal = places - printed.shift(_near(nominal, printed))
+        places = nominal
+    return np.asarray(places)
+
+
+def _near(places: Array, printed: Print) -> Array:
+    """Keep places (..., 2) where fields over the board are meant to be asked."""
+    around = 2 * printed.size
+    high = np.array([printed.columns - 1, printed.rows - 1]) * printed.size + around
+    return np.clip(np.nan_to_num(places, nan=-around, posinf=0, neginf=0), -around, high)
+
+
+def _light(printed: Print, places: Array) -> Array:
+    """Return the reflectance (H, W) that each pixel sees on average."""
+    part = places / printed.size
+    by_v, by_u = np.gradient(part, axis=(0, 1))
+    (vv, uv_), uu = np.gradient(by_v, axis=(0, 1)), np.gradient(by_u, axis=1)
+    total = np.zeros(part.shape[:2])
+    steps = (np.arange(_BETWEEN) + 0.5) / _BETWEEN - 0.5
+    for b in steps:
+        for a in steps:
+            sample = (part + a * by_u + b * by_v
+                      + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv)
+            slope = (by_u + a * uu + b * uv_, by_v + a * uv_ + b * vv)
+            total += _reflectance(printed, sample, slope)
+    return np.where(np.isfinite(total), total / _BETWEEN**2, _ROOM)
+
+
+def _reflectance(printed: Print, places: Array, slope: tuple[Array, Array]) -> Array:
+    """Return the reflectance at places (H, W, 2), squares, averaged over a sample's width."""
+    # How far, in squares, a sample reaches across lines of x and of y.
+    width = (np.abs(slope[0]) + np.abs(slope[1])) / _BETWEEN + 1e-12
+    count = np.array([printed.columns, printed.rows])
+    # Brightness changes across the lines through inner corners alone.
+    line = np.clip(np.round(places), 0, count - 1)
+    face = np.where(line % 2 == 0, 1.0, -1.0) * np.clip(2 * (places - line) / width, -1.0, 1.0)
+    ink = 0.5 + 0.5 * face[..., 0] * face[..., 1]
+    low, high = -1.0, count.astype(float)
+    squares = _inside(places, low, high, width)
+    sheet = _inside(places, low - printed.margin, high + printed.margin, width)
+    board = _BRIGHT + (_DARK - _BRIGHT) * ink * squares
+    return np.asarray(_ROOM + (board - _ROOM) * sheet)
+
+
+def _inside(places: Array, low: Any, high: Any, width: Array) -> Array:
+    depth = np.minimum(places - low, high - places) / width
+    return np.asarray(np.clip(depth + 0.5, 0.0, 1.0).prod(axis=-1))
+
+
+def _blurred(light: Array, theta: Array, exposure: Exposure, edge: float) -> Array:
+    if not exposure.blur_edge:
+        return np.asarray(_gaussian(light, exposure.blur))
+    # Blur that grows outwards: between images of few blurs, by the square of the blur.
+    part = np.nan_to_num(theta / edge, nan=1.0)
+    square = exposure.blur**2 + (exposure.blur_edge * part) ** 2
+    levels = np.linspace(exposure.blur**2, exposure.blur**2 + exposure.blur_edge**2, 6)
+    place = np.clip((square - levels[0]) / (levels[1] - levels[0]), 0, len(levels) - 1 - 1e-9)
+    stack = np.stack([_gaussian(light, float(np.sqrt(level))) for level in levels])
+    lower = np.floor(place).astype(int)
+    row, column = np.indices(light.shape)
+    weight = place - lower
+    return np.asarray((1 - weight) * stack[lower, row, column]
+                      + weight * stack[lower + 1, row, column])
+
+
+def _gaussian(light: Array, blur: float) -> Array:
+    return np.asarray(cv2.GaussianBlur(light, (0, 0), blur)) if blur > 0.05 else light.copy()

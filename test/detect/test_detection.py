@@ -1,0 +1,343 @@
+"""Boards in rendered photographs: where their corners are, how sure, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import sleep
+
+import cv2
+import numpy as np
+import pytest
+from helpers.photographs import (
+    BOARD,
+    photograph,
+    poses,
+    printed_with,
+    true_corners,
+    write,
+)
+
+from fisheye_svp_ros.detect.detection import Detection, detect
+from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.photographs import exif_turned, find_photographs, message_pixels
+from fisheye_svp_ros.detect.points import find_points
+from fisheye_svp_ros.detect.workers import Late, bounded_map
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.simulate.render import Exposure, Print
+
+PATTERN = parse_pattern(BOARD)
+
+
+def found(folder: Path, board: str = BOARD) -> Detection:
+    return detect(find_photographs([str(folder)]), parse_pattern(board), source=str(folder))
+
+
+def reasons(detection: Detection) -> dict[str, str]:
+    return {Path(one.name).name: one.reason for one in detection.searched}
+
+
+class TestPatterns:
+    @pytest.mark.parametrize('spec', [
+        'chessboard', 'chessboard:9x6', 'chessboard:9x6:24', 'chessboard:9x6:-1mm',
+        'chessboard:2x6:1mm', 'chessboard:9x6:24m', 'checker:9x6:24mm', 'chessboard:9x6:1.2.3mm',
+        'charuco:5x4:20mm:30mm', 'squares:3x4:30mm', 'circles:3x4:1mm:symmetric',
+        'aprilgrid:missing.yaml', 'chessboard:900x600:1mm',
+    ])
+    def test_refused_in_one_line(self, spec: str) -> None:
+        with pytest.raises(ParameterError) as error:
+            parse_pattern(spec)
+        assert '\n' not in str(error.value)
+
+    @pytest.mark.parametrize(('spec', 'ways'), [
+        ('chessboard:9x6:24mm', 1), ('chessboard:6x4:24mm', 2), ('chessboard:5x3:24mm', 2),
+        ('chessboard:5x5:24mm', 2), ('chessboard:4x4:24mm', 4), ('circles:5x4:2cm', 2),
+        ('circles:4x4:2cm', 4), ('circles:4x11:2cm:asymmetric', 1), ('squares:3x4:30mm:20mm', 2),
+    ])
+    def test_in_how_many_ways_it_looks_the_same(self, spec: str, ways: int) -> None:
+        assert len(parse_pattern(spec).symmetries) == ways
+
+    def test_lengths_in_any_unit(self) -> None:
+        for spec in ('chessboard:9x6:0.025m', 'chessboard:9x6:2.5cm', 'chessboard:9x6:25mm'):
+            assert parse_pattern(spec).points[-1] == pytest.approx([0.2, 0.125, 0])
+
+    def test_kalibr_target(self, tmp_path: Path) -> None:
+        path = tmp_path / 'april.yaml'
+        path.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
+                        'tagSpacing: 0.3\n')
+        pattern = parse_pattern(f'aprilgrid:{path}')
+        assert pattern.points[6] == pytest.approx([0.065 + 0.05, 0.05, 0])
+
+
+class TestCorners:
+    def test_scatter_is_the_stated_sigma(self) -> None:
+        pose = poses(3, 1).take(1)
+        seen = [find_points(photograph(pose, seed=seed), PATTERN, 'saddle') for seed in range(40)]
+        uv = np.stack([one.uv for one in seen if not isinstance(one, str)])
+        sigma = np.stack([one.sigma for one in seen if not isinstance(one, str)])
+        assert uv.shape == (40, 30, 2)
+        ratio = uv.std(axis=0, ddof=1).mean(axis=1) / sigma.mean(axis=0)
+        assert np.mean(ratio) == pytest.approx(1.0, abs=0.2)
+        assert np.abs(uv.mean(axis=(0, 1)) - true_corners(pose).mean(axis=0)).max() < 0.01
+
+    def test_uneven_light_and_defocus_do_not_move_corners(self) -> None:
+        pose = poses(3, 1).take(1)
+        exposure = Exposure(blur=1.8, slope=(0.6, -0.4))
+        points = find_points(photograph(pose, exposure=exposure), PATTERN, 'saddle')
+        assert not isinstance(points, str)
+        assert points.blur == pytest.approx(1.8, abs=0.2)
+        error = points.uv - true_corners(pose)[points.ids]
+        assert np.abs(error.mean(axis=0)).max() < 0.02
+
+    @pytest.mark.parametrize('detector', ['saddle', 'sb', 'classic'])
+    def test_every_detector_keeps_the_order(self, detector: str) -> None:
+        for i in range(4):
+            pose = poses(4, 2).take(i)
+            points = find_points(photograph(pose), PATTERN, detector)
+            assert not isinstance(points, str)
+            assert np.median(np.abs(points.uv - true_corners(pose)[points.ids])) < 0.2
+
+    def test_near_the_last_place(self) -> None:
+        pose = poses(4, 2).take(0)
+        image, true = photograph(pose), true_corners(pose)
+        points = find_points(image, PATTERN, 'saddle', true + 5)
+        lost = find_points(image, PATTERN, 'saddle', (true % 40) + 300)
+        assert not isinstance(points, str)
+        assert not isinstance(lost, str)
+        assert np.abs(points.uv - lost.uv).max() < 0.02
+
+    def test_a_board_of_another_size_is_no_board(self) -> None:
+        assert isinstance(
+            find_points(photograph(poses(1).take(0)), parse_pattern('chessboard:9x8:30mm'),
+                        'saddle'), str)
+
+    def test_sixteen_bits(self) -> None:
+        pose = poses(1).take(0)
+        image = photograph(pose).astype(np.uint16) * 16
+        points = find_points(image, PATTERN, 'saddle')
+        assert not isinstance(points, str)
+        assert np.abs(points.uv - true_corners(pose)[points.ids]).max() < 0.1
+
+
+class TestTags:
+    def warped(self, flat: np.ndarray) -> tuple:
+        """Show a flat print obliquely; return the picture and the homography."""
+        turn = np.array([[0.5, 0.06, 60], [-0.04, 0.47, 80], [1.2e-4, 0.8e-4, 1]])
+        image = cv2.warpPerspective(flat, turn, (520, 480), flags=cv2.INTER_AREA,
+                                    borderValue=255)
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
+        return image, turn
+
+    def test_charuco(self) -> None:
+        pattern = parse_pattern('charuco:6x5:40mm:28mm:DICT_5X5_100')
+        if not hasattr(cv2.aruco, 'CharucoDetector'):
+            pytest.skip('boards are drawn by OpenCV 4.7 or newer')
+        board = cv2.aruco.CharucoBoard(
+            (6, 5), 0.04, 0.028, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100))
+        image, turn = self.warped(board.generateImage((960, 800)))
+        points = find_points(image, pattern, 'charuco')
+        assert not isinstance(points, str), points
+        assert len(points.ids) > 15
+        flat = (pattern.points[points.ids, :2] + 0.04) * 4000 - 0.5
+        expected = cv2.perspectiveTransform(flat[None], turn)[0]
+        assert np.abs(points.uv - expected).max() < 0.5
+
+    def test_aprilgrid(self, tmp_path: Path) -> None:
+        path = tmp_path / 'april.yaml'
+        path.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\n"
+                        'tagSpacing: 0.3\n')
+        pattern = parse_pattern(f'aprilgrid:{path}')
+        flat = np.full((700, 1000), 255, np.uint8)
+        cell, gap = 20, 60  # a tag of ten cells; 0.1 m are 200 px
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+        left, bottom = 100, 600
+        for tag in range(6):
+            draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
+            picture = draw(dictionary, tag, 10 * cell, borderBits=2)
+            u, v = left + 260 * (tag % 3), bottom - 200 - 260 * (tag // 3)
+            flat[v:v + 200, u:u + 200] = picture
+        for row in range(3):
+            for column in range(4):
+                u, v = left - gap + 260 * column, bottom - 260 * row
+                flat[v:v + gap, u:u + gap] = 0
+        image, turn = self.warped(flat)
+        points = find_points(image, pattern, 'aprilgrid')
+        assert not isinstance(points, str), points
+        assert len(points.ids) == 24
+        place = pattern.points[points.ids, :2] * 2000
+        flat_uv = np.stack([left + place[:, 0], bottom - place[:, 1]], axis=-1) - 0.5
+        expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
+        assert np.abs(points.uv - expected).max() < 0.5
+
+    @pytest.mark.parametrize('spec', ['circles:6x5:40mm', 'circles:4x7:40mm:asymmetric'])
+    def test_circles(self, spec: str) -> None:
+        pattern = parse_pattern(spec)
+        flat = np.full((900, 1100), 255, np.uint8)
+        for x, y in pattern.points[:, :2] * 3000 + 120:
+            cv2.circle(flat, (round(x), round(y)), 40, 0, -1, cv2.LINE_AA)
+        image, turn = self.warped(flat)
+        points = find_points(image, pattern, 'circles')
+        assert not isinstance(points, str), points
+        flat_uv = pattern.points[points.ids, :2] * 3000 + 120
+        expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
+        assert np.abs(points.uv - expected).max() < 1.0
+
+    def test_squares(self) -> None:
+        pattern = parse_pattern('squares:3x4:40mm:30mm')
+        flat = np.full((900, 800), 255, np.uint8)
+        for x, y in pattern.points[::4, :2] * 2500 + 150:
+            flat[round(y):round(y) + 100, round(x):round(x) + 100] = 0
+        image, turn = self.warped(flat)
+        points = find_points(image, pattern, 'squares')
+        assert not isinstance(points, str), points
+        flat_uv = pattern.points[points.ids, :2] * 2500 + 150 - 0.5
+        expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
+        assert np.abs(points.uv - expected).max() < 1.0
+
+
+class TestPhotographs:
+    @pytest.fixture(scope='class')
+    @classmethod
+    def folder(cls, tmp_path_factory: pytest.TempPathFactory) -> Path:
+        """Photographs, the first four as they should be and the others each odd in one way."""
+        folder = tmp_path_factory.mktemp('photographs')
+        where = poses(6, 4)
+        images = [photograph(where.take(i)) for i in range(4)]
+        write(folder, images)
+        cv2.imwrite(str(folder / '10_copy.png'), images[0])
+        cv2.imwrite(str(folder / '11_blank.png'), np.full_like(images[0], 128))
+        cv2.imwrite(str(folder / '12_size.png'), images[1][:-10])
+        cv2.imwrite(str(folder / '13_colour.jpg'), cv2.cvtColor(
+            photograph(where.take(4)), cv2.COLOR_GRAY2BGR), [cv2.IMWRITE_JPEG_QUALITY, 98])
+        data = (folder / '13_colour.jpg').read_bytes()
+        (folder / '14_cut.jpg').write_bytes(data[:len(data) // 2])
+        (folder / '15_empty.png').write_bytes(b'')
+        (folder / '16_text.png').write_text('no image')
+        cv2.imwrite(str(folder / '17_soft.png'), photograph(
+            where.take(5), exposure=Exposure(blur=2.5)))
+        cv2.imwrite(str(folder / '18_burnt.png'), photograph(
+            where.take(5), exposure=Exposure(gain=1.5), seed=2))
+        deep = photograph(where.take(3), seed=3).astype(np.uint16) * 200
+        cv2.imwrite(str(folder / '19_deep.png'), deep)
+        return folder
+
+    @pytest.fixture(scope='class')
+    @classmethod
+    def detection(cls, folder: Path) -> Detection:
+        return found(folder)
+
+    def test_the_odd_ones_are_named_and_the_rest_goes_on(self, detection: Detection) -> None:
+        said = reasons(detection)
+        assert {name for name, reason in said.items() if not reason} == {
+            '00.png', '01.png', '02.png', '03.png', '13_colour.jpg', '17_soft.png',
+            '18_burnt.png', '19_deep.png'}
+        assert 'a copy of' in said['10_copy.png']
+        assert said['11_blank.png'] == 'no board found'
+        assert 'is 424x390 px; the others are 424x400' in said['12_size.png']
+        assert 'JPEG ends' in said['14_cut.jpg']
+        assert 'not an image' in said['15_empty.png']
+        assert 'not an image' in said['16_text.png']
+        assert all('\n' not in reason for reason in said.values())
+        notes = {Path(one.name).name: ' '.join(one.notes) for one in detection.searched}
+        assert 'blurred by 2.' in notes['17_soft.png']
+        assert 'over-exposed' in notes['18_burnt.png']
+        assert 'same place as 03.png' in notes['19_deep.png']
+        assert not notes['00.png']
+
+    def test_observations_are_the_corners(self, detection: Detection) -> None:
+        table = detection.observations
+        assert detection.image_size == (424, 400)
+        assert len(table.frames) == 8
+        assert np.isfinite(table.sigma).all()
+        for i in range(4):
+            mine = table.frame == detection.frames[i]
+            true = true_corners(poses(6, 4).take(i))[table.landmark[mine]]
+            assert np.abs(table.uv[mine] - true).max() < 0.1
+
+    def test_nothing_found(self, tmp_path: Path) -> None:
+        with pytest.raises(ObservationError, match='no photograph in it'):
+            found(tmp_path)
+        write(tmp_path, [np.full((50, 60), 9, np.uint8)])
+        with pytest.raises(ObservationError, match='no board found'):
+            found(tmp_path)
+        with pytest.raises(ObservationError, match='no such file'):
+            found(tmp_path / 'nowhere')
+
+    def test_a_rig_by_its_folders(self, tmp_path: Path) -> None:
+        images = [photograph(poses(2, 4).take(i)) for i in range(2)]
+        write(tmp_path / 'left', images)
+        write(tmp_path / 'right', images[::-1])
+        table = found(tmp_path).observations
+        assert table.cameras == ('left', 'right')
+        left, right = (table.take(table.camera == i) for i in (0, 1))
+        assert np.abs(left.uv[left.frame == 0] - right.uv[right.frame == 1]).max() < 1e-9
+
+    def test_video(self, tmp_path: Path) -> None:
+        path = tmp_path / 'film.avi'
+        video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*'MJPG'), 10.0, (424, 400))
+        if not video.isOpened():
+            pytest.skip('this OpenCV writes no video')
+        for i in range(3):
+            video.write(cv2.cvtColor(photograph(poses(4, 4).take(i)), cv2.COLOR_GRAY2BGR))
+        video.release()
+        table = detect(find_photographs([str(path)], every=2), PATTERN).observations
+        assert np.unique(table.t).tolist() == pytest.approx([0.0, 0.2])
+
+    def test_exif(self) -> None:
+        entry = b'\x12\x01\x03\x00\x01\x00\x00\x00\x06\x00\x00\x00'
+        head = b'\xff\xd8\xff\xe1\x00\x22Exif\0\0II*\0\x08\0\0\0\x01\0'
+        assert exif_turned(head + entry)
+        assert not exif_turned(head + entry.replace(b'\x06', b'\x01'))
+        big = b'\xff\xd8\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01'
+        assert exif_turned(big + b'\x01\x12\x00\x03\x00\x00\x00\x01\x00\x08\x00\x00')
+
+    @pytest.mark.parametrize(('encoding', 'shape'), [
+        ('mono8', (4, 6)), ('bgr8', (4, 6, 3)), ('rgba8', (4, 6, 4)), ('bayer_rggb8', (4, 6)),
+        ('mono16', (4, 6)), ('yuv422_yuy2', (4, 6, 2)),
+    ])
+    def test_messages(self, encoding: str, shape: tuple[int, ...]) -> None:
+        class Message:
+            height, width, is_bigendian = 4, 6, 0
+
+        message = Message()
+        kind = np.uint16 if encoding == 'mono16' else np.uint8
+        rows = np.full(shape, 100, kind)
+        message.encoding, message.step = encoding, rows.nbytes // 4 + 3
+        padded = np.pad(rows.view(np.uint8).reshape(4, -1), ((0, 0), (0, 3)))
+        message.data = padded.tobytes()
+        pixels = message_pixels(message, 'sensor_msgs/msg/Image', 'one')
+        assert pixels.shape == (4, 6)
+        assert np.abs(pixels.astype(int) - 100).max() <= 16
+        message.data = message.data[:-8]
+        with pytest.raises(FisheyeSvpError, match='do not hold'):
+            message_pixels(message, 'sensor_msgs/msg/Image', 'one')
+
+
+class TestOrder:
+    def test_frames_of_a_symmetric_board_are_turned_alike(self, tmp_path: Path) -> None:
+        board = Print(6, 4, 0.030)
+        printed = printed_with(0.0003, 5, board)
+        where = poses(12, 6, board)
+        write(tmp_path, [photograph(where.take(i), printed, seed=i) for i in range(12)])
+        detection = found(tmp_path, 'chessboard:6x4:30mm')
+        table, turned = detection.observations, []
+        for i in range(12):
+            mine = table.frame == i
+            if mine.any():
+                true = true_corners(where.take(i), printed)[table.landmark[mine]]
+                turned.append(np.abs(table.uv[mine] - true).max() > 1)
+        assert len(turned) > 9
+        assert len(set(turned)) == 1
+        sure = detection.certainty[detection.frames >= 0]
+        assert sure.min() > 0.8
+
+    def test_a_perfect_board_leaves_the_order_open(self, tmp_path: Path) -> None:
+        board = Print(6, 4, 0.030)
+        where = poses(8, 6, board)
+        write(tmp_path, [photograph(where.take(i), board, seed=i) for i in range(8)])
+        assert found(tmp_path, 'chessboard:6x4:30mm').certainty.mean() < 0.98
+
+
+def test_work_is_bounded_in_time() -> None:
+    results = dict(bounded_map(sleep, [0.0, 0.0, 0.0, 120.0, 0.0, 0.0], 1.0))
+    assert results[3] == Late(True)
+    assert [results[i] for i in (0, 1, 2, 4, 5)] == [None] * 5
