@@ -16,6 +16,7 @@ from fisheye_svp_ros.detect.patterns import Turn
 from fisheye_svp_ros.detect.points import local_axes
 
 _ROUNDS = 30
+_SHUFFLES = 8
 
 
 class Agreement(NamedTuple):
@@ -37,6 +38,16 @@ def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
     turns: those that nothing in the print tells apart, the first of them none.
     """
     field = np.nan_to_num(field)
+    choice, margin = _agreed(field, turns)
+    # Views can be turned to agree a little on anything: as much as they do once mixed up.
+    rng = np.random.default_rng(0)
+    mixed = [np.stack([rng.permutation(view) for view in field]) for _ in range(_SHUFFLES)]
+    chance = float(np.mean([_agreed(one, turns)[1].mean() for one in mixed]))
+    return Agreement(choice, _certainty(margin, chance))
+
+
+def _agreed(field: Array, turns: tuple[Turn, ...]) -> tuple[Index, Array]:
+    """Return the best turns (V,) and how much better each is than the next, (V,)."""
     turned = np.stack([field[:, turn.source] @ turn.matrix.T for turn in turns])
     turned = turned.reshape(len(turns), len(field), -1)
     turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
@@ -45,8 +56,7 @@ def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
     choice = max(found, key=lambda one: _likeness(turned, one)[one, np.arange(len(one))].sum())
     likeness = _likeness(turned, choice)
     ranked = np.sort(likeness, axis=0)
-    margin = (ranked[-1] - ranked[-2]) / 2
-    return Agreement(choice, _certainty(margin))
+    return choice, np.asarray(ranked[-1] - ranked[-2]) / 2
 
 
 def _settled(turned: Array, first: Array) -> Index:
@@ -67,12 +77,14 @@ def _likeness(turned: Array, choice: Index) -> Array:
     return np.asarray((turned * others).sum(axis=-1))
 
 
-def _certainty(margin: Array) -> Array:
+def _certainty(margin: Array, chance: float) -> Array:
     """Chances, from margins that are +-mean with Gaussian scatter, by their moments.
 
-    The fourth moment tells a mean from scatter, although every view was turned to agree.
+    The fourth moment tells a mean from scatter, although every view was turned to agree; what
+    margins are by chance is taken off.
     """
     second, fourth = (margin**2).mean(), (margin**4).mean()
     mean2 = np.sqrt(max((3 * second**2 - fourth) / 2, 0.0))
-    scatter2 = max(second - mean2, 1e-3 * second, 1e-30)
-    return np.asarray(1 / (1 + np.exp(-np.minimum(2 * np.sqrt(mean2) * margin / scatter2, 50))))
+    scatter2 = max(second - mean2, 1e-3 * second, chance**2, 1e-30)
+    mean = max(float(np.sqrt(mean2)) - chance, 0.0)
+    return np.asarray(1 / (1 + np.exp(-np.minimum(2 * mean * margin / scatter2, 50))))

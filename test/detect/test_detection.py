@@ -71,10 +71,10 @@ class TestPatterns:
 class TestCorners:
     def test_scatter_is_the_stated_sigma(self) -> None:
         pose = poses(3, 1).take(1)
-        seen = [find_points(photograph(pose, seed=seed), PATTERN, 'saddle') for seed in range(40)]
+        seen = [find_points(photograph(pose, seed=seed), PATTERN, 'saddle') for seed in range(25)]
         uv = np.stack([one.uv for one in seen if not isinstance(one, str)])
         sigma = np.stack([one.sigma for one in seen if not isinstance(one, str)])
-        assert uv.shape == (40, 30, 2)
+        assert uv.shape == (25, 30, 2)
         ratio = uv.std(axis=0, ddof=1).mean(axis=1) / sigma.mean(axis=0)
         assert np.mean(ratio) == pytest.approx(1.0, abs=0.2)
         assert np.abs(uv.mean(axis=(0, 1)) - true_corners(pose).mean(axis=0)).max() < 0.01
@@ -334,7 +334,7 @@ class TestOrder:
         board = Print(6, 4, 0.030)
         where = poses(8, 6, board)
         write(tmp_path, [photograph(where.take(i), board, seed=i) for i in range(8)])
-        assert found(tmp_path, 'chessboard:6x4:30mm').certainty.mean() < 0.98
+        assert found(tmp_path, 'chessboard:6x4:30mm').certainty.mean() < 0.95
 
 
 def test_work_is_bounded_in_time() -> None:

@@ -19,7 +19,7 @@ QUIET = Exposure(noise=0.0)
 PATTERN = parse_pattern(BOARD)
 
 
-def corner_errors(printed: Print, exposure: Exposure, count: int = 4) -> np.ndarray:
+def corner_errors(printed: Print, exposure: Exposure, count: int = 2) -> np.ndarray:
     """Return found minus true corners of some photographs."""
     errors = []
     for i in range(count):
