@@ -149,7 +149,7 @@ class Effect(ABC):
         Raises LensError where the lens holds another form of the same effect.
         """
         curved = self.curved(lens, values)
-        if curved is not lens and type(curved.image_height) in IMAGE_HEIGHTS.values():
+        if curved is not lens and IMAGE_HEIGHTS.name_of(type(curved.image_height)):
             return curved
         held: Mapping[str, Any] = getattr(lens, self.place)
         if self.name in held:

@@ -1,4 +1,8 @@
-"""The registry of effects: one line each."""
+"""The registry of effects: one line each.
+
+A distribution of the user's own adds effects by entry points in the group
+`fisheye_svp_ros.effects`, each under the name that its class has.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +34,9 @@ from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.effects.wrong_ids import WrongIdsEffect
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.registry import Registry
 
-CATALOGUE: dict[str, type[Effect]] = {
+CATALOGUE: Registry[type[Effect]] = Registry('effects', {
     effect.name: effect
     for effect in (
         ViewpointShiftEffect,
@@ -58,7 +63,7 @@ CATALOGUE: dict[str, type[Effect]] = {
         QuantisationEffect,
         NoiseVsAngleEffect,
     )
-}
+}, Effect)
 
 
 def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:

@@ -69,7 +69,7 @@ class LandmarkSurveyEffect(Effect):
         columns = np.zeros((*slot.shape, 3, len(self.landmarks), 3))
         view, point = np.nonzero(slot >= 0)
         columns[view, point, :, slot[view, point]] = np.eye(3)
-        return columns.reshape(*slot.shape, 3, -1)
+        return columns.reshape(*slot.shape, 3, len(self.parameters))
 
     def displacement(self, scene: Scene, values: Array) -> Array:
         slot = self.slots(scene.views.landmark)

@@ -53,6 +53,7 @@ class RigFlexEffect(Effect):
         else:
             amounts = (order[:, None] == np.arange(len(self.frames))).astype(float)
         turn = scene.pose.rotation * (scene.views.camera > 0)[:, None, None]
-        turns = (amounts[:, None, :, None] * turn[:, :, None, :]).reshape(len(order), 3, -1)
+        turns = amounts[:, None, :, None] * turn[:, :, None, :]
+        turns = turns.reshape(len(order), 3, len(self.parameters))
         columns = np.concatenate([np.zeros_like(turns), turns], axis=1)
         return np.broadcast_to(columns[:, None], (*scene.uv.shape[:2], *columns.shape[1:]))

@@ -64,4 +64,4 @@ class SessionStepEffect(Effect):
         instant = scene.times if self.timed else scene.views.frame
         after = (instant[:, None] >= np.array(self.starts)).astype(float)
         columns = step[..., None, :] * after[:, None, None, :, None]
-        return np.asarray(columns.reshape(*scene.uv.shape, -1))
+        return np.asarray(columns.reshape(*scene.uv.shape, len(self.parameters)))

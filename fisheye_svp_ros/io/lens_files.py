@@ -17,8 +17,9 @@ from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import read_yaml, write_text
 from fisheye_svp_ros.optics.curve_base import Curve, SumOfShifts, ViewpointShift
-from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS, curve_name
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens, field_of_view
+from fisheye_svp_ros.registry import Registry
 
 C = TypeVar('C', bound=Curve)
 
@@ -72,7 +73,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
 def lens_to_dict(lens: Lens) -> dict[str, Any]:
     """Return the mapping of the lens's YAML."""
     focal = {'f': lens.fx} if lens.fx == lens.fy else {'fx': lens.fx, 'fy': lens.fy}
-    kind, *k = _curve_to_dict(lens.image_height, 'k').items()
+    kind, *k = _curve_to_dict(lens.image_height, IMAGE_HEIGHTS, 'k').items()
     document: dict[str, Any] = {
         'name': lens.name,
         'image': {'width': lens.width, 'height': lens.height},
@@ -113,7 +114,7 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
 
 def _shift_to_dict(shift: ViewpointShift) -> Any:
     parts = shift.parts if isinstance(shift, SumOfShifts) else (shift,)
-    entries = [_curve_to_dict(part, 'e') for part in parts]
+    entries = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in parts]
     return entries if len(entries) > 1 else entries[0]
 
 
@@ -141,10 +142,11 @@ def _curve(
         raise LensError(f'{where}: a coefficient is missing; needed are {needed}') from cause
 
 
-def _curve_to_dict(curve: Curve, listed: str) -> dict[str, Any]:
+def _curve_to_dict(curve: Curve, registry: Registry[Any], listed: str) -> dict[str, Any]:
     values = dict(zip(curve.coefficient_names, curve.coefficients, strict=True))
     numbered = [values.pop(name) for name in tuple(values) if name.removeprefix(listed).isdigit()]
-    return {'model': curve_name(curve), **values, **({listed: numbered} if numbered else {})}
+    named = {'model': registry.name_of(type(curve)), **values}
+    return {**named, listed: numbered} if numbered else named
 
 
 def _effects(document: Mapping[str, Any], name: str, where: str) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Readers: files of measured or simulated image points to one table of observations.
 
-A new reader is one module with `read(path) -> Observations` and one line in READERS.
+A new reader is one module with `read(path) -> Observations` and one line in READERS; another
+distribution adds a `Reader` by an entry point in the group `fisheye_svp_ros.readers`.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import NamedTuple
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.poses_csv import FramePoses, read_poses, write_poses
+from fisheye_svp_ros.registry import Registry
 from fisheye_svp_ros.scene.observations import Observations
 
 __all__ = [
@@ -33,13 +35,17 @@ def _holds(pattern: str) -> Callable[[Path], bool]:
     return lambda path: path.is_dir() and any(path.glob(pattern))
 
 
-READERS = (
-    Reader('a .csv file', lambda path: path.suffix == '.csv', 'observations_csv'),
-    Reader('an .orpc file', lambda path: path.suffix == '.orpc', 'orpc'),
-    Reader('a folder of .orpc files', _holds('*.orpc'), 'orpc'),
-    Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap', 'observations_bag'),
-    Reader('a folder of one', _holds('*.mcap'), 'observations_bag'),
-)
+_HERE = 'fisheye_svp_ros.io'
+READERS: Registry[Reader] = Registry('readers', {
+    reader.form: reader for reader in (
+        Reader('a .csv file', lambda path: path.suffix == '.csv', f'{_HERE}.observations_csv'),
+        Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_HERE}.orpc'),
+        Reader('a folder of .orpc files', _holds('*.orpc'), f'{_HERE}.orpc'),
+        Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap',
+               f'{_HERE}.observations_bag'),
+        Reader('a folder of one', _holds('*.mcap'), f'{_HERE}.observations_bag'),
+    )
+}, Reader)
 
 
 def read_observations(path: str | Path) -> Observations:
@@ -48,13 +54,11 @@ def read_observations(path: str | Path) -> Observations:
     Raises ObservationError, naming file, line and field, for anything missing or malformed.
     """
     given = Path(path)
-    for reader in READERS:
+    for reader in READERS.values():
         if reader.recognises(given):
-            read: Callable[[Path], Observations] = import_module(
-                f'fisheye_svp_ros.io.{reader.module}'
-            ).read
+            read: Callable[[Path], Observations] = import_module(reader.module).read
             return read(given)
     if not given.exists():
         raise ObservationError(f'{path}: there is no such file or folder; check the path')
-    forms = ', '.join(reader.form for reader in READERS)
+    forms = ', '.join(reader.form for reader in READERS.values())
     raise ObservationError(f'{path}: not observations in a known form; these are {forms}')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -33,8 +34,6 @@ from fisheye_svp_ros.study.settings import SolverSettings
 
 T = TypeVar('T')
 
-_UNITS = {'1': '', 'm': '_m', 'm^2': '_m2', 'rad': '_rad', 's': '_s', 'px': '_px',
-          '1/rad^2': '_per_rad2'}
 _MOST = 24  # parameters of a cause that are worth a topic each
 
 
@@ -210,10 +209,15 @@ def figures(found: Diagnosis) -> dict[str, float]:
         if len(cause.parameters) > _MOST:
             continue
         for name, entry in cause.parameters.items():
-            unit = _UNITS[entry['unit']]
+            unit = _suffix(entry['unit'])
             key = f'{cause.effect}_{name}'.replace('.', '_')
             numbers |= {f'{key}{unit}': entry['value'], f'{key}_stderr{unit}': entry['stderr']}
     return {name: float(value) for name, value in numbers.items() if math.isfinite(value)}
+
+
+def _suffix(unit: str) -> str:
+    """Return a unit as the end of a metric's name: nothing, _m2, _per_rad2."""
+    return '' if unit == '1' else '_' + re.sub(r'\W', '', unit.replace('1/', 'per_'))
 
 
 def in_background(work: Callable[[], T]) -> Future[T]:

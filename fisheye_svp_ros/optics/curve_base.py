@@ -153,6 +153,11 @@ class ViewpointShift(Curve):
     formula: ClassVar[Formula]
     lengths: ClassVar[tuple[str, ...] | None] = None
 
+    @classmethod
+    def neutral(cls) -> ViewpointShift:
+        """Return the curve of this kind from which a fit starts: it shifts nothing."""
+        return cls()
+
     def value_and_slope(self, theta: Array, half_tan: Array) -> tuple[Array, Array]:
         """Return s and ds/dtheta; `half_tan` is tan(theta / 2), which the caller has at hand."""
         # The guards only matter on the axis, where the slope of every shift vanishes.

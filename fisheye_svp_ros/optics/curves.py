@@ -1,4 +1,8 @@
-"""The lens curves of the package: a new one is one class here and one line in its registry."""
+"""The lens curves of the package: a new one is one class here and one line in its registry.
+
+A distribution of the user's own adds curves by entry points in the groups
+`fisheye_svp_ros.image_heights` and `fisheye_svp_ros.viewpoint_shifts`.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics import formulas
-from fisheye_svp_ros.optics.curve_base import Curve, ImageHeight, Trigonometric, ViewpointShift
+from fisheye_svp_ros.optics.curve_base import ImageHeight, Trigonometric, ViewpointShift
+from fisheye_svp_ros.registry import Registry
 
 
 @dataclass(frozen=True)
@@ -128,26 +133,24 @@ class FlatPort(ViewpointShift):
         root = np.sqrt(n * n - np.sin(theta) ** 2)
         return np.stack([1 - cos / root, self.thickness * cos * n / root**3], axis=-1)
 
+    @classmethod
+    def neutral(cls) -> FlatPort:
+        return cls(0.0, 1.5)
+
     def check(self) -> str:
         index = self.refractive_index
         return '' if index > 1.0 else f'refractive_index is {index}; it must be above 1'
 
 
-IMAGE_HEIGHTS: dict[str, type[ImageHeight]] = {
+IMAGE_HEIGHTS: Registry[type[ImageHeight]] = Registry('image_heights', {
     'orthographic': Orthographic,
     'equidistant': Equidistant,
     'equisolid': Equisolid,
     'stereographic': Stereographic,
     'kannala_brandt': KannalaBrandt,
-}
+}, ImageHeight)
 
-VIEWPOINT_SHIFTS: dict[str, type[ViewpointShift]] = {
+VIEWPOINT_SHIFTS: Registry[type[ViewpointShift]] = Registry('viewpoint_shifts', {
     'gennery': Gennery,
     'flat_port': FlatPort,
-}
-
-
-def curve_name(curve: Curve) -> str:
-    """Return the name under which the curve's class is registered."""
-    registry: dict[str, type] = {**IMAGE_HEIGHTS, **VIEWPOINT_SHIFTS}
-    return next(name for name, kind in registry.items() if kind is type(curve))
+}, ViewpointShift)

@@ -11,8 +11,7 @@ import numpy as np
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
 from fisheye_svp_ros.optics.camera import back_project, incidence
-from fisheye_svp_ros.optics.curve_base import ViewpointShift
-from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import (
     INTRINSICS,
     Lens,
@@ -37,7 +36,6 @@ FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is n
 _CANDIDATES = 4
 _START_ITERATIONS = 40
 _ROUNDS = 4
-_SHIFT_STARTS: tuple[ViewpointShift, ...] = (Gennery(), FlatPort(0.0, 1.5))
 
 
 class Calibration(NamedTuple):
@@ -110,7 +108,8 @@ def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], na
     width, height = image_size
     if min(width, height) < 1:
         raise LensError(f'image size is {width}x{height}; both must be above 0')
-    shifts = (s for s in _SHIFT_STARTS if set(s.coefficient_names) & set(free))
+    shifts = (kind.neutral() for kind in VIEWPOINT_SHIFTS.values()
+              if set(kind.coefficient_names) & set(free))
     lens = Lens(
         name=name, width=width, height=height,
         fx=float(width), fy=float(width), cx=(width - 1) / 2, cy=(height - 1) / 2,

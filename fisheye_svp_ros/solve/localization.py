@@ -40,6 +40,8 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     if not some_flat:
         return found
     flat, centre, normal = _flat_targets(views)
+    if not flat.size:
+        return found
     reflected = _reflected(found.pose.take(flat), centre, normal)
     other, _ = _localized(model, views.take(flat), reflected)
     better = other.cost < found.cost[flat]

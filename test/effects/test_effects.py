@@ -88,6 +88,15 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
         )
 
 
+@pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
+def test_no_views_are_no_trouble(name, linearised):
+    model, pose, views, _, scene_ = linearised
+    for effect in forms(name, scene_):
+        extended = ForwardModel(model.lens, [(effect, np.full(len(effect.parameters), 1e-5))])
+        none = np.zeros(0, dtype=int)
+        assert extended.predict(pose.take(none), views.take(none)).uv.shape == (0, 60, 2)
+
+
 def test_unknown_and_incomplete_effects_are_refused():
     with pytest.raises(LensError, match="effect 'bent' is unknown"):
         load_effects({'bent': {}}, 'lens.yaml')

@@ -1,0 +1,58 @@
+"""Registries: the package's own kinds by name, and those of other distributions.
+
+Another distribution adds one by an entry point: its name in the group `fisheye_svp_ros.<what>`,
+pointing to the class.  Those are looked for when a name is not the package's own, or when all are
+asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, TypeVar
+
+from fisheye_svp_ros.errors import ParameterError
+
+T = TypeVar('T')
+
+
+class Registry(Mapping[str, T]):
+    """Kinds by name; what: the last word of the group of entry points; base: of every class."""
+
+    def __init__(self, what: str, own: Mapping[str, T], base: type) -> None:
+        self._what, self._own, self._base = what, own, base
+
+    def __getitem__(self, name: str) -> T:
+        return self._own[name] if name in self._own else self._added[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*self._own, *self._added))
+
+    def __len__(self) -> int:
+        return len(self._own) + len(self._added)
+
+    def name_of(self, kind: object) -> str | None:
+        """Return the name of a kind; None where it is not registered."""
+        for names in (self._own, self):
+            for name, known in names.items():
+                if known is kind:
+                    return name
+        return None
+
+    @cached_property
+    def _added(self) -> dict[str, T]:
+        group = f'fisheye_svp_ros.{self._what}'
+        return {entry.name: self._load(entry) for entry in entry_points(group=group)}
+
+    def _load(self, entry: EntryPoint) -> Any:
+        whose = f'{entry.group} {entry.name!r} of {entry.dist.name if entry.dist else entry.value}'
+        try:
+            kind = entry.load()
+        except Exception as cause:  # whatever somebody else's module raises
+            raise ParameterError(f'{whose} cannot be loaded ({cause}); mend it') from cause
+        if entry.name in self._own or getattr(kind, 'name', entry.name) != entry.name:
+            raise ParameterError(f'{whose} has a name of its own or of another; rename it')
+        if not issubclass(kind if isinstance(kind, type) else type(kind), self._base):
+            raise ParameterError(f'{whose} is no {self._base.__name__}; derive it from that')
+        return kind
