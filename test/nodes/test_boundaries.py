@@ -209,8 +209,8 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
     monkeypatch.setattr(Localizer, 'solve', slowly)
     for stamp in range(2, 302):
         attack.tell_points(stamp)
-    texts = []
     attack.graph.until(lambda: attack.answer(301))
+    texts = [message.status[0].message for message in attack.diagnostics]
     for _ in range(3):
         counts = attack.counts()
         texts.append(attack.diagnostics[-1].status[0].message)
