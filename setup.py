@@ -45,7 +45,8 @@ setup(
         'rich>=13.0',
         'Jinja2>=3.1',
         'opencv-python-headless>=4.6',
-        'rosbags>=0.11',
+        'rosbags>=0.11.9',
+        'mcap>=1.1',
         'pyarrow>=14',
     ],
     extras_require={

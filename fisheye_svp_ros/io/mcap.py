@@ -1,22 +1,23 @@
-"""What is whole in an MCAP file that was cut short: by a crash, a full disk, a broken copy.
+"""What is whole in an MCAP file that was cut short or damaged.
 
-Readers of MCAP start from the index at the end; here the file is read from its beginning up to the
-first record that is not whole.  Source: mcap.dev/spec.
+Readers of MCAP trust the index at its end; here every chunk is looked at on its own, and believed
+where its checksum fits.  Source: mcap.dev/spec.
 """
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, Any, NamedTuple
 
-from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-_MAGIC = b'\x89MCAP0\r\n'
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK = 0x03, 0x04, 0x05, 0x06
-_RECORD = struct.Struct('<BQ')
-_CHUNK_HEAD = struct.Struct('<QQQI')
+_LARGEST = 1 << 30  # bytes of a record that is taken for one
 
 
 class RawMessage(NamedTuple):
@@ -28,54 +29,77 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-def whole_messages(path: Path) -> Iterator[RawMessage]:
-    """Yield every whole message of an MCAP file, in the order of the file."""
-    data = path.read_bytes()
-    if not data.startswith(_MAGIC):
-        return
+def whole_messages(path: Path, note: Callable[[str], None]) -> Iterator[RawMessage]:
+    """Yield every whole message of an MCAP file, in the order of the file.
+
+    note: told what is damaged, and where.
+    """
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    for kind, body in _records(data[len(_MAGIC):]):
-        if kind == _SCHEMA:
-            (number,) = struct.unpack_from('<H', body)
-            schemas[number] = _string(body, 2)[0]
-        elif kind == _CHANNEL:
-            number, schema = struct.unpack_from('<HH', body)
-            channels[number] = _string(body, 4)[0], schemas.get(schema, '')
-        elif kind == _MESSAGE:
-            number, _, time = struct.unpack_from('<HIQ', body)
-            if number in channels:
-                yield RawMessage(*channels[number], time, bytes(body[22:]))
+    with path.open('rb') as stream:
+        for record in _records(stream, note):
+            if isinstance(record, Schema):
+                schemas[record.id] = record.name
+            elif isinstance(record, Channel):
+                channels[record.id] = record.topic, schemas.get(record.schema_id, '')
+            elif isinstance(record, Message) and record.channel_id in channels:
+                yield RawMessage(*channels[record.channel_id], record.log_time, record.data)
 
 
-def _records(data: bytes | memoryview) -> Iterator[tuple[int, memoryview]]:
-    """Yield the whole records, those inside chunks included."""
-    view, place = memoryview(data), 0
-    while place + _RECORD.size <= len(view):
-        kind, size = _RECORD.unpack_from(view, place)
-        start, place = place + _RECORD.size, place + _RECORD.size + size
-        if kind == _CHUNK:
-            yield from _records(_chunk(view[start:place]))
-        elif place <= len(view):
-            yield kind, view[start:place]
-
-
-def _chunk(body: memoryview) -> bytes | memoryview:
-    """Return the records of a chunk; of one that is cut short only where it is not compressed."""
-    if len(body) < _CHUNK_HEAD.size + 4:
-        return b''
-    _, _, size, _ = _CHUNK_HEAD.unpack_from(body)
-    compression, end = _string(body, _CHUNK_HEAD.size)
-    content = body[end + 8:]
-    if not compression:
-        return content
+def _records(stream: IO[bytes], note: Callable[[str], None]) -> Iterator[Any]:
+    place = 0
     try:
-        return DECOMPRESSORS[compression](bytes(content), size)
+        for record in StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records:
+            if isinstance(record, Chunk):
+                yield from _contents(record, f'the chunk that ends at byte {stream.tell()}', note)
+            else:
+                yield record
+            place = stream.tell()
+        return
+    except Exception as cause:
+        note(f'from byte {place} on it cannot be followed ({cause or "its end is missing"})')
+    for start in sorted({place, *(s for s in _indexed_chunks(stream) if s > place)}):
+        stream.seek(start)
+        if stream.read(9)[:1] != bytes([Opcode.CHUNK]):
+            continue
+        where = f'the chunk at byte {start}'
+        try:
+            chunk = Chunk.read(ReadDataStream(stream))
+        except Exception as cause:
+            note(f'{where} cannot be read ({cause})')
+            continue
+        yield from _contents(chunk, where, note)
+
+
+def _indexed_chunks(stream: IO[bytes]) -> list[int]:
+    """Return where the index at the end of a file says that chunks start; empty without one."""
+    try:
+        stream.seek(0)
+        summary = make_reader(stream).get_summary()
     except Exception:
-        return b''
+        return []
+    return sorted(c.chunk_start_offset for c in summary.chunk_indexes) if summary else []
 
 
-def _string(body: memoryview, place: int) -> tuple[str, int]:
-    (size,) = struct.unpack_from('<I', body, place)
-    end = place + 4 + size
-    return bytes(body[place + 4:end]).decode('utf-8', 'replace'), end
+def _contents(chunk: Chunk, where: str, note: Callable[[str], None]) -> list[Any]:
+    """Return the records of a chunk; of one that is cut short, where it is not compressed."""
+    try:
+        if chunk.compression or len(chunk.data) == chunk.uncompressed_size:
+            return breakup_chunk(chunk, validate_crc=True)
+    except Exception as cause:
+        note(f'{where} is damaged ({cause})')
+        return []
+    note(f'{where} is cut short')
+    data, records = ReadDataStream(BytesIO(chunk.data)), []
+    kinds: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
+    while data.count + 9 <= len(chunk.data):
+        kind, size = data.read1(), data.read8()
+        if data.count + size > len(chunk.data):
+            break
+        if kind == Opcode.MESSAGE:
+            records.append(Message.read(data, size))
+        elif kind in kinds:
+            records.append(kinds[kind].read(data))
+        else:
+            data.read(size)
+    return records

@@ -5,16 +5,17 @@ from __future__ import annotations
 import re
 import signal
 import time
+from collections.abc import Sequence
 from importlib import import_module
+from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from fisheye_svp_ros.io.bags import BagWriter
+from fisheye_svp_ros.io.bags import BagWriter, Offered
 
 _COUNTED = ('/image_points', '/result')
-_LATCHED = ('landmarks', 'camera_info', 'rig')
 _LOOK_EVERY = 0.2  # s, for topics that are new
 _QUIET = 0.5  # s without a message after which nothing is on its way any more
 
@@ -27,6 +28,7 @@ class Recorder(Node):  # type: ignore[misc]
         self.topics: set[str] = set()
         self._bag = bag
         self._wanted = wanted
+        self._warned: set[str] = set()
         self._timer = self.create_timer(_LOOK_EVERY, self._look)
 
     def spin(self) -> None:
@@ -56,18 +58,52 @@ class Recorder(Node):  # type: ignore[misc]
         for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED)):
             if topic in self.topics or (topic.endswith(_COUNTED) and topic not in complete):
                 continue
-            if self._wanted.fullmatch(topic) and len(types) == 1:
-                self._subscribe(topic, types[0])
+            if self._wanted.fullmatch(topic):
+                self._take(topic, types)
 
-    def _subscribe(self, topic: str, typename: str) -> None:
-        latched = topic.rpartition('/')[2] in _LATCHED
-        durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
-        package, _, name = typename.split('/')
+    def _take(self, topic: str, types: Sequence[str]) -> None:
+        """Record a topic once somebody publishes on it; warn, once, where that is impossible."""
+        publishers = self.get_publishers_info_by_topic(topic)
+        for typename in types:
+            offered = [
+                Offered(one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                        one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+                for one in publishers if one.topic_type == typename
+            ]
+            if not offered:
+                continue
+            try:
+                package, _, name = typename.split('/')
+                kind = getattr(import_module(f'{package}.msg'), name)
+                self._subscribe(topic, kind, typename, offered)
+            except Exception as error:  # a stranger's topic may have any name and any type
+                self._warn(f'{topic}: {typename} is not recorded ({error!r:.200})')
+                continue
+            self.topics.add(topic)
+            if len(types) > 1:
+                self._warn(f'{topic}: of {", ".join(types)} only {typename} is recorded')
+            return
+
+    def _subscribe(
+        self, topic: str, kind: Any, typename: str, offered: Sequence[Offered]
+    ) -> None:
+        self._bag.add(topic, typename, offered)
+        # What everybody offers is asked for; who asks for more does not hear the others.
+        latched, reliable = (all(values) for values in
+                             ([o.latched for o in offered], [o.reliable for o in offered]))
         self.create_subscription(
-            getattr(import_module(f'{package}.msg'), name),
-            topic,
-            lambda data: self._bag.write(topic, typename, data),
-            QoSProfile(depth=1000, durability=durability),
+            kind, topic, lambda data: self._bag.write(topic, typename, data),
+            QoSProfile(
+                depth=1000,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched
+                else DurabilityPolicy.VOLATILE,
+                reliability=ReliabilityPolicy.RELIABLE if reliable
+                else ReliabilityPolicy.BEST_EFFORT,
+            ),
             raw=True,
         )
-        self.topics.add(topic)
+
+    def _warn(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            self.get_logger().warning(text)

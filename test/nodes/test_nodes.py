@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -41,6 +41,11 @@ from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.localization import localize
+
+
+class Endpoint(NamedTuple):
+    topic_type: str
+    qos_profile: Any
 
 
 @pytest.fixture
@@ -520,7 +525,7 @@ def test_a_recorder_joins_a_topic_that_is_waited_for_once_its_publisher_is_there
 ) -> None:
     one = graph()
     one.hear(DiagnosticArray, '/localizer/result')
-    one.hear(Float64, '/localizer/metrics/rms_px')
+    one.probe.create_publisher(Float64, '/localizer/metrics/rms_px', 10)
     with BagWriter(tmp_path / 'bag') as bag:
         recorder = one.start(lambda: Recorder(bag, re.compile('/localizer/.*')))
         one.until(lambda: recorder.topics)
@@ -529,3 +534,44 @@ def test_a_recorder_joins_a_topic_that_is_waited_for_once_its_publisher_is_there
         assert recorder.topics == {'/localizer/metrics/rms_px'}
         one.probe.create_publisher(DiagnosticArray, '/localizer/result', 10)
         one.until(lambda: '/localizer/result' in recorder.topics)
+
+
+def test_a_recorder_survives_what_strangers_publish(
+    graph: Callable[..., Graph], tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    one = graph()
+    with BagWriter(tmp_path / 'bag') as bag:
+        recorder = one.start(lambda: Recorder(bag, re.compile('.*')))
+        # As a stranger's types look to this machine: unknown, or not even of three parts.
+        told = dict(one.probe.get_topic_names_and_types())
+        types = {**told, '/a': ['nobody_msgs/msg/Thing'], '/b': ['odd'],
+                 '/c': ['std_msgs/msg/Nothing']}
+        recorder.get_topic_names_and_types = lambda: list(types.items())
+        publishers = recorder.get_publishers_info_by_topic
+        profile = next(p for topic in told for p in publishers(topic)).qos_profile
+        recorder.get_publishers_info_by_topic = lambda topic: [
+            Endpoint(types[topic][0], profile)] if topic in '/a/b/c' else publishers(topic)
+        twice = [one.probe.create_publisher(kind, '/twice', 10) for kind in (Float64, CameraInfo)]
+        types['/twice'] = ['sensor_msgs/msg/CameraInfo', 'std_msgs/msg/Float64']
+        one.until(lambda: '/twice' in recorder.topics)
+        twice[1].publish(CameraInfo())
+        one.until(lambda: bag.count)
+        assert recorder.topics.isdisjoint({'/a', '/b', '/c'})
+    said = capfd.readouterr().err
+    for text in ('/a: nobody_msgs/msg/Thing is not recorded', '/b: odd is not recorded',
+                 '/c: std_msgs/msg/Nothing is not recorded', 'only sensor_msgs/msg/CameraInfo'):
+        assert said.count(text) == 1, said
+
+
+def test_the_camera_info_of_an_ordinary_driver_is_recorded(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    from rclpy.qos import qos_profile_sensor_data
+
+    one = graph()
+    driver = one.probe.create_publisher(CameraInfo, '/camera_info', qos_profile_sensor_data)
+    with BagWriter(tmp_path / 'bag') as bag:
+        recorder = one.start(lambda: Recorder(bag, re.compile('/camera_info')))
+        one.until(lambda: driver.get_subscription_count())
+        one.until(lambda: driver.publish(CameraInfo()) or bag.count)
+        assert recorder.topics == {'/camera_info'}
