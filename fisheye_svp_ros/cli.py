@@ -83,11 +83,21 @@ def _run(arguments: Sequence[str]) -> None:
         commands.choices[named].set_defaults(run=module.run)
     if named in _SOLVING:
         _add_engine(commands.choices[named])
-    parsed = parser.parse_args(arguments)
+    parsed, unknown = parser.parse_known_args(arguments)
+    if unknown:
+        _refuse(commands.choices[named], unknown[0])
     if named in _SOLVING and parsed.engine:
         import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
     parsed.run(parsed)
     sys.stdout.flush()
+
+
+def _refuse(parser: argparse.ArgumentParser, word: str) -> NoReturn:
+    """End with the help of the command that does not know a word, and an option like it."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(word.partition('=')[0], parser.format_help().split(), 1, 0.8)
+    parser.error(f'unknown argument {word}' + (f'; {near[0]}?' if near else ''))
 
 
 def _add_engine(parser: argparse.ArgumentParser) -> None:

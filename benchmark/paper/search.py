@@ -14,7 +14,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import Localized, localize_environments
+from fisheye_svp_ros.paper.evaluation import LocalizedSpread, localize_environments
 from fisheye_svp_ros.paper.studies import NAMES
 from fisheye_svp_ros.paper.tables import LOCALIZATION
 from fisheye_svp_ros.pose import Pose
@@ -127,7 +127,7 @@ class _TableFit:
     def _lens(self, which: int, numbers: Array) -> Lens:
         return lens_with(self._lenses[which], numbers * _SCALE)
 
-    def _tables(self, x: Array) -> tuple[Array, list[list[Localized]]]:
+    def _tables(self, x: Array) -> tuple[Array, list[list[LocalizedSpread]]]:
         """Return tables (2, 3, 3, 5) and what was localized, by lens and spread."""
         directions = _directions(x[:2 * _COUNT].reshape(1, _COUNT, 2))
         numbers = x[2 * _COUNT:].reshape(2, -1)
@@ -137,7 +137,9 @@ class _TableFit:
         ]
         return np.stack([np.stack([g.rows for g in one], axis=1) for one in localized]), localized
 
-    def _cell_columns(self, x: Array, tables: Array, localized: list[list[Localized]]) -> Array:
+    def _cell_columns(
+        self, x: Array, tables: Array, localized: list[list[LocalizedSpread]]
+    ) -> Array:
         """Differentiate the whitened misfits (90, 76), each solve starting from its neighbour."""
         moved = x[:2 * _COUNT] + _STEP * np.eye(2 * _COUNT)
         moved_directions = _directions(moved.reshape(-1, _COUNT, 2))
@@ -187,7 +189,7 @@ def _sigma() -> Array:
     return sigma
 
 
-def _at_all_radii(lens: Lens, directions: Array, start: Pose | None = None) -> Localized:
+def _at_all_radii(lens: Lens, directions: Array, start: Pose | None = None) -> LocalizedSpread:
     """Localize among layouts (B, N, 3) at the three radii, B * 3 environments."""
     points = (np.array(RADII)[:, None, None] * directions[:, None]).reshape(
         -1, *directions.shape[1:])

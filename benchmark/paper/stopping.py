@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import Localized, localize_spreads
+from fisheye_svp_ros.paper.evaluation import LocalizedSpread, localize_spreads
 from fisheye_svp_ros.paper.tables import LENSES, LOCALIZATION, OUT_OF_LINE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
@@ -65,7 +65,7 @@ def stopping_document(executor: Executor) -> dict[str, Any]:
     }
 
 
-def excess_of_published(localized: Localized, lens: Lens) -> Excess:
+def excess_of_published(localized: LocalizedSpread, lens: Lens) -> Excess:
     """Return how much worse the published position fits than the optimum; localized: Whole."""
     radius = OUT_OF_LINE[1]
     published = LOCALIZATION[OUT_OF_LINE][:3]
@@ -78,7 +78,7 @@ def excess_of_published(localized: Localized, lens: Lens) -> Excess:
     return Excess(1e3 * offset, float(offset @ position_only @ offset / cost[0]))
 
 
-def stopped_early(localized: tuple[Localized, ...], lens: Lens) -> Array:
+def stopped_early(localized: tuple[LocalizedSpread, ...], lens: Lens) -> Array:
     """Return how far from the optimum z stops, relative to the z error of the optimum.
 
     localized: one a spread.  Median over 40 starts, (2 dampings, gains, 3 radii, 3 spreads).

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.paper.demonstration import Shown
+    from fisheye_svp_ros.paper.demonstration import DemoRow
 
 _PATIENCE = 900.0  # s; only a hang takes this long
 
@@ -35,14 +35,14 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.columns import write_columns
     from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
     from fisheye_svp_ros.io.results import write_json
-    from fisheye_svp_ros.paper.demonstration import shown
+    from fisheye_svp_ros.paper.demonstration import demo_rows
     from fisheye_svp_ros.reporting.progress import progress
 
     bag = args.output / 'recording'
     with progress('running the nodes'):
         record(bag, args.output / 'logs', args.lenses, args.radii)
     columns = tabulate(Bag(bag).records(is_tabulated))
-    rows = shown(columns, args.lenses, args.radii)
+    rows = demo_rows(columns, args.lenses, args.radii)
     write_columns(args.output / 'table', columns)
     write_json(args.output / 'demo.json', {
         'recording': str(bag), 'rows': [row._asdict() for row in rows],
@@ -95,38 +95,36 @@ def _list(values: Sequence[Any]) -> str:
     return '[' + ', '.join(map(str, values)) + ']'
 
 
-def _print(rows: Sequence[Shown]) -> None:
+def _print(rows: Sequence[DemoRow]) -> None:
+    from fisheye_svp_ros.paper.demonstration import TASKS
     from fisheye_svp_ros.reporting.tables import print_table
 
-    print_table(
-        'What the SVP approximation costs, beside the published numbers.  error: along the axis '
-        '(localization), of the left camera (calibration), of points (depth); image: mean '
-        'residual, for depth the distance from the epipolar curve',
-        ('', 'lens', 'radius m', 'where', 'error mm', 'published', 'axis deg', 'published',
-         'image px', 'published'),
-        [_cells(row) for row in rows],
-    )
+    for task in TASKS:
+        mine = [row for row in rows if row.task == task.name]
+        axis = () if task.name == 'depth' else ('axis deg', 'published')
+        print_table(task.title, ('lens', 'radius m', task.swept, 'error mm', 'published', *axis,
+                                 'image px', 'published'), map(_cells, mine))
 
 
-def _cells(row: Shown) -> tuple[str, ...]:
+def _cells(row: DemoRow) -> tuple[str, ...]:
     import numpy as np
 
-    def number(value: float, digits: int) -> str:
-        return '' if np.isnan(value) else f'{value:.{digits}f}'
+    def span(values: tuple[float, float], scale: float) -> str:
+        low, high = (scale * value for value in values)
+        return number(low) if not low < high else f'{low:g} to {high:g}'
 
-    def span(values: tuple[float, float], scale: float, digits: int) -> str:
-        low, high = (number(scale * value, digits) for value in values)
-        return low if low == high else f'{low} to {high}'
+    def number(value: float) -> str:
+        return '' if np.isnan(value) else f'{value:.4f}'
 
+    axis = map(number, np.degrees([row.axis_error, row.published_axis_error]))
     return (
-        row.task, row.lens, f'{row.radius:g}', row.where,
-        number(1e3 * row.error, 4), span(row.published_error, 1e3, 4),
-        number(np.degrees(row.axis_error), 4), number(np.degrees(row.published_axis_error), 4),
-        number(row.pixels, 4), span(row.published_pixels, 1, 4),
+        row.lens, f'{row.radius:g}', row.where,
+        number(1e3 * row.error), span(row.published_error, 1e3),
+        *(() if row.task == 'depth' else axis), number(row.pixels), span(row.published_pixels, 1),
     )
 
 
-def _draw(folder: Path, bag: Path, rows: Sequence[Shown]) -> None:
+def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.recording_residuals import has_residuals

@@ -105,12 +105,12 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
 
     done = parts.numbers()
     remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
-    left = sum(map(len, remaining))
-    if left < len(plan.sweep):
-        say(f'{len(plan.sweep) - left} of {len(plan.sweep)} scenarios are done already')
+    count = sum(map(len, remaining))
+    if count < len(plan.sweep):
+        say(f'{len(plan.sweep) - count} of {len(plan.sweep)} scenarios are done already')
     with (
         dask(args.dask) if args.dask else local(args.workers) as workers,
-        progress('sweeping', left) as advance,
+        progress('sweeping', count) as advance,
     ):
         for numbers, columns in solve_sweep(plan, remaining, engine, *workers):
             parts.write(numbers.start, columns)

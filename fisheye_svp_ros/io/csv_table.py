@@ -16,7 +16,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import write_text
 
 
-class Table:
+class CsvTable:
     """The cells of a CSV file by column, in any column order."""
 
     def __init__(self, path: Path, required: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.files import read_yaml
 from fisheye_svp_ros.io.share import config_path
 from fisheye_svp_ros.scene.landmarks import SPREADS, Landmarks, check_landmarks
@@ -50,6 +50,6 @@ def load_landmarks(path: str | Path) -> Landmarks:
 
     Raises ObservationError naming file, line and column.
     """
-    table = Table(Path(path), ('landmark', 'x', 'y', 'z'))
+    table = CsvTable(Path(path), ('landmark', 'x', 'y', 'z'))
     landmarks = Landmarks(table.whole('landmark'), table.numbers('x', 'y', 'z'))
     return check_landmarks(landmarks, str(path))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.csv_table import Table, write_table
+from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 REQUIRED = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
@@ -20,7 +20,7 @@ def read(path: str | Path) -> Observations:
 
     Raises ObservationError, naming file, line and column.
     """
-    table = Table(Path(path), REQUIRED)
+    table = CsvTable(Path(path), REQUIRED)
     frame, landmark = table.whole('frame'), table.whole('landmark')
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.io.csv_table import Table, write_table
+from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 
 COLUMNS = ('frame', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
@@ -27,7 +27,7 @@ def read_poses(path: str | Path) -> FramePoses:
 
     Raises ObservationError, naming file, line and column.
     """
-    table = Table(Path(path), COLUMNS)
+    table = CsvTable(Path(path), COLUMNS)
     frame = table.whole('frame')
     table.refuse_repeats(frame[:, None], 'frame')
     quaternion = table.numbers('qx', 'qy', 'qz', 'qw')

@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+from fisheye_svp_ros.errors import FisheyeSvpError, LensError, ParameterError
+
 
 @cache
 def share_directory() -> Path:
@@ -22,17 +24,26 @@ def config_path(name: str) -> Path:
 
 
 def lens_path(name: str) -> Path:
-    """Return the path of a lens: a file as given, or the name of one in config/lenses."""
-    return _given_or_named(name, 'lenses')
+    """Return the path of a lens: a file as given, or the name of one in config/lenses.
+
+    Raises LensError for a name that is neither.
+    """
+    return _given_or_named(name, 'lenses', LensError)
 
 
 def sweep_path(name: str) -> Path:
-    """Return the path of a sweep file: a file as given, or the name of one in config/sweeps."""
-    return _given_or_named(name, 'sweeps')
+    """Return the path of a sweep file: a file as given, or the name of one in config/sweeps.
+
+    Raises ParameterError for a name that is neither.
+    """
+    return _given_or_named(name, 'sweeps', ParameterError)
 
 
-def _given_or_named(name: str, folder: str) -> Path:
-    given = Path(name)
+def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
+    given, named = Path(name), config_path(f'{folder}/{name}.yaml')
     if given.suffix in ('.yaml', '.yml') or given.is_file():
         return given
-    return config_path(f'{folder}/{name}.yaml')
+    if not named.is_file():
+        known = ', '.join(sorted(path.stem for path in named.parent.glob('*.yaml')))
+        raise error(f'{name!r} is neither a file nor among the {folder} of this package: {known}')
+    return named

@@ -32,7 +32,7 @@ from fisheye_svp_ros.study.settings import SyntheticCameraSettings
 _SAY_EVERY = 1.0  # s, how far the sweep is
 
 
-class Step(NamedTuple):
+class SweepSet(NamedTuple):
     """One set (`frame`) of scenario `number`.
 
     swept: values of the sweep point; seen: observations by camera; svp_lens: for `camera_info`.
@@ -74,7 +74,7 @@ class SyntheticCamera(CameraNode):
                 self.camera(name)
         self.play(steps(settings, self._sweep))
 
-    def publish_set(self, step: Step, stamp: int) -> None:
+    def publish_set(self, step: SweepSet, stamp: int) -> None:
         """Publish a set."""
         if self._sweep.lists:
             self.get_logger().info(f'scenario {step.number + 1} of {len(self._sweep)}',
@@ -91,7 +91,7 @@ class SyntheticCamera(CameraNode):
             self._markers.publish(messages.markers_message(_shapes(step), stamp, WORLD))
 
 
-def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
+def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]:
     """Yield all sets of all scenarios, over and over where the settings say so."""
     nothing = np.array([], dtype=np.int64)
     for repetition in itertools.count():
@@ -106,12 +106,12 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[Step]:
                     camera: table.take(rows_of.get((frame, camera), nothing))
                     for camera in table.cameras
                 }
-                yield Step(number, frame, scenario, swept, simulation, seen, svp_lens)
+                yield SweepSet(number, frame, scenario, swept, simulation, seen, svp_lens)
         if not settings.repeat:
             return
 
 
-def _shapes(step: Step) -> Iterator[messages.Segments]:
+def _shapes(step: SweepSet) -> Iterator[messages.Segments]:
     simulation = step.simulation
     yield landmarks_shape(simulation.landmarks.points)
     for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):

@@ -33,6 +33,7 @@ class Task(NamedTuple):
     """One of the paper's three evaluations: namespace, what is swept beside lens and radius."""
 
     name: str
+    title: str
     swept: str
     values: Sequence[str]
     node: str
@@ -41,15 +42,19 @@ class Task(NamedTuple):
 
 
 TASKS = (
-    Task('localization', 'environment', SPREADS, 'localizer', 'position_error_z_m',
+    Task('localization', 'Self-localization as SVP. error: of the position along the axis; image: '
+         'mean residual', 'environment', SPREADS, 'localizer', 'position_error_z_m',
          'mean_residual_px'),
-    Task('calibration', 'style', STYLE_NAMES, 'stereo_calibrator', 'position_error_m',
+    Task('calibration', 'Stereo calibration as SVP. error: of the place of the left camera; '
+         'image: mean residual', 'style', STYLE_NAMES, 'stereo_calibrator', 'position_error_m',
          'mean_residual_px'),
-    Task('depth', 'style', STYLE_NAMES, 'stereo_depth', 'error3_m', 'error2_px'),
+    Task('depth', 'Stereo depth as SVP. error: Error3, mean distance from the true points; image: '
+         'Error2, mean distance from the epipolar curves; published: over all panels', 'style',
+         STYLE_NAMES, 'stereo_depth', 'error3_m', 'error2_px'),
 )
 
 
-class Shown(NamedTuple):
+class DemoRow(NamedTuple):
     """One row of the demo; m, rad, px; published: (lowest, highest), NaN where there is none.
 
     error: of the position along the axis (localization), of the left camera (calibration), of
@@ -68,7 +73,7 @@ class Shown(NamedTuple):
     published_pixels: tuple[float, float]
 
 
-def shown(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[Shown]:
+def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[DemoRow]:
     """Return the rows of the demo from the table of its recording.
 
     Raises BagError where a scenario is missing or stands there twice.
@@ -107,13 +112,13 @@ def _is_shown(task: Task, row: dict[str, Any]) -> bool:
     return bool(row['set'] == row['sets'] - 1)
 
 
-def _row(task: Task, lens: str, radius: float, where: str, row: dict[str, Any]) -> Shown:
+def _row(task: Task, lens: str, radius: float, where: str, row: dict[str, Any]) -> DemoRow:
     def metric(name: str) -> float:
         value = row.get(f'{task.node}.{name}')
         return np.nan if value is None else float(value)
 
     error, axis, pixels = _published(task, lens, radius, where)
-    return Shown(
+    return DemoRow(
         task.name, lens, radius, where, metric(task.error), metric('axis_error_rad'),
         metric(task.pixels), error, axis, pixels
     )

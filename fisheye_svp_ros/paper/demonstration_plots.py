@@ -12,7 +12,7 @@ from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.io.recording_residuals import ResidualField
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.demonstration import Shown
+from fisheye_svp_ros.paper.demonstration import DemoRow
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
 
 _TITLES = {
@@ -22,7 +22,7 @@ _TITLES = {
 }
 
 
-def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
+def draw_comparison(rows: Sequence[DemoRow], path: Path) -> None:
     """Draw the errors of the demo beside the published ones: a column a task, a row a lens."""
     lenses = list(dict.fromkeys(row.lens for row in rows))
     with picture(path, 11.0, 1.2 + 2.6 * len(lenses)) as figure:
@@ -37,7 +37,7 @@ def draw_comparison(rows: Sequence[Shown], path: Path) -> None:
         legend_below(figure, *axes[0])
 
 
-def _draw_errors(axis: Any, rows: Sequence[Shown]) -> None:
+def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
     place = np.arange(len(rows))[::-1]
     ours = 1e3 * np.array([row.error for row in rows])
     low, high = 1e3 * np.array([row.published_error for row in rows]).T

@@ -31,7 +31,7 @@ from fisheye_svp_ros.study.solutions import calibrated, localized, measured
 RIGHT_CAMERA_Z = {'fish214': -0.1}
 
 
-class Localized(NamedTuple):
+class LocalizedSpread(NamedTuple):
     """E environments localized.  rows (E, 5); solved; views: what was seen of the landmarks."""
 
     rows: Array
@@ -67,7 +67,7 @@ class Evaluation(NamedTuple):
     lens: Lens
     localization: Array
     calibration: Array
-    localized: tuple[Localized, ...]
+    localized: tuple[LocalizedSpread, ...]
     measured: tuple[Measured, ...]
 
     def panels(self, metric: str) -> Array:
@@ -107,7 +107,7 @@ def evaluate(lens: Lens, solver: Lens | None = None) -> Evaluation:
 
 def localize_environments(
     lens: Lens, points: Array, solver: Lens | None = None, start: Pose | None = None
-) -> Localized:
+) -> LocalizedSpread:
     """Localize the paper's camera among landmarks (E, N, 3), m (section 3).
 
     start (E,): poses to start from, the true one by default.
@@ -117,10 +117,10 @@ def localize_environments(
     views = views_of(points, ForwardModel(lens).predict(true, blank).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
     found = localized(model, views, true, true if start is None else start)
-    return Localized(_rows(found.metrics), found.solution, views)
+    return LocalizedSpread(_rows(found.metrics), found.solution, views)
 
 
-def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[Localized, ...]:
+def localize_spreads(lens: Lens, solver: Lens | None = None) -> tuple[LocalizedSpread, ...]:
     """Localize at the three radii, one result a spread: Whole, Inner, Outer."""
     return tuple(
         localize_environments(

@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.beyond import NOISES, Crossings
 from fisheye_svp_ros.paper.evaluation import (
     Evaluation,
-    Localized,
+    LocalizedSpread,
     Measured,
     landmarks_at,
     shift_at,
@@ -241,7 +241,7 @@ def _draw_world(axis: Any, view: tuple[tuple[int, int], str, str], points: Array
     _frame_world(axis, radius, x_name, y_name)
 
 
-def _draw_residuals(axis: Any, localized: Localized, row: int, colour: str) -> None:
+def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, colour: str) -> None:
     """Draw image points as circles, residuals (measured less predicted) as lines, magnified."""
     seen = localized.views.used[row]
     uv = localized.views.uv[row][seen]

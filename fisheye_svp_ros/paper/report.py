@@ -31,7 +31,7 @@ from fisheye_svp_ros.reporting.blocks import (
     Block,
     Heading,
     Picture,
-    Table,
+    TableBlock,
     Text,
     write_blocks,
 )
@@ -118,7 +118,7 @@ def _recovered(results: Results) -> Iterator[Block]:
             [NAMES[name], f'shift at {angle} degree, mm', f'{_MM * value:.2f}', _spread(fitted, 2)]
             for angle, value, fitted in zip(_ANGLES, own, curves.T, strict=True)
         ]
-    yield Table(['lens', 'quantity', 'used', 'all fits'], rows, 2)
+    yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
     yield Text(
         'Determined: the shift of Fish180 to some tenths of a millimetre over the whole field, '
         'that of Fish214 up to where the landmarks end (88 degree); beyond, nothing holds it. '
@@ -161,7 +161,7 @@ def _stopping(results: Results) -> Iterator[Block]:
         [damping, f'{gain:g}', *(f'{value:.2f}' for value in off[:, d, g, :2].ravel())]
         for d, damping in enumerate(study.dampings) for g, gain in enumerate(study.gains)
     ]
-    yield Table(header, rows, 1)
+    yield TableBlock(header, rows, 1)
     levenberg = off[0, 1, study.gains.index(1e-3)]
     yield Text(
         'Stopping early with Levenberg damping explains the cell: at 0.001 px² z of Fish180, '
@@ -198,7 +198,7 @@ def _stereo(results: Results) -> Iterator[Block]:
             _number(panel.published_error2, 3), f'{panel.error2:.4f}', f'{panel.vertical:.4f}',
             _number(panel.published_error3, 2), f'{panel.error3:.2f}',
         ])
-    yield Table(['lens', 'radius', 'style', 'points', 'Error2 px published', 'Error2 px',
+    yield TableBlock(['lens', 'radius', 'style', 'points', 'Error2 px published', 'Error2 px',
                  'within the column px', 'Error3 mm published', 'Error3 mm'], rows, 3)
     yield Text(
         'Points that one of the two cameras does not see are left out: the rig of Fish214 stands '
@@ -216,7 +216,7 @@ def _stereo(results: Results) -> Iterator[Block]:
 
 def _claims(results: Results) -> Iterator[Block]:
     yield Heading('What the text says')
-    yield Table(
+    yield TableBlock(
         ['section', 'statement', 'verdict', 'numbers'],
         [
             [str(claim.section), claim.statement, claim.verdict,
@@ -246,7 +246,7 @@ def _solvers(results: Results) -> Iterator[Block]:
                 one.calibration[..., 3].max(), one.panels('error2_px').max(),
                 _MM * one.panels('error3_m').max(),
             ))])
-    yield Table(['solver', 'lens', 'localization |z| mm', 'axis degree', 'residual px',
+    yield TableBlock(['solver', 'lens', 'localization |z| mm', 'axis degree', 'residual px',
                  'calibration position mm', 'axis degree', 'Error2 px', 'Error3 mm'], rows, 2)
     yield Text('Each number is the largest of its nine cells.')
     yield Picture('solvers.png', 'Mean errors by solver, on a logarithmic scale.')
@@ -262,7 +262,8 @@ def _noise(results: Results) -> Iterator[Block]:
         [NAMES[c.lens], c.quantity, c.where, *(_range(value) for value in c.ranges)]
         for c in results.crossings
     ]
-    yield Table(['lens', 'error', 'landmarks or style', *(f'{n} px' for n in NOISES)], rows, 3)
+    header = ['lens', 'error', 'landmarks or style', *(f'{n} px' for n in NOISES)]
+    yield TableBlock(header, rows, 3)
     yield Picture('noise.png', 'The same as curves; where there is no point, the SVP error is '
                   'under the noise at 0.2 m already.')
 
@@ -287,8 +288,9 @@ def _differences(results: Results) -> Iterator[Block]:
         'Sizes are compared, not signs. poses: between these two lie 90 % of what '
         f'{POSE_SETS} random sets of ten poses give; the ten in use are one set of many.'
     )
-    yield Table(['table', 'cell', 'quantity', 'unit', 'why', 'published', 'ours', 'poses: 5 %',
-                 'poses: 95 %'], rows, 5)
+    header = ['table', 'cell', 'quantity', 'unit', 'why', 'published', 'ours', 'poses: 5 %',
+              'poses: 95 %']
+    yield TableBlock(header, rows, 5)
 
 
 def _reason(cell: Cell, low: Array, high: Array) -> str:
@@ -306,7 +308,7 @@ def _reason(cell: Cell, low: Array, high: Array) -> str:
     return 'beyond what other sets of poses give'
 
 
-def _beside(results: Results, table: int, names: Sequence[str]) -> Table:
+def _beside(results: Results, table: int, names: Sequence[str]) -> TableBlock:
     header = ['radius', 'range' if table < 3 else 'style']
     for quantity, unit in zip(QUANTITIES, UNITS, strict=True):
         header += [f'{quantity} {unit} published', 'ours', '%']
@@ -315,7 +317,7 @@ def _beside(results: Results, table: int, names: Sequence[str]) -> Table:
         if cell.table == table:
             row = rows.setdefault((cell.radius, cell.row), [f'{cell.radius} m', cell.row])
             row += [_number(cell.published, 4), f'{cell.ours:.4f}', _percent(cell, names)]
-    return Table(header, list(rows.values()), 2)
+    return TableBlock(header, list(rows.values()), 2)
 
 
 def _percent(cell: Cell, names: Sequence[str]) -> str:

@@ -27,7 +27,7 @@ class Text(NamedTuple):
     kind: str = 'text'
 
 
-class Table(NamedTuple):
+class TableBlock(NamedTuple):
     """A table; the first `names` columns hold names, the others numbers."""
 
     header: Sequence[str]
@@ -44,7 +44,7 @@ class Picture(NamedTuple):
     kind: str = 'picture'
 
 
-Block = Heading | Text | Table | Picture
+Block = Heading | Text | TableBlock | Picture
 
 
 def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]:

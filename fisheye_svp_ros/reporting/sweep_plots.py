@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from fisheye_svp_ros.io.clouds import Points
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, legend_below, picture
 from fisheye_svp_ros.reporting.runs_plot import draw_runs
 from fisheye_svp_ros.study.dependence import (
-    Table,
+    SweptTable,
     curves,
     grid,
     is_number,
@@ -23,15 +24,16 @@ from fisheye_svp_ros.study.dependence import (
 )
 
 _COLOURS = 'viridis'
-_HUES, _LINES = 8, ('-', '--', ':', '-.')  # colours and lines that can be told apart
-_TICKS = 12
+_HUES, _LINES = 4, ('-', '--')  # what can be told apart in one picture
+_COLUMNS = 4  # axes beside each other
+_TICKS, _LABELS = 12, 6
 _CLOUD = 20_000  # points in a scatter plot
 _UNITS = {'radius': 'm', 'baseline': 'm', 'vergence': 'rad', 'noise_px': 'px'}
 _NAMES = {'radius': 'range of the landmarks', 'shift_scale': 'viewpoint shift, relative',
           'noise_px': 'noise', 'vergence': 'inward turn of the left camera'}
 
 
-class Shown(NamedTuple):
+class PlottedMetric(NamedTuple):
     """A metric for people: column, title and the factor into the unit that the title names."""
 
     column: str
@@ -40,80 +42,89 @@ class Shown(NamedTuple):
 
 
 _METRICS = (
-    Shown('localizer.position_error_m', 'Localization: position error, mm', 1e3),
-    Shown('localizer.axis_error_rad', 'Localization: axis error, deg', np.degrees(1.0)),
-    Shown('localizer.rms_px', 'Localization: rms residual, px', 1.0),
-    Shown('stereo_calibrator.position_error_m', 'Calibration: position error, mm', 1e3),
-    Shown('stereo_calibrator.axis_error_rad', 'Calibration: axis error, deg', np.degrees(1.0)),
-    Shown('stereo_depth.error3_m', 'Depth: mean error (Error3), mm', 1e3),
-    Shown('stereo_depth.error2_px', 'Depth: epipolar distance (Error2), px', 1.0),
+    PlottedMetric('localizer.position_error_m', 'Localization: position error, mm', 1e3),
+    PlottedMetric('localizer.axis_error_rad', 'Localization: axis error, deg', np.degrees(1.0)),
+    PlottedMetric('localizer.rms_px', 'Localization: rms residual, px', 1.0),
+    PlottedMetric('stereo_calibrator.position_error_m', 'Calibration: position error, mm', 1e3),
+    PlottedMetric('stereo_calibrator.axis_error_rad', 'Calibration: axis error, deg',
+                  np.degrees(1.0)),
+    PlottedMetric('stereo_depth.error3_m', 'Depth: mean error in space (Error3), mm', 1e3),
+    PlottedMetric('stereo_depth.error2_px', 'Depth: distance to epipolar curve (Error2), px', 1.0),
 )
 
 
-def draw_table(table: Table, folder: Path) -> list[Path]:
+def draw_table(table: SweptTable, folder: Path) -> list[Path]:
     """Draw whatever a table is good for; return the files."""
     files = []
-    shown = [m for m in _METRICS if m.column in table]
+    metrics = [metric for metric in _METRICS if metric.column in table]
     swept = swept_parameters(table)
     numbers = [name for name in swept if is_number(table, name)]
-    for x in numbers if shown else ():
+    for x in numbers if metrics else ():
         files.append(folder / f'error_against_{x}.png')
-        _draw_curves(table, shown, x, [name for name in swept if name != x], files[-1])
-    if len(numbers) >= 2 and shown:
+        _draw_curves(table, metrics, x, [name for name in swept if name != x], files[-1])
+    if len(numbers) >= 2 and metrics:
         y, x = sorted(sorted(numbers, key=lambda n: -len(set(table[n])))[:2], key=numbers.index)
         files.append(folder / f'heat_map_{y}_{x}.png')
         others = [name for name in swept if name not in (x, y)]
-        _draw_grids(table, shown, x, y, others, files[-1])
+        _draw_grids(table, metrics, x, y, others, files[-1])
     if 'localizer.rms_px' in table and any(table.get('noise_px', ())):
         files.append(folder / 'residuals_and_noise.png')
-        _draw_spreads(table, _hue(table, [name for name in swept if name != 'noise_px']),
+        others = [name for name in swept if name != 'noise_px']
+        few = [name for name in others if len(set(table[name])) <= 2 * _HUES]
+        _draw_spreads(table, min(few, key=lambda name: len(set(table[name])), default=None),
                       files[-1])
     return files + draw_runs(table, folder / 'runs.png')
 
 
-def _hue(table: Table, names: Sequence[str]) -> str | None:
-    """Return the parameter with fewest values to tell curves apart by."""
-    few = [name for name in names if len(set(table[name])) <= _HUES]
-    return min(few, key=lambda name: len(set(table[name])), default=None)
+@contextmanager
+def _axes(path: Path, count: int, width: float, height: float) -> Iterator[Any]:
+    """Yield a figure and as many axes as are needed, each of a size in inches."""
+    columns, lines = min(count, _COLUMNS), -(-count // _COLUMNS)
+    with picture(path, width * columns, 0.4 + height * lines) as figure:
+        axes = figure.subplots(lines, columns, squeeze=False).ravel()
+        yield figure, axes[:count]
+        for axis in axes[count:]:
+            axis.remove()
 
 
 def _draw_curves(
-    table: Table, shown: Sequence[Shown], x: str, others: Sequence[str], path: Path
+    table: SweptTable, metrics: Sequence[PlottedMetric], x: str, others: Sequence[str], path: Path
 ) -> None:
     """Draw an error over x: the colour tells one other parameter, the line style a second."""
-    by = _told_apart(table, others)
+    by = sorted(others, key=lambda name: -len(set(table[name])))[-2:]
+    looks = [_some(list(dict.fromkeys(table[name])), most)
+             for name, most in zip(by, (_HUES, len(_LINES)), strict=False)]
     merged = [name for name in others if name not in by]
-    with picture(path, 4.2 * min(len(shown), 4), 0.5 + 3.6 * -(-len(shown) // 4)) as figure:
-        axes = figure.subplots(-(-len(shown) // 4), min(len(shown), 4), squeeze=False).ravel()
-        for axis, metric in zip(axes, shown, strict=False):
-            found = curves(table, metric.column, x, by)
-            looks = [list(dict.fromkeys(c.key[i] for c in found)) for i in range(len(by))]
+    with _axes(path, len(metrics), 4.2, 3.6) as (figure, axes):
+        for axis, metric in zip(axes, metrics, strict=True):
+            found = [curve for curve in curves(table, metric.column, x, by)
+                     if all(v in values for v, values in zip(curve.key, looks, strict=True))]
             for curve in found:
                 place = [values.index(v) for values, v in zip(looks, curve.key, strict=True)]
                 colour = _hues(len(looks[0]))[place[0]] if place else OURS
-                style = _LINES[place[1]] if len(place) > 1 else '-'
                 middle, low, high = (metric.factor * values for values in curve[2:])
                 if not merged:
                     axis.fill_between(curve.x, low, high, color=colour, alpha=0.15, linewidth=0)
-                axis.plot(curve.x, middle, style, marker='.', color=colour, label=', '.join(
-                    f'{name} {_text(value)}' for name, value in zip(by, curve.key, strict=True)
-                ))
+                axis.plot(
+                    curve.x, middle, _LINES[place[1]] if len(place) > 1 else '-', marker='.',
+                    color=colour, label=', '.join(
+                        f'{name} {_text(v)}' for name, v in zip(by, curve.key, strict=True)))
             _scale(axis, found[0].x, metric.factor * np.concatenate([c.median for c in found]))
             axis.set_xlabel(_label(x))
             axis.set_title(metric.title, loc='left')
-        for axis in axes[len(shown):]:
-            axis.remove()
         if by:
             legend_below(figure, axes[0])
         what = f'median over all {", ".join(merged)}' if merged else 'median; band: 5 to 95 %'
-        figure.suptitle(what, x=0.01, ha='left', fontsize=8)
+        thinned = [f'{len(values)} of {count} values of {name}'
+                   for name, values in zip(by, looks, strict=True)
+                   if len(values) < (count := len(set(table[name])))]
+        figure.suptitle('; '.join([what, *thinned]), x=0.01, ha='left', fontsize=8)
 
 
-def _told_apart(table: Table, names: Sequence[str]) -> list[str]:
-    """Return up to two parameters that colours and line styles can tell apart."""
-    few = sorted((name for name in names if len(set(table[name])) <= _HUES),
-                 key=lambda name: -len(set(table[name])))[:2]
-    return few if len(few) < 2 or len(set(table[few[1]])) <= len(_LINES) else few[:1]
+def _some(values: list[Any], most: int) -> list[Any]:
+    """Return the first, the last and what lies evenly between, `most` in all."""
+    places = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
+    return [values[i] for i in places]
 
 
 def _text(value: Any) -> str:
@@ -121,11 +132,11 @@ def _text(value: Any) -> str:
 
 
 def _draw_grids(
-    table: Table, shown: Sequence[Shown], x: str, y: str, others: Sequence[str], path: Path
+    table: SweptTable, metrics: Sequence[PlottedMetric], x: str, y: str, others: Sequence[str],
+    path: Path,
 ) -> None:
-    with picture(path, 4.4 * min(len(shown), 4), 3.8 * -(-len(shown) // 4)) as figure:
-        axes = figure.subplots(-(-len(shown) // 4), min(len(shown), 4), squeeze=False).ravel()
-        for axis, metric in zip(axes, shown, strict=False):
+    with _axes(path, len(metrics), 4.4, 3.6) as (figure, axes):
+        for axis, metric in zip(axes, metrics, strict=True):
             found = grid(table, metric.column, x, y)
             values = np.ma.masked_invalid(metric.factor * found.median)
             positive = values.compressed()[values.compressed() > 1e-6]
@@ -140,27 +151,24 @@ def _draw_grids(
             axis.set(xlabel=_label(x), ylabel=_label(y))
             axis.set_title(metric.title, loc='left')
             figure.colorbar(mesh, ax=axis)
-        for axis in axes[len(shown):]:
-            axis.remove()
         over = f', over all {", ".join(others)}' if others else ''
         figure.suptitle(f'median of the magnitude{over}', x=0.01, ha='left', fontsize=8)
 
 
-def _draw_spreads(table: Table, by: str | None, path: Path) -> None:
+def _draw_spreads(table: SweptTable, by: str | None, path: Path) -> None:
     spreads = noise_spreads(table, by)
-    with picture(path, 4.0 * min(len(spreads), 4), 3.2 * -(-len(spreads) // 4)) as figure:
-        axes = figure.subplots(-(-len(spreads) // 4), min(len(spreads), 4), squeeze=False).ravel()
-        for axis, spread in zip(axes, spreads, strict=False):
+    with _axes(path, len(spreads), 4.0, 2.8) as (figure, axes):
+        for axis, spread in zip(axes, spreads, strict=True):
             edges = np.linspace(0.0, spread.at[-1], 61)
-            beyond = np.mean(spread.ratio > edges[-1])
             axis.hist(spread.ratio, edges, weights=np.full(len(spread.ratio), 1 / len(spread.ratio)
                       / (edges[1] - edges[0])), color=OURS, label='localizations')
             axis.plot(spread.at, spread.density, color=PUBLISHED, label='noise alone')
-            more = f', {beyond:.0%} farther right' if beyond else ''
-            axis.set_title(f'{spread.label}{more}', loc='left')
+            beyond = np.mean(spread.ratio > edges[-1])
+            if beyond:
+                axis.annotate(f'{100 * beyond:.0f} % are above {edges[-1]:g}', (0.98, 0.92),
+                              xycoords='axes fraction', ha='right')
+            axis.set_title(spread.label, loc='left')
             axis.set(xlabel='rms residual / noise', yticks=[], xlim=(0.0, edges[-1]))
-        for axis in axes[len(spreads):]:
-            axis.remove()
         legend_below(figure, axes[0])
 
 
@@ -196,7 +204,8 @@ def _scale(axis: Any, x: Sequence[float], y: Array) -> None:
     if min(x) > 0 and max(x) >= 10 * min(x):
         axis.set_xscale('log')
         if len(x) <= _TICKS:
-            axis.set_xticks(x, [f'{value:g}' for value in x])
+            shown = _some(sorted(x), _LABELS)
+            axis.set_xticks(shown, [f'{value:g}' for value in shown])
             axis.tick_params(axis='x', which='minor', bottom=False, labelbottom=False)
     known = y[np.isfinite(y) & (y > 1e-6)]
     if known.size and known.max() > 30 * known.min():

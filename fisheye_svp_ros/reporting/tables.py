@@ -20,17 +20,21 @@ def print_table(
     """Print a table: the first column flush left, the others, numbers, flush right.
 
     words: further columns that hold text; it is broken into lines where the table is too wide.
+    Numbers are never cut: a terminal that is too narrow folds the lines.
     """
     table = Table(box=box.SIMPLE_HEAD)
+    cells = [header, *rows]
     for i, name in enumerate(header):
         text = name in words
         justify: JustifyMethod = 'right' if i and not text else 'left'
-        table.add_column(name, justify=justify, no_wrap=not text)
-    for row in rows:
+        widest = max(len(row[i]) for row in cells)
+        table.add_column(name, justify=justify, no_wrap=not text,
+                         min_width=None if text else widest)
+    for row in cells[1:]:
         table.add_row(*row)
     out = console()
     out.print(title)
-    out.print(table)
+    out.print(table, crop=False, overflow='ignore')
 
 
 def print_paragraphs(title: str, texts: Iterable[str]) -> None:

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.simulate.scenario import SCALARS
 
-Table = Mapping[str, Sequence[Any]]
+SweptTable = Mapping[str, Sequence[Any]]
 
 _REPEATS = ('seed',)  # differ so that the noise does
 _BAND = (5.0, 95.0)  # percent
@@ -50,18 +50,18 @@ class Spread(NamedTuple):
     density: Array
 
 
-def swept_parameters(table: Table) -> list[str]:
+def swept_parameters(table: SweptTable) -> list[str]:
     """Return the parameters that differ between rows, but for those that only redraw noise."""
     return [name for name in SCALARS
             if name in table and name not in _REPEATS and len(set(table[name])) > 1]
 
 
-def is_number(table: Table, name: str) -> bool:
+def is_number(table: SweptTable, name: str) -> bool:
     """Say whether a column holds numbers."""
     return all(isinstance(value, int | float) for value in table[name])
 
 
-def curves(table: Table, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
+def curves(table: SweptTable, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
     """Return an error over parameter x, a curve a combination of the parameters `by`."""
     values, places = _numbers(table, metric), _slots(table, x)
     groups: dict[tuple[Any, ...], Any] = {(): np.arange(len(values))}
@@ -81,7 +81,7 @@ def curves(table: Table, metric: str, x: str, by: Sequence[str]) -> list[Curve]:
     return found
 
 
-def grid(table: Table, metric: str, x: str, y: str) -> Grid:
+def grid(table: SweptTable, metric: str, x: str, y: str) -> Grid:
     """Return the median of the magnitude of an error over two parameters."""
     values, columns, lines = np.abs(_numbers(table, metric)), _slots(table, x), _slots(table, y)
     median = np.full((len(lines), len(columns)), np.nan)
@@ -93,7 +93,7 @@ def grid(table: Table, metric: str, x: str, y: str) -> Grid:
     return Grid(list(columns), list(lines), median)
 
 
-def noise_spreads(table: Table, by: str | None) -> list[Spread]:
+def noise_spreads(table: SweptTable, by: str | None) -> list[Spread]:
     """Return the residuals of localizations beside what their noise alone would leave.
 
     N image points of noise sigma in u and in v leave, after a pose is fitted to them, a sum of
@@ -119,7 +119,7 @@ def noise_spreads(table: Table, by: str | None) -> list[Spread]:
     return found
 
 
-def _numbers(table: Table, name: str) -> Array:
+def _numbers(table: SweptTable, name: str) -> Array:
     """Return a column, NaN = empty; of calibrations only those from all sets of a scenario."""
     cells = np.array([np.nan if v is None else v for v in table[name]], dtype=float)
     if name.startswith('stereo_calibrator.'):
@@ -127,7 +127,7 @@ def _numbers(table: Table, name: str) -> Array:
     return cells
 
 
-def _slots(table: Table, name: str) -> dict[Any, Any]:
+def _slots(table: SweptTable, name: str) -> dict[Any, Any]:
     """Return the rows of each value of a column: numbers ascend, names are as they come."""
     cells = table[name]
     values = dict.fromkeys(cells)

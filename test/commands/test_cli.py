@@ -15,7 +15,7 @@ from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.optics.curves import Equidistant
@@ -86,7 +86,7 @@ class TestLocalize:
     def test_poses_are_the_true_ones_within_their_covariance(self, output, scene):
         frame, pose = read_poses(output / 'poses.csv')
         np.testing.assert_array_equal(frame, np.arange(6))
-        table = Table(output / 'covariance.csv', ['frame'])
+        table = CsvTable(output / 'covariance.csv', ['frame'])
         axes = ('x', 'y', 'z', 'rx', 'ry', 'rz')
         covariance = table.numbers(*(f'{a}_{b}' for a in axes for b in axes)).reshape(-1, 6, 6)
         off = pose.difference(scene[1])
@@ -94,7 +94,7 @@ class TestLocalize:
         assert nees.mean() == pytest.approx(6, abs=4 * np.sqrt(12 / 6))
 
     def test_residuals_are_those_of_the_poses(self, output, scene):
-        table = Table(output / 'residuals.csv', ['frame', 'landmark'])
+        table = CsvTable(output / 'residuals.csv', ['frame', 'landmark'])
         np.testing.assert_array_equal(table.whole('landmark'), scene[2].landmark)
         du, dv, theta, distance = table.numbers('du', 'dv', 'theta', 'range').T
         rms = json.loads((output / 'localize.json').read_text())['rms_px']
@@ -276,3 +276,15 @@ def test_measured_data(tmp_path):
     test = str(OV_PLANE / 'test.csv')
     assert cli.main(['localize', test, '--lens', str(lens), '-o', str(tmp_path)]) == 0
     assert json.loads((tmp_path / 'localize.json').read_text())['rms_px'] <= 0.475
+
+
+@pytest.mark.parametrize(('words', 'said'), [
+    (['localize', 'o.csv', '--lens', 'fish21'],
+     "'fish21' is neither a file nor among the lenses of this package: fish180, fish214"),
+    (['sweep', 'nois'], "'nois' is neither a file nor among the sweeps of this package: env"),
+    (['diagnose', 'o.csv', '--lens', 'fish214', '--held_out', 'x'],
+     'unknown argument --held_out; --held-out? (see fisheye-svp diagnose --help)'),
+    (['plot', 'x', '--foo'], 'unknown argument --foo (see fisheye-svp plot --help)'),
+])
+def test_a_slip_is_answered_with_what_there_is(words, said, capsys):
+    assert said in refused(capsys, *words)

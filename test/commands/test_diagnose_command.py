@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
-from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_observations, write_poses
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -122,8 +122,9 @@ class TestFiles:
         assert figures[1] == pytest.approx(found['extended']['rms_px'], rel=1e-3)
 
     def test_residuals_of_every_point(self, scene, output):
-        table = Table(output / 'residuals.csv', ['frame', 'landmark', 'u', 'v', 'theta', 'range'])
-        given = Table(scene / 'shift.csv', ['frame', 'landmark', 'u', 'v'])
+        names = ['frame', 'landmark', 'u', 'v', 'theta', 'range']
+        table = CsvTable(output / 'residuals.csv', names)
+        given = CsvTable(scene / 'shift.csv', ['frame', 'landmark', 'u', 'v'])
         np.testing.assert_array_equal(table.numbers('frame', 'landmark', 'u', 'v'),
                                       given.numbers('frame', 'landmark', 'u', 'v'))
         assert not table.whole('outlier').any()

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 pytest.importorskip('pyarrow')
@@ -32,6 +37,29 @@ def test_curves_are_medians_over_the_rest() -> None:
     assert (one.key, one.x, one.median.tolist()) == (('a',), [1.0, 2.0], [2.0, 5.0])
     assert (other.key, other.median.tolist()) == (('b',), [-7.0, 8.0])
     assert one.low[0] == pytest.approx(1.1) and one.high[0] == pytest.approx(2.9)
+
+
+def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+
+    @contextmanager
+    def kept(path: Path, width: float, height: float) -> Iterator[Any]:
+        drawn.append(Figure())
+        yield drawn[-1]
+
+    monkeypatch.setattr('fisheye_svp_ros.reporting.sweep_plots.picture', kept)
+    monkeypatch.setattr('fisheye_svp_ros.reporting.sweep_plots.legend_below', lambda *_: None)
+    rows = list(product([1.0, 2.0], range(7), 'abc'))
+    radius, scale, environment = (list(column) for column in zip(*rows, strict=True))
+    draw_table({'radius': radius, 'shift_scale': scale, 'environment': environment,
+                'localizer.rms_px': [float(i) for i in range(len(rows))]}, tmp_path)
+    figure = next(one for one in drawn if one.axes[0].get_xlabel().startswith('range'))
+    labels = [line.get_label() for line in figure.axes[0].lines]
+    assert labels == [f'shift_scale {i}, environment {name}' for i in (0, 2, 4, 6)
+                      for name in 'ac']
+    assert '4 of 7 values of shift_scale; 2 of 3 values of environment' in figure.get_suptitle()
 
 
 def test_a_grid_holds_magnitudes() -> None:

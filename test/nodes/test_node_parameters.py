@@ -87,7 +87,7 @@ def test_every_parameter_is_described_and_refuses_what_breaks_it(
 
 
 @pytest.mark.parametrize(('name', 'parameter', 'value', 'reason'), [
-    ('synthetic_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('synthetic_camera', 'lens', 'nothere', "'nothere' is neither a file"),
     ('synthetic_camera', 'environment', 'cellar', "environment 'cellar' is unknown"),
     ('synthetic_camera', 'environment', 'nothere.csv', 'start it with folder:=DIR'),
     ('synthetic_camera', 'poses', [0.0] * 6, 'poses holds 6 numbers; seven a pose are needed'),
@@ -97,10 +97,10 @@ def test_every_parameter_is_described_and_refuses_what_breaks_it(
     ('measured_camera', 'observations', '', 'observations is empty; name the file to replay'),
     ('measured_camera', 'observations', 'nothere.csv', 'start it with folder:=DIR'),
     ('measured_camera', 'true_poses', 'nothere.csv', 'start it with folder:=DIR'),
-    ('measured_camera', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
-    ('localizer', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
-    ('stereo_calibrator', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
-    ('stereo_depth', 'lens', 'nothere', 'nothere.yaml: cannot be read'),
+    ('measured_camera', 'lens', 'nothere', "'nothere' is neither a file"),
+    ('localizer', 'lens', 'nothere', "'nothere' is neither a file"),
+    ('stereo_calibrator', 'lens', 'nothere', "'nothere' is neither a file"),
+    ('stereo_depth', 'lens', 'nothere', "'nothere' is neither a file"),
 ])
 def test_a_value_that_cannot_be_used_is_refused_with_the_reason(
     name: str, parameter: str, value: Any, reason: str, start: Callable[..., Any]

@@ -19,7 +19,7 @@ from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import BagError, StandaloneError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
-from fisheye_svp_ros.paper.demonstration import shown
+from fisheye_svp_ros.paper.demonstration import demo_rows
 
 pytestmark = pytest.mark.xdist_group('demo')  # run once
 
@@ -92,15 +92,15 @@ def test_a_missing_scenario_is_named(demo: Any) -> None:
     folder, _ = demo
     columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
     with pytest.raises(BagError, match=r'no result of localizer for fish180, whole, 2\.0 m'):
-        shown(columns, ['fish180'], [2.0])
+        demo_rows(columns, ['fish180'], [2.0])
     twice = {name: cells * 2 for name, cells in columns.items()}
     with pytest.raises(BagError, match='was recorded twice'):
-        shown(twice, ['fish180'], [0.5])
+        demo_rows(twice, ['fish180'], [0.5])
 
 
 def test_a_process_that_fails_is_named_and_none_is_left(tmp_path: Path) -> None:
     with (
-        pytest.raises(StandaloneError, match=r'bad ended with status 2: .*nothere.yaml'),
+        pytest.raises(StandaloneError, match=r"bad ended with status 2: .*'nothere' is neither"),
         Processes(tmp_path / 'logs') as processes,
     ):
         processes.start('good', ['run', 'localizer'])

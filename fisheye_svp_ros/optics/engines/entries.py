@@ -19,13 +19,13 @@ from fisheye_svp_ros.optics.engines.kernels import (
     BARE,
     BEHIND,
     INVALID,
-    LEFT,
     OPTIONS,
     ROW,
     ROWS,
     SCRATCH,
     SINGULAR,
     STATE,
+    UNSETTLED,
     VALID,
     B,
     U,
@@ -85,7 +85,7 @@ def _residual(w, points, uv, row, lens, pose, out):
         image(w, n, lens)
         remaining, off = 0, out[start:]
         for i in range(n):
-            remaining += (rows[i] >= 0) & (w[STATE + i] == LEFT)
+            remaining += (rows[i] >= 0) & (w[STATE + i] == UNSETTLED)
             seen = (rows[i] >= 0) & (w[STATE + i] != INVALID)
             off[i, 0] = measured[i, 0] - w[U + i] if seen else np.nan
             off[i, 1] = measured[i, 1] - w[V + i] if seen else np.nan

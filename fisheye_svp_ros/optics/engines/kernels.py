@@ -34,7 +34,7 @@ B = 248  # points in a block; rows a power of two apart would share the same lin
 ROWS = 7 * B  # from ROW on, for u and for v: by place (3), by turn (3), residual
 GRAM = ROW + 2 * ROWS  # the upper triangle of 7 x 7, row by row, then room for `view_equations`
 SCRATCH = GRAM + 28 + 49 + 42
-VALID, INVALID, LEFT = 1.0, 0.0, -1.0
+VALID, INVALID, UNSETTLED = 1.0, 0.0, -1.0
 SINGULAR = 1e-15  # pivot beside the diagonal
 DOF = 6  # unknowns of a pose or a rig; a size that the compiler knows is faster
 
@@ -97,7 +97,7 @@ def meet(w, n, lens, edge):
         for i in range(n):
             far = w[R + i] * w[R + i] + w[Z + i] * w[Z + i] >= lens[NEAR] * lens[NEAR]
             settled = (w[TURN + i] <= 0.3) & (w[TURN + i] >= -0.3) & (w[THETA + i] > 0.0)
-            w[STATE + i] = w[STATE + i] if far & settled else LEFT
+            w[STATE + i] = w[STATE + i] if far & settled else UNSETTLED
 
 
 @njit(**BARE)
@@ -304,7 +304,7 @@ def view_equations(w, points, uv, weight, lens, rotation, position, hessian, gra
     sums[:] = 0.0
     state = add_view(w, points, uv, weight, lens, rotation, position, sums)
     if state < VALID:
-        return np.nan if state == LEFT else np.inf
+        return np.nan if state == UNSETTLED else np.inf
     k = 0
     for a in range(7):
         for b in range(a, 7):

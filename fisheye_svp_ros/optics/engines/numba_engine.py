@@ -45,9 +45,9 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
         entries.project(points[part], numbers, limit, uv[part], state[part])
 
     _spread(run, len(points), len(points))
-    left = _left(state, numbers)
-    if left is not None:
-        uv[left], state[left] = numpy_engine.project(lens, points[left], limited)
+    unsettled = _unsettled(state, numbers)
+    if unsettled is not None:
+        uv[unsettled], state[unsettled] = numpy_engine.project(lens, points[unsettled], limited)
     return uv, state > 0
 
 
@@ -71,13 +71,13 @@ def linearise_views(
 
     _spread(run, systems, systems * count)
     by_pose = np.moveaxis(d_pose, -1, 1)
-    left = _left(state, numbers)
-    if left is not None:
-        rows, _ = left
+    unsettled = _unsettled(state, numbers)
+    if unsettled is not None:
+        rows, _ = unsettled
         again = numpy_engine.linearise_views(
-            lens, rotation[rows], position[rows], points[left][:, None], limited
+            lens, rotation[rows], position[rows], points[unsettled][:, None], limited
         )
-        uv[left], state[left], by_pose[left] = (part[:, 0] for part in again)
+        uv[unsettled], state[unsettled], by_pose[unsettled] = (part[:, 0] for part in again)
     return uv, state > 0, by_pose
 
 
@@ -168,11 +168,11 @@ def _contiguous(*arrays: Any) -> list[Any]:
     return [np.ascontiguousarray(array) for array in arrays]
 
 
-def _left(state: Array, numbers: Array) -> tuple[Index, ...] | None:
+def _unsettled(state: Array, numbers: Array) -> tuple[Index, ...] | None:
     if numbers[kernels.SHIFT_KIND] < 0:
         return None
-    left = np.nonzero(state == kernels.LEFT)
-    return left if left[0].size else None
+    places = np.nonzero(state == kernels.UNSETTLED)
+    return places if places[0].size else None
 
 
 def _spread(run: Callable[[slice], T], count: int, points: int) -> list[T]:
