@@ -136,7 +136,8 @@ class TestLocalize:
         folder, _, _ = scene
         observations, lens = folder / 'observations.csv', folder / 'lens.yaml'
         assert '--lens' in refused(capsys, 'localize', observations)
-        assert 'nolens.yaml' in refused(capsys, 'localize', observations, '--lens', 'nolens')
+        unknown = refused(capsys, 'localize', observations, '--lens', 'nolens')
+        assert "'nolens' is neither" in unknown
         assert 'no such file' in refused(capsys, 'localize', tmp_path / 'x', '--lens', lens)
 
     def test_an_impossible_place_to_write(self, scene, capsys, tmp_path):

@@ -149,7 +149,7 @@ def test_a_node_says_which_lens_it_solves_with(
     ('sweep.radius:=[1.0, -1.0]', 'radius is -1.0; allowed is 0.001 to 1e+06'),
     ('sweep.radius:=[near]', "radius is 'near'; float is needed"),
     ('sweep.radius:=2.0', 'a list of at least one value is needed'),
-    ('sweep.lens:=[fish180, fish999]', 'fish999.yaml: cannot be read'),
+    ('sweep.lens:=[fish180, fish999]', "'fish999' is neither a file"),
     ('sweep.environment:=[whole, cellar]', "environment 'cellar' is unknown"),
     ('sweep.style:=[mono, triple]', "style is 'triple'"),
 ])

@@ -170,7 +170,7 @@ BAD = {
     'sweep.radius: [1.0, near]': 'differ in type',
     'sweep.radius: [-1.0]': 'radius is -1.0; allowed is',
     'sweep.style: [mono, parallel]': 'make two sweeps of it',
-    'sweep.lens: [fish214, nonsense]': 'nonsense.yaml: cannot be read',
+    'sweep.lens: [fish214, nonsense]': "'nonsense' is neither a file",
     'sweep.environment: [nowhere]': "environment 'nowhere' is unknown",
     'radius: 2.0': 'nothing is swept',
     'sweep.seed: [1], radios: 3': 'radios is no parameter of synthetic_camera',
@@ -202,7 +202,7 @@ def test_a_bad_sweep_is_refused_before_anything_runs(
     ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
      '{sweep.style: [parallel]}}', "rig is 'topic'"),
     ('localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '
-     '{sweep.seed: [1]}}', 'nonsense.yaml: cannot be read'),
+     '{sweep.seed: [1]}}', "'nonsense' is neither a file"),
 ])
 def test_a_file_that_is_no_sweep_is_refused(
     write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str,
