@@ -75,7 +75,9 @@ def test_everything_is_recorded(demo: Any) -> None:
 
 def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
     folder, printed = demo
-    assert printed.count('localization') >= 3 and 'published' in printed
+    assert printed.count(' as SVP. error: ') == 3
+    assert printed.count('fish180') == 9 and '-0.1614' in printed
+    assert 'Error2' in printed and 'Error3' in printed
     for name in ('errors.png', 'residuals.png'):
         assert (folder / name).read_bytes().startswith(b'\x89PNG')
     assert (folder / 'table.csv').exists() and (folder / 'table.parquet').exists()
