@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects import forward
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
@@ -213,14 +214,12 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 def project(lens: AnyLens, points: Array) -> Image:
     """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
-    return ForwardModel(load_lens(lens)).project(np.asarray(points, dtype=float))
+    return forward.project(load_lens(lens), np.asarray(points, dtype=float))
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
-    uv = np.asarray(uv, dtype=float)
-    rays = ForwardModel(load_lens(lens)).back_project(uv.reshape(1, -1, 2))
-    return rays.shaped(uv.shape[:-1])
+    return forward.back_project(load_lens(lens), np.asarray(uv, dtype=float))
 
 
 def localize(observations: AnyObservations, lens: AnyLens) -> Localized:

@@ -83,9 +83,9 @@ def write_photographs(
     import cv2
     import numpy as np
 
+    from fisheye_svp_ros.effects.forward import project
     from fisheye_svp_ros.io.files import replacing
     from fisheye_svp_ros.io.readers import write_observations, write_poses
-    from fisheye_svp_ros.optics.camera import project
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.scene.observations import make_observations
     from fisheye_svp_ros.simulate.render import render

@@ -14,8 +14,8 @@ from fisheye_svp_ros.effects.base import Term as Term
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import curved_lens
 from fisheye_svp_ros.effects.target import Target
-from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays, back_project, project
+from fisheye_svp_ros.optics import camera, engines
+from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -97,7 +97,7 @@ class ForwardModel:
         limited: refuse points outside the field of view, as a camera does.
         """
         if self.plain:
-            return project(self.lens, pose.into_body(views.points), limited)
+            return camera.project(self.lens, pose.into_body(views.points), limited)
         linear = self._through(pose, views, limited)
         return Image(linear.uv, linear.valid)
 
@@ -112,14 +112,14 @@ class ForwardModel:
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""
         if not self._acts('image', 'detector'):
-            return back_project(self.lens, uv)
+            return camera.back_project(self.lens, uv)
         ideal = uv
         views = views_of(np.zeros((*uv.shape[:-1], 3)), uv)
         pose = identity(len(uv))
         for _ in range(4):
             scene = Scene(views, self.lens, pose, ideal)
             ideal = uv - self._moved(scene, 'image') - self._moved(scene, 'detector')
-        return back_project(self.lens, ideal)
+        return camera.back_project(self.lens, ideal)
 
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
         """Return what effects may look at once the views are linearised."""
@@ -169,7 +169,7 @@ class ForwardModel:
             points = points + self._moved(Scene(views, self.lens, pose, views.uv), 'target')
         if self._acts('pose'):
             # When a row was exposed depends on where the point is seen: predict that first.
-            seen = project(self.lens, pose.into_body(points), limited=False).uv
+            seen = camera.project(self.lens, pose.into_body(points), limited=False).uv
             move = np.asarray(self._moved(Scene(views, self.lens, pose, seen), 'pose'))
             turn = rotation_from_vector(-move[..., 3:])
             place = pose.position[..., None, :]
@@ -187,3 +187,14 @@ class ForwardModel:
             if effect.stage == stage:
                 moved = moved + effect.displacement(scene, values)
         return moved if self._target is None else moved + self._target.moved(scene, stage)
+
+
+def project(lens: Lens, points: Array) -> Image:
+    """Project points (..., 3), m, in the camera frame through a lens with its corrections."""
+    return ForwardModel(lens).project(points)
+
+
+def back_project(lens: Lens, uv: Array) -> Rays:
+    """Return the rays of image points (..., 2), px, through a lens with its corrections."""
+    rays = ForwardModel(lens).back_project(uv.reshape(1, -1, 2))
+    return rays.shaped(uv.shape[:-1])

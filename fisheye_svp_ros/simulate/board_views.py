@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.simulate.render import Print

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.optics.camera import back_project, project
+from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 

@@ -28,6 +28,7 @@ from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, verdict_sentences
 from fisheye_svp_ros.reporting.target_map import board_maps
 from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 
 # Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
@@ -120,6 +121,15 @@ class TestFiles:
         found = document(output)
         assert figures[0] == pytest.approx(found['base']['rms_px'], rel=1e-3)
         assert figures[1] == pytest.approx(found['extended']['rms_px'], rel=1e-3)
+
+    def test_everything_means_the_extended_lens(self, output, tmp_path):
+        path = str(output / 'extended_lens.yaml')
+        lens = load_lens(path)
+        assert lens.svp().viewpoint_shift is None
+        assert true_lens(path, 0.5).viewpoint_shift.e0 == lens.viewpoint_shift.e0 / 2
+        assert cli.main(['budget', '--lens', path, '-o', str(tmp_path)]) == 0
+        found = json.loads((tmp_path / 'budget.json').read_text())
+        assert found['at_point'][0]['error'] > 1e-5
 
     def test_residuals_of_every_point(self, scene, output):
         names = ['frame', 'landmark', 'u', 'v', 'theta', 'range']

@@ -22,9 +22,10 @@ from fisheye_svp_ros.optics.curves import (
     Stereographic,
 )
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
-from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import group_views, views_of
 from fisheye_svp_ros.scene.rigs import rig
+from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import model_of, true_lens
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.study.budget import Setup, make_budget
@@ -262,3 +263,24 @@ def test_the_library_projects_with_all_of_the_lens():
     rays = fsvp.back_project(extended, image.uv)
     off = points - rays.origin
     np.testing.assert_allclose(np.cross(off, rays.direction), 0, atol=1e-6)
+
+
+def contrast(photograph, corner):
+    """Return how much two opposite quadrants about a place are brighter than the other two."""
+    u, v = np.round(corner).astype(int)
+    a, b, c, d = (photograph[y - 5:y, x - 5:x].mean() for y in (v, v + 6) for x in (u, u + 6))
+    return abs(a + d - b - c)
+
+
+def test_photographs_are_taken_with_all_of_the_lens():
+    small = replace(KB, width=160, height=120, fx=40.0, fy=40.0, cx=79.5, cy=59.5)
+    extended = extend_lens(small, [(CATALOGUE['decentering'](), np.array([0.1, -0.08]))])
+    printed, exposure = Print(4, 3, 0.05), Exposure(noise=0.0, blur=0.0, vignetting=0.0)
+    pose = Pose(np.eye(3), np.array([0.075, 0.05, -0.12]))
+    photograph = render(extended, printed, pose, exposure, np.random.default_rng(0))
+    points = pose.into_body(printed.corners)
+    seen, elsewhere = fsvp.project(extended, points).uv, fsvp.project(small, points).uv
+    far = np.linalg.norm(seen - elsewhere, axis=-1) > 3
+    assert far.sum() > 3
+    for corner, wrong in zip(seen[far], elsewhere[far], strict=True):
+        assert contrast(photograph, corner) > 1.5 * contrast(photograph, wrong)

@@ -13,7 +13,8 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.camera import back_project, project
+from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
@@ -56,6 +57,15 @@ def test_what_has_no_image_is_absent():
     empty = simulate(ForwardModel(FISH214), Landmarks(np.array([3]), points[:1]), paper_pose(2),
                      0.0, rng())
     assert len(empty) == 0
+
+
+def test_the_image_ends_half_a_pixel_beyond_the_outer_centres():
+    lens = replace(FISH214, viewpoint_shift=None, width=400, height=300, cx=200.0, cy=150.0)
+    edges = np.array([[-0.45, 10.0], [399.45, 10.0], [10.0, -0.45], [10.0, 299.45],
+                      [-0.55, 10.0], [399.55, 10.0], [10.0, -0.55], [10.0, 299.55]])
+    points = back_project(lens, edges).direction
+    table = simulate(ForwardModel(lens), Landmarks(np.arange(8), points), identity(1), 0.0, rng())
+    assert table.landmark.tolist() == [0, 1, 2, 3]
 
 
 def test_noise_is_gaussian_and_follows_the_seed():
