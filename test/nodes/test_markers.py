@@ -10,8 +10,10 @@ from geometry_msgs.msg import TransformStamped  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.markers import camera_shape
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.rigs import rig
 
 _PIXEL = 0.08 / 1536  # m, on the base of a camera
@@ -46,3 +48,13 @@ def test_epipolar_curves_run_through_the_image_points(
     assert off.max() < 0.5 * _PIXEL  # curves are drawn in straight pieces
     if frame != 'world':
         assert np.ptp(points[:, 2]) < 1e-12 and np.abs(points[:, :2]).max() < 768 * _PIXEL
+
+
+def test_a_camera_opens_along_its_viewing_axis() -> None:
+    turned = Pose(rotation_from_vector(np.array([0.0, 0.5, 0.0])), np.array([1.0, 2.0, 3.0]))
+    edges = turned.into_body(camera_shape(turned, 'left', 1.0).points).reshape(4, 2, 2, 3)
+    np.testing.assert_allclose(edges[:, 0, 0], 0.0, atol=1e-12)  # the tip
+    corners = edges[:, 0, 1]
+    np.testing.assert_allclose(corners[:, 2], 0.1)  # ahead
+    np.testing.assert_allclose(np.abs(corners[:, :2]), 0.04)
+    np.testing.assert_allclose(edges[:, 1], np.stack([corners, np.roll(corners, -1, 0)], 1))

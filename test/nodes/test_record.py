@@ -91,6 +91,20 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
     assert columns['localizer.rms_px'] == [None, None, 1.0]
 
 
+def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        for base, radius in (('/x', 1.0), ('/x/left', 2.0)):
+            tag = messages.key_values_message('scenario', {'radius': radius}, 5)
+            bag.write(f'{base}/scenario', DIAGNOSTICS, cdr(tag))
+        for node in ('/x/left/localizer', '/x/right/localizer'):
+            message = messages.key_values_message('n', {'rms_px': 3.0}, 5)
+            bag.write(f'{node}/result', DIAGNOSTICS, cdr(message))
+    assert tabulate(Bag(tmp_path / 'bag').records(is_tabulated)) == {
+        'namespace': ['/x', '/x/left'], 'stamp_ns': [5, 5], 'radius': [1.0, 2.0],
+        'right/localizer.rms_px': [3.0, None], 'localizer.rms_px': [None, 3.0],
+    }
+
+
 def test_the_command_writes_csv_parquet_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
