@@ -59,14 +59,14 @@ mutation: $(VENV)/ready
 test-oldest:
 	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
-	.venv-oldest/bin/pip install --quiet -e '.[standalone,fast,test]' -c test/oldest.txt
+	.venv-oldest/bin/pip install --quiet -e '.[standalone,fast,parquet,test]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
 
 $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -e '.[standalone,fast,dask,test,lint]'
+	$(BIN)/pip install --quiet -e '.[standalone,fast,parquet,dask,test,lint]'
 	touch $@
 
 clean:

@@ -47,11 +47,11 @@ setup(
         'opencv-python-headless>=4.6',
         'rosbags>=0.11.9',
         'mcap>=1.1',
-        'pyarrow>=14',
     ],
     extras_require={
         'standalone': ['cyclonedds>=11.0.1'],
         'fast': ['numba>=0.59'],
+        'parquet': ['pyarrow>=14'],
         'dask': ['distributed>=2023.7'],
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.

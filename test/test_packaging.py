@@ -18,7 +18,7 @@ ROSDEP = {
     'numpy': 'python3-numpy', 'scipy': 'python3-scipy', 'PyYAML': 'python3-yaml',
     'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'Jinja2': 'python3-jinja2',
     'opencv-python-headless': 'python3-opencv', 'rosbags': 'python3-rosbags-pip',
-    'setuptools': 'python3-setuptools', 'pyarrow': None,
+    'setuptools': 'python3-setuptools', 'pyarrow': None, 'mcap': None,
     'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
     'psutil': 'python3-psutil', 'mpmath': None,
 }

@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the graph; make everything else from its recording."""
+    from fisheye_svp_ros.commands.notes import note_formats
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.columns import write_columns
     from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
@@ -44,6 +45,7 @@ def run(args: argparse.Namespace) -> None:
     columns = tabulate(Bag(bag).records(is_tabulated))
     rows = demo_rows(columns, args.lenses, args.radii)
     write_columns(args.output / 'table', columns)
+    note_formats()
     write_json(args.output / 'demo.json', {
         'recording': str(bag), 'rows': [row._asdict() for row in rows],
     })

@@ -13,6 +13,15 @@ def say(note: str) -> None:
     print(f'fisheye-svp: note: {note}', file=sys.stderr)
 
 
+def note_formats() -> None:
+    """Say it where tables come in one form only."""
+    from fisheye_svp_ros.io.columns import arrow
+
+    _, problem = arrow()
+    if problem:
+        say(problem)
+
+
 def note_left_out(frames: Sequence[int]) -> None:
     """Name the frames that could not be posed, if there are any."""
     if frames:

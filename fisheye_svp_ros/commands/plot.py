@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
 def _table_in(source: Path) -> Path | None:
     if source.suffix in _TABLES:
         return source
-    table = source / 'sweep.parquet'
+    table = source / 'sweep.csv'
     return table if table.exists() else None
 
 

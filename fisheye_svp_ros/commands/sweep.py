@@ -42,12 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Solve what is not solved yet; join the parts."""
-    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.notes import note_formats, say
     from fisheye_svp_ros.commands.sweep_file import read_sweep
-    from fisheye_svp_ros.errors import ParameterError
+    from fisheye_svp_ros.errors import OutputError, ParameterError
     from fisheye_svp_ros.io.columns import Parts
     from fisheye_svp_ros.io.share import sweep_path
-    from fisheye_svp_ros.study.sweep import column_types, fingerprint, work
+    from fisheye_svp_ros.study.sweep import column_types, fingerprint, tasks, work
 
     path = sweep_path(str(args.file))
     plan = read_sweep(path)
@@ -62,7 +62,11 @@ def run(args: argparse.Namespace) -> None:
     else:
         engine = _claim(parts, mine, args.resume, work(plan))
         _solve(args, plan, parts, engine)
+        if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
+            raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are gone; '
+                              '--resume computes them anew')
         parts.join(args.output / 'sweep')
+        note_formats()
         _report(path, args.output, plan, mine)
     shutil.rmtree(parts.folder, ignore_errors=True)
 
@@ -119,16 +123,16 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
-    from fisheye_svp_ros.io.columns import read_column
+    from fisheye_svp_ros.io.columns import as_numbers, read_columns
     from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.study.summary import summarise
     from fisheye_svp_ros.study.sweep import column_types
 
-    table = folder / 'sweep.parquet'
+    table = read_columns(folder / 'sweep.csv')
     metrics = [name for name, kind in column_types(plan).items()
                if kind is float and '.' in name]
-    found = {name: summarise(read_column(table, name)) for name in metrics}
+    found = {name: summarise(as_numbers(table[name])) for name in metrics}
     print_table(
         f'{path}: {len(plan.sweep)} scenarios',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),

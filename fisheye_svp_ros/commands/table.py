@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Join the error topics by stamp, print what varies, write all of it."""
-    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.notes import note_formats, say
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.recording_table import STAMP, is_tabulated, tabulate
@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> None:
         from fisheye_svp_ros.io.results import write_json
 
         write_columns(args.output / 'table', columns)
+        note_formats()
         write_json(args.output / 'table.json', {
             'bag': str(args.bag), 'rows': rows, 'columns': list(columns), 'damage': bag.damage,
         })

@@ -1,32 +1,46 @@
-"""Tables for scripts: columns as CSV and Parquet, whole or part by part."""
+"""Tables for scripts: columns as CSV, and as Parquet where pyarrow is there; whole or in parts."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import parquet
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.files import replacing
+from fisheye_svp_ros.errors import ObservationError, OutputError
+from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.files import replacing, write_text
 
-_TYPES = {int: pa.int64(), float: pa.float64(), str: pa.string()}
 _ROWS = 1 << 16  # of a row group
 
+Columns = Mapping[str, Sequence[Any]]
 
-def write_columns(path: Path, columns: Mapping[str, Sequence[Any]]) -> list[Path]:
+
+@cache
+def arrow() -> tuple[Any, str]:
+    """Return pyarrow, or None and in one line why it cannot be had."""
+    try:
+        pyarrow = import_module('pyarrow')
+        import_module('pyarrow.parquet')
+    except Exception as cause:  # beside an older NumPy it ends in more than one way
+        return None, f'no Parquet file, the CSV file has it all: pyarrow is not usable ({cause})'
+    return pyarrow, ''
+
+
+def write_columns(path: Path, columns: Columns) -> list[Path]:
     """Write columns of equal length to `path`.csv and `path`.parquet; None is an empty cell.
 
-    Numbers in the CSV read back to the same bits.  Returns the files; raises OutputError where
-    one cannot be written.
+    Numbers in the CSV read back to the same bits; there is no Parquet file where `arrow` says so.
+    Returns the files; raises OutputError where one cannot be written.
     """
-    table = pa.table(dict(columns))
-    return _write(path, table.schema, [table])
+    return _write(path, list(columns), None, [columns])
 
 
 class Parts:
@@ -37,32 +51,43 @@ class Parts:
 
     def __init__(self, folder: Path, types: Mapping[str, type]) -> None:
         self.folder = folder
-        self._schema = pa.schema([(name, _TYPES[kind]) for name, kind in types.items()])
+        self._types = types
 
     def numbers(self) -> set[int]:
         """Return which parts are there."""
-        return {int(path.stem) for path in self.folder.glob('[0-9]*.parquet')}
+        return {int(path.stem) for path in self.folder.glob('[0-9]*.json')}
 
-    def write(self, number: int, columns: Mapping[str, Sequence[Any]]) -> None:
+    def write(self, number: int, columns: Columns) -> None:
         """Write a part; raise OutputError where that is impossible."""
-        table = pa.table(dict(columns), schema=self._schema)
-        with replacing(self._path(number)) as temporary:
-            parquet.write_table(table, temporary)
+        write_text(self._path(number), json.dumps(
+            {name: list(columns[name]) for name in self._types}, default=np.generic.item))
 
     def join(self, path: Path) -> list[Path]:
-        """Write all parts, in the order of their numbers, as `write_columns` does."""
-        tables = (parquet.read_table(self._path(n), schema=self._schema)
-                  for n in sorted(self.numbers()))
-        return _write(path, self._schema, tables)
+        """Write all parts, in the order of their numbers, as `write_columns` does.
+
+        Raises OutputError for a part that is damaged.
+        """
+        parts = map(self._read, sorted(self.numbers()))
+        return _write(path, list(self._types), self._types, parts)
+
+    def _read(self, number: int) -> Columns:
+        path = self._path(number)
+        try:
+            part: dict[str, list[Any]] = json.loads(path.read_text(encoding='utf-8'))
+            if {*part} != {*self._types} or len({*map(len, part.values())}) != 1:
+                raise ValueError('its columns are others')
+        except (OSError, ValueError, TypeError, AttributeError) as cause:
+            raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
+                              'compute it anew') from cause
+        return part
 
     def _path(self, number: int) -> Path:
-        return self.folder / f'{number:09}.parquet'
+        return self.folder / f'{number:09}.json'
 
 
-def read_column(path: Path, name: str) -> Array:
-    """Return one column of numbers (N,) of a Parquet table, NaN = empty."""
-    column = parquet.read_table(path, columns=[name]).column(0)
-    return np.asarray(column.to_numpy(), dtype=float)
+def as_numbers(cells: Sequence[float | None]) -> Array:
+    """Return a column of numbers (N,), NaN = empty."""
+    return np.array([np.nan if cell is None else cell for cell in cells], dtype=float)
 
 
 def read_columns(path: Path) -> dict[str, list[Any]]:
@@ -70,44 +95,75 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
 
     Raises OutputError for a file that is no such table.
     """
-    from pyarrow import csv as arrow_csv
-
-    options = arrow_csv.ConvertOptions(strings_can_be_null=False)
+    if path.suffix == '.csv':
+        try:
+            return {name: typed(cells) for name, cells in Table(path, ()).items()}
+        except ObservationError as cause:
+            raise OutputError(str(cause)) from cause
+    pyarrow, problem = arrow()
+    if pyarrow is None:
+        raise OutputError(f'{path}: {problem}; give the .csv beside it')
     try:
-        if path.suffix == '.csv':
-            table = arrow_csv.read_csv(path, convert_options=options)
-        else:
-            table = parquet.read_table(path)
-    except (OSError, pa.ArrowException) as cause:
+        columns: dict[str, list[Any]] = pyarrow.parquet.read_table(path).to_pydict()
+    except (OSError, pyarrow.ArrowException) as cause:
         raise OutputError(f'{path}: not a table ({str(cause).splitlines()[0]})') from cause
-    columns: dict[str, list[Any]] = table.to_pydict()
     return columns
 
 
-def _write(path: Path, schema: pa.Schema, tables: Iterable[pa.Table]) -> list[Path]:
+def typed(cells: Sequence[str | None]) -> list[Any]:
+    """Return whole numbers or numbers where every cell is one or empty; the text otherwise."""
+    for kind in (int, float):
+        try:
+            return [kind(cell) if cell else None for cell in cells]
+        except ValueError:
+            continue
+    return list(cells)
+
+
+def _write(
+    path: Path, names: Sequence[str], types: Mapping[str, type] | None, parts: Iterable[Columns]
+) -> list[Path]:
     files = [path.with_name(f'{path.name}.csv'), path.with_name(f'{path.name}.parquet')]
-    with (
-        replacing(files[0]) as text, replacing(files[1]) as binary,
-        text.open('w', encoding='utf-8', newline='') as stream,
-        parquet.ParquetWriter(binary, schema) as writer,
-    ):
+    pyarrow, _ = arrow()
+    with ExitStack() as stack:
+        text = stack.enter_context(replacing(files[0]))
+        stream = stack.enter_context(text.open('w', encoding='utf-8', newline=''))
         lines = csv.writer(stream, lineterminator='\n')
-        lines.writerow(schema.names)
-        pending: list[pa.Table] = []
-        for table in tables:
-            lines.writerows(zip(*table.to_pydict().values(), strict=True))
-            pending.append(table)
-            # Row groups of a fixed size, so that a table does not show how it was made.
-            if sum(map(len, pending)) >= _ROWS:
-                pending = [_grouped(writer, pending)]
-        if pending:
-            writer.write_table(pa.concat_tables(pending))
+        lines.writerow(names)
+        parts = _to_csv(lines, names, parts)
+        if pyarrow is None:
+            for _ in parts:
+                pass
+            return files[:1]
+        _to_parquet(pyarrow, stack.enter_context(replacing(files[1])), types, parts)
     return files
 
 
-def _grouped(writer: parquet.ParquetWriter, tables: Sequence[pa.Table]) -> pa.Table:
-    """Write whole row groups; return the rest."""
-    table = pa.concat_tables(tables)
-    whole = len(table) // _ROWS * _ROWS
-    writer.write_table(table.slice(0, whole), row_group_size=_ROWS)
-    return table.slice(whole)
+def _to_csv(lines: Any, names: Sequence[str], parts: Iterable[Columns]) -> Iterator[Columns]:
+    """Write parts as they pass."""
+    for part in parts:
+        lines.writerows(zip(*(part[name] for name in names), strict=True))
+        yield part
+
+
+def _to_parquet(
+    pyarrow: Any, path: Path, types: Mapping[str, type] | None, parts: Iterable[Columns]
+) -> None:
+    """Write row groups of a fixed size, so that a table does not show how it was made."""
+    kinds = {int: pyarrow.int64(), float: pyarrow.float64(), str: pyarrow.string()}
+    schema = pyarrow.schema([(n, kinds[t]) for n, t in types.items()]) if types else None
+    pending: list[Any] = []
+    writer = None
+    for part in parts:
+        pending.append(pyarrow.table(dict(part), schema=schema))
+        if writer is None:
+            writer = pyarrow.parquet.ParquetWriter(path, pending[0].schema)
+        if sum(map(len, pending)) >= _ROWS:
+            table = pyarrow.concat_tables(pending)
+            whole = len(table) // _ROWS * _ROWS
+            writer.write_table(table.slice(0, whole), row_group_size=_ROWS)
+            pending = [table.slice(whole)]
+    writer = writer or pyarrow.parquet.ParquetWriter(path, schema)
+    with writer:
+        if pending:
+            writer.write_table(pyarrow.concat_tables(pending))

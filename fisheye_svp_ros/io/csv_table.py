@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,10 @@ class CsvTable:
 
     def __contains__(self, name: str) -> bool:
         return name in self._header
+
+    def items(self) -> Iterable[tuple[str, tuple[str, ...]]]:
+        """Return the names and cells of all columns."""
+        return self._columns.items()
 
     def text(self, name: str) -> tuple[str, ...]:
         """Return the cells of a column."""

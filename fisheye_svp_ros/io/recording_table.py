@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
+from fisheye_svp_ros.io.columns import typed
 from fisheye_svp_ros.io.decoding import stamp_of, statuses
 
 STAMP = 'stamp_ns'
@@ -70,15 +71,5 @@ def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
     columns: Columns = {NAMESPACE: [base or '/' for base, _ in order],
                         STAMP: [stamp for _, stamp in order]}
     for name in names:
-        columns[name] = _typed([rows[key].get(name) for key in order])
+        columns[name] = typed([rows[key].get(name) for key in order])
     return columns
-
-
-def _typed(cells: list[str | None]) -> list[Any]:
-    """Return whole numbers or numbers where every cell is one; the text otherwise."""
-    for kind in (int, float):
-        try:
-            return [None if cell is None else kind(cell) for cell in cells]
-        except ValueError:
-            continue
-    return cells

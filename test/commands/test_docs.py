@@ -30,7 +30,6 @@ BLOCKS = [
 
 @pytest.mark.parametrize('block', BLOCKS)
 def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int) -> None:
-    pytest.importorskip('pyarrow')
     if 'dask' in block:
         pytest.importorskip(
             'distributed', reason='dask.distributed is not installed (extra `dask`)')

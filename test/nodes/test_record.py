@@ -20,7 +20,6 @@ import yaml
 from helpers.nodes import ROOT, NodeProcess, until
 
 pytest.importorskip('rosbags')
-pytest.importorskip('pyarrow')
 from helpers import graph  # noqa: F401 - supplies the message packages
 
 from fisheye_svp_ros import standalone
@@ -28,6 +27,7 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
 from fisheye_svp_ros.io import bags, decoding
 from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
+from fisheye_svp_ros.io.columns import arrow, read_columns
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
@@ -108,18 +108,17 @@ def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None
 def test_the_command_writes_csv_parquet_and_json(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from pyarrow import parquet
-
     write_results(tmp_path / 'bag', 5)
     assert main(['table', str(tmp_path / 'bag'), '-o', str(tmp_path / 'out')]) == 0
     out, err = capsys.readouterr()
-    assert '5 rows' in out and 'localizer.rms_px' in out and err == ''
+    assert '5 rows' in out and 'localizer.rms_px' in out and (err == '' or arrow()[1] in err)
     with (tmp_path / 'out' / 'table.csv').open() as stream:
         rows = list(csv.DictReader(stream))
     assert [float(row['localizer.rms_px']) for row in rows] == [n / 3 for n in range(5)]
-    table = parquet.read_table(tmp_path / 'out' / 'table.parquet')
-    assert table.column('localizer.rms_px').to_pylist() == [n / 3 for n in range(5)]
-    assert table.column('stamp_ns').to_pylist() == list(range(5))
+    if arrow()[0] is not None:
+        table = read_columns(tmp_path / 'out' / 'table.parquet')
+        assert table['localizer.rms_px'] == [n / 3 for n in range(5)]
+        assert table['stamp_ns'] == list(range(5))
     document = json.loads((tmp_path / 'out' / 'table.json').read_text())
     assert document['rows'] == 5 and document['damage'] == ''
 

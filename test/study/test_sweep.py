@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from helpers.nodes import ROOT, until
 
-pytest.importorskip('pyarrow')
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import OutputError, ParameterError
+from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
 from fisheye_svp_ros.io.parameters import changed
 from fisheye_svp_ros.scene.observations import views_of
@@ -26,6 +26,8 @@ from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.study.metrics import localization_metrics
 from fisheye_svp_ros.study.sweep import InProcess, plan_sweep, solve_sweep, sweep_rows, tasks
 
+# What a sweep leaves behind for scripts.
+FILES = ['sweep.csv', *(['sweep.parquet'] if tables.arrow()[0] else [])]
 SMALL = """
 /**:
   ros__parameters:
@@ -89,19 +91,19 @@ def finish(*arguments: Any) -> None:
 
 def files_of(folder: Path) -> list[bytes]:
     """Return the tables of a finished sweep, byte by byte."""
-    assert sorted(p.name for p in folder.iterdir()) == ['sweep.csv', 'sweep.json', 'sweep.parquet']
-    return [(folder / name).read_bytes() for name in ('sweep.csv', 'sweep.parquet')]
+    assert sorted(p.name for p in folder.iterdir()) == sorted([*FILES, 'sweep.json'])
+    return [(folder / name).read_bytes() for name in FILES]
 
 
 def parts_in(folder: Path) -> int:
-    return len(list((folder / 'parts').glob('0*.parquet')))
+    return len(list((folder / 'parts').glob('0*.json')))
 
 
 def test_rows_are_those_of_scenarios_one_by_one(
     write: Callable[[str], Path], tmp_path: Path
 ) -> None:
     sweep(write(SMALL), '-o', tmp_path / 'out')
-    columns = read_columns(tmp_path / 'out' / 'sweep.parquet')
+    columns = read_columns(tmp_path / 'out' / FILES[-1])
     assert read_columns(tmp_path / 'out' / 'sweep.csv') == columns | {
         'poses_file': [None] * 8
     }
@@ -247,7 +249,7 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     until(lambda: parts_in(out) >= 2)
     process.kill()
     process.communicate()
-    done = {p.name: p.stat().st_mtime_ns for p in (out / 'parts').glob('0*.parquet')}
+    done = {p.name: p.stat().st_mtime_ns for p in (out / 'parts').glob('0*.json')}
     assert main(['sweep', str(path), '-o', str(out)]) == 2
     assert '--resume goes on with it' in capsys.readouterr().err
     other = tmp_path / 'other.yaml'
@@ -257,7 +259,7 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     # What is done stays as it is until it is joined.
     kept: dict[str, int] = {}
     monkeypatch.setattr('shutil.rmtree', lambda folder, **_: kept.update(
-        {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.parquet')}))
+        {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.json')}))
     sweep(path, '-o', out, '--resume')
     assert 'scenarios are done already' in capsys.readouterr().err
     assert len(kept) == TASKS and {name: kept[name] for name in done} == done
@@ -363,12 +365,29 @@ def test_the_order_of_work_does_not_matter() -> None:
         assert again == pytest.approx(rows[numbers.start:numbers.stop], abs=1e-12)
 
 
-def test_a_missing_package_is_one_line(
+def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'with')]) == 0
+    capsys.readouterr()
+    tables.arrow.cache_clear()
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
-    monkeypatch.delitem(sys.modules, 'fisheye_svp_ros.io.columns', raising=False)
-    assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 2
+    assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 0
     err = capsys.readouterr().err
-    assert 'the Python package pyarrow is not installed' in err and err.count('\n') == 1
+    tables.arrow.cache_clear()
+    assert 'no Parquet file, the CSV file has it all: pyarrow' in err and err.count('\n') == 1
+    assert not (tmp_path / 'out' / 'sweep.parquet').exists()
+    assert (tmp_path / 'out' / 'sweep.csv').read_text() == (
+        tmp_path / 'with' / 'sweep.csv').read_text()
+
+
+def test_a_damaged_part_is_named(tmp_path: Path) -> None:
+    parts = tables.Parts(tmp_path / 'parts', {'n': int, 'x': float, 'note': str})
+    for number in range(3):
+        parts.write(number, {'n': [number], 'x': [None], 'note': ['']})
+    parts.join(tmp_path / 'whole')
+    assert (tmp_path / 'whole.csv').read_text() == 'n,x,note\n0,,\n1,,\n2,,\n'
+    (tmp_path / 'parts' / '000000001.json').write_text('{"n": [1], "x": [], "note": [""]}')
+    with pytest.raises(OutputError, match=r'000000001.json: a part of the table is damaged'):
+        parts.join(tmp_path / 'whole')
