@@ -121,6 +121,7 @@ class TestFiles:
         found = document(output)
         assert figures[0] == pytest.approx(found['base']['rms_px'], rel=1e-3)
         assert figures[1] == pytest.approx(found['extended']['rms_px'], rel=1e-3)
+        assert figures[1] < 0.9 * figures[0]
 
     def test_everything_means_the_extended_lens(self, output, tmp_path):
         path = str(output / 'extended_lens.yaml')
