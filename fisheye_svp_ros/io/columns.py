@@ -15,7 +15,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError, OutputError
-from fisheye_svp_ros.io.csv_table import Table
+from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.files import replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
@@ -97,7 +97,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
     """
     if path.suffix == '.csv':
         try:
-            return {name: typed(cells) for name, cells in Table(path, ()).items()}
+            return {name: typed(cells) for name, cells in CsvTable(path, ()).items()}
         except ObservationError as cause:
             raise OutputError(str(cause)) from cause
     pyarrow, problem = arrow()
