@@ -17,7 +17,7 @@ standalone.install()
 
 from sensor_msgs.msg import PointCloud2, PointField  # noqa: E402
 
-from fisheye_svp_ros import messages  # noqa: E402
+from fisheye_svp_ros.nodes import messages  # noqa: E402
 from fisheye_svp_ros.errors import ObservationError  # noqa: E402
 from fisheye_svp_ros.io import decoding  # noqa: E402
 from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack  # noqa: E402
