@@ -35,12 +35,13 @@ def advise(found: Found, causes: Sequence[Cause], measured: Measured) -> list[Ad
     advice = []
     stages = {stage_of(cause.effect) for cause in causes}
     if 'lens' in stages and gains['lens'].value > 0:
-        advice.append(Advice('use the extended lens', gain=gains['lens'].value))
+        advice.append(Advice('solve with the extended lens file', gain=gains['lens'].value))
     target = gains['named'].value - max(gains['lens'].value, 0.0)
     if 'target' in stages and target > 0:
         boards = sorted({b for c in causes if stage_of(c.effect) == 'target' for b in _boards(c)})
         advice.append(Advice(
-            'measure the target again, or use it as the extended lens file has it', boards=boards,
+            'measure the target again (the extended lens file corrects it for this target alone)',
+            boards=boards,
             landmarks=[n for c in causes if c.effect == 'landmark_survey' for n in _landmarks(c)],
             gain=target,
         ))
@@ -50,6 +51,7 @@ def advise(found: Found, causes: Sequence[Cause], measured: Measured) -> list[Ad
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
         if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
     ]
+    # Advice without a figure keeps its order, after all that has one.
     return sorted(advice, key=lambda one: -one.gain)
 
 

@@ -116,8 +116,9 @@ def held_out_gain(
         evidence.scale[columns], evidence.scale[columns]
     )
     everything = _marginal(evidence.information, included, columns, prior)
+    variance = evidence.variances.sigma**2
     gains = np.array([
-        everything - _marginal(f.information / evidence.variances.sigma**2, included, columns, prior)
+        everything - _marginal(f.information / variance, included, columns, prior)
         for f in evidence.folds
     ])
     count = len(gains)

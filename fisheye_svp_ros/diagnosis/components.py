@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis.reml import (
 _CALLED, _CALLED_LATE = 0.3, 0.01
 _LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
 _SHARE = 0.02
-_NO_PART = 2e-3  # of the noise variance: a component that adds less is none
+_DOUBTFUL = (6.0, 100.0)  # likelihood ratios between which the other variances are found anew
 
 
 def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
@@ -85,7 +85,7 @@ def component_traces(eq: Equations, now: Variances) -> dict[str, float]:
     for name, there in zip(NAMES, now.alive, strict=True):
         products = _products(eq, Variances(1.0, nothing, now.weight), NAMES.index(name))
         if there and products is not None:
-            own, ge, gr, gx = products
+            own, ge, gr, _ = products
             found[name] = float(np.trace(own) - np.trace(f.taken(ge, gr, None)))
     return found
 
@@ -120,15 +120,17 @@ def significance(eq: Equations, now: Variances) -> dict[str, float]:
     JASA 82 (1987)); the other variances follow.
     """
     full = _deviance(eq, now)
-    adds = start_variances(eq, 1.0).lam / np.maximum(now.lam, 1e-300)
     found = {}
-    for i, (name, there) in enumerate(zip(NAMES, now.alive, strict=True)):
-        if there and adds[i] < _NO_PART:
-            found[name] = 0.5
-        elif there:
-            rest, _ = estimate(eq, without(now, name), steps=2)
-            ratio = max(_deviance(eq, rest) - full, 0.0)
-            found[name] = float(stats.chi2.sf(ratio, 1)) / 2
+    for name, there in zip(NAMES, now.alive, strict=True):
+        if not there:
+            continue
+        rest = without(now, name)
+        ratio = _deviance(eq, rest) - full
+        # The other variances only ever take up a part of it.
+        if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
+            rest, _ = estimate(eq, rest, steps=2)
+            ratio = _deviance(eq, rest) - full
+        found[name] = float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
     return found
 
 

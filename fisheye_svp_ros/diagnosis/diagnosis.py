@@ -27,9 +27,11 @@ from fisheye_svp_ros.diagnosis.noise import (
 )
 from fisheye_svp_ros.diagnosis.prediction import Gain
 from fisheye_svp_ros.diagnosis.refit import Local
-from fisheye_svp_ros.diagnosis.search import Found, Wanted, search
+from fisheye_svp_ros.diagnosis.search import Found, search
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
+from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
 from fisheye_svp_ros.diagnosis.table import growth_cause, gross_rows, table_causes, with_outliers
+from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -118,7 +120,8 @@ def diagnose(
         # Values on a lattice repeat with the pixel by themselves.
         wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
     found = search(data, base, free, wanted, gross, progress)
-    noise_causes = growth_cause(found.growth) + table_causes(observations, found.gross, step if rounded else 0.0)
+    noise_causes = growth_cause(found.growth)
+    noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data')
     return _judged(
         observations, lens, found, Measured(found, free, held_out, wanted.quick), noise_causes

@@ -42,7 +42,8 @@ class Evidence:
     """A linearised state with its null model and everything that could be added to it.
 
     scale (X,): norms that the border's columns were divided by: what is in the model (the first
-    `own` of them), then the forms, then probes (`fields`); full: equations of all of them and all components.
+    `own` of them), then the forms, then probes (`fields`); full: equations of all of them and
+    all components.
     """
 
     linear: Linearised
@@ -77,11 +78,9 @@ class Evidence:
         found = []
         part = frame_folds(self.linear.data.frames)
         for fold in range(int(part.max()) + 1):
-            own = equations(
-                alive, self.linear.frame_columns, self.border, self.full,
-                np.flatnonzero(part == fold),
-            ).trimmed(self.variances.alive)
-            eq = less_frames(self.equations, own)
+            out = np.flatnonzero(part == fold)
+            own = equations(alive, self.linear.frame_columns, self.border, self.full, out)
+            eq = less_frames(self.equations, own.trimmed(self.variances.alive), out)
             found.append(factored(eq, self.variances.lam, self.variances.weight))
         return found
 

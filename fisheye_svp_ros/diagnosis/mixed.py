@@ -143,7 +143,7 @@ def equations(
     return found if frames is not None else _held(found, np.where(np.isfinite(scale), _RIDGE, 1.0))
 
 
-def less_frames(eq: Equations, part: Equations) -> Equations:
+def less_frames(eq: Equations, part: Equations, frames: Index) -> Equations:
     """Return equations without some frames, whose own equations are `part`."""
     b, c = eq.blocks, part.blocks
     left = Blocks(
@@ -151,7 +151,9 @@ def less_frames(eq: Equations, part: Equations) -> Equations:
         b.e_label, b.r_label,
     )
     # Poses that no row depends on any more stay where they are.
-    return _held(replace(eq, blocks=left), np.full(eq.pose_scale.shape, 1e-6))
+    ridge = np.zeros(eq.pose_scale.shape)
+    ridge[frames] = 1.0
+    return _held(replace(eq, blocks=left), ridge)
 
 
 def _held(eq: Equations, ridge: Array) -> Equations:
@@ -282,7 +284,6 @@ class Factored:
     border: Array
     information: Array
 
-
     def coefficients(self, way: Array) -> tuple[Array, Array]:
         """Return the coefficients (E, k), (R,) that follow a combination (X,) of the border."""
         r = _back(self.factor, self.border @ way)
@@ -309,12 +310,15 @@ class Factored:
         label = np.concatenate([b.e_label.ravel(), b.r_label])
         squares = np.concatenate([(self.precision[0] * e**2).ravel(), self.precision[1] * r**2])
         mine = label >= 0
-        return np.bincount(label[mine], weights=squares[mine], minlength=len(NAMES))
+        return np.asarray(
+            np.bincount(label[mine], weights=squares[mine], minlength=len(NAMES)), dtype=float
+        )
 
     def taken(self, e: Array, r: Array, x: Array | None) -> Array:
-        """Return v' A (A' A + D)^-1 A' v (C, C) of vectors with products (E, k, C), (R, C), (X, C).
+        """Return v' A (A' A + D)^-1 A' v (C, C) of vectors v.
 
-        A: all columns; x: the products with the border's fixed ones, None to leave these out.
+        e (E, k, C), r (R, C): their products with the columns A; x (X, C): those with the border's
+        fixed ones, None to leave these out.
         """
         first = self.inverse @ e
         flat = first.reshape(-1, first.shape[-1])
@@ -436,4 +440,4 @@ def _deviance(f: Factored, root: Array, freedom: int, variance: float) -> float:
         2 * float(np.log(np.maximum(np.abs(np.diagonal(part, axis1=-2, axis2=-1)), 1e-300)).sum())
         for part in (f.factor, root)
     ) - 2 * float(np.log(np.diagonal(f.inverse, axis1=-2, axis2=-1)).sum())
-    return freedom * np.log(max(variance, 1e-300)) + logs - float(np.log(priors).sum())
+    return float(freedom * np.log(max(variance, 1e-300)) + logs - np.log(priors).sum())

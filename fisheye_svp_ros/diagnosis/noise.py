@@ -76,7 +76,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     of_landmark = _scale_of_landmark(views, offset)
     typical = float(np.median(scale))
     whole = scale[:, 0] > max(_VIEW * typical, _VIEW_PX)
-    whole &= whole.mean() < 0.2
+    whole = np.asarray(whole & (whole.mean() < 0.2))
     far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
     swapped = _fits_another(model, pose, views, far, _GATE * typical)
     gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
@@ -92,7 +92,7 @@ def set_aside(data: Data, mask: Mask) -> Data:
     views = views._replace(
         weight=np.where(mask, 0.0, views.weight), row=np.where(mask, -1, views.row)
     )
-    return chosen_views(replace(data, views=views), views.used.any(axis=1))
+    return chosen_views(replace(data, views=views), np.asarray(views.used.any(axis=1)))
 
 
 def outlying(

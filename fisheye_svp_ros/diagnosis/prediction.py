@@ -27,11 +27,14 @@ class HeldOut(NamedTuple):
         """Root mean square of the 2-D residual norm, px."""
         return float(np.sqrt(self.squares.sum() / self.counts.sum()))
 
-    def excess(self, noise: float, rows: Array | slice = slice(None)) -> float:
-        """Mean square above what noise alone leaves once each frame has fitted its pose, px^2."""
-        squares, counts = self.squares[rows], self.counts[rows]
-        freedom = 2 * counts.sum() - 6 * len(counts)
-        return float((squares.sum() - noise**2 * freedom) / counts.sum())
+    def excess(self, noise: float, rows: Index) -> Array:
+        """Mean squares (B,) above what noise leaves once each frame has fitted its pose, px^2.
+
+        rows: the frames (B, F) that count.
+        """
+        squares, counts = self.squares[rows].sum(axis=1), self.counts[rows].sum(axis=1)
+        freedom = 2 * counts - 6 * rows.shape[1]
+        return np.asarray((squares - noise**2 * freedom) / counts)
 
 
 class Gain(NamedTuple):
@@ -46,17 +49,17 @@ def gain_between(before: HeldOut, after: HeldOut, noise: float) -> Gain:
     """Return the gain with a bootstrap interval over frames."""
     rng = np.random.default_rng(0)
     rows = rng.integers(0, len(before.squares), (_RESAMPLES, len(before.squares)))
-    ratios = [_ratio(before, after, noise, row) for row in rows]
-    low, high = np.quantile(ratios, (0.025, 0.975))
-    return Gain(_ratio(before, after, noise, slice(None)), float(low), float(high))
+    low, high = np.quantile(_ratio(before, after, noise, rows), (0.025, 0.975))
+    whole = np.arange(len(before.squares))[None]
+    return Gain(float(_ratio(before, after, noise, whole)[0]), float(low), float(high))
 
 
-def _ratio(before: HeldOut, after: HeldOut, noise: float, rows: Array | slice) -> float:
+def _ratio(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> Array:
     base = before.excess(noise, rows)
     # With nothing above the noise there is nothing to gain.
-    if base <= 1e-3 * noise**2:
-        return 0.0
-    return float(np.clip(1 - after.excess(noise, rows) / base, -1.0, 1.0))
+    some = base > 1e-3 * noise**2
+    gain = 1 - after.excess(noise, rows) / np.where(some, base, 1.0)
+    return np.where(some, np.clip(gain, -1.0, 1.0), 0.0)
 
 
 def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldOut:

@@ -34,8 +34,9 @@ class Points(NamedTuple):
     """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
 
     used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
-    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on the board over its size;
-    place (F, N, 2, 3): whitened derivatives by an offset along the board's axes, per mm.
+    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on
+    the board over its size; place (F, N, 2, 3): whitened derivatives by an offset along the
+    board's axes, per mm.
     """
 
     used: Mask
@@ -53,7 +54,7 @@ class Points(NamedTuple):
         """Gather the points of a linearised state."""
         data, views = linear.data, linear.data.views
 
-        def rows(values: Array) -> Array:
+        def rows(values: Array | Index) -> Array:
             return data.blocks(np.asarray(values, dtype=float)[..., None, :])
 
         weight = rows(linear.weight[..., None])[..., 0]
@@ -71,8 +72,10 @@ class Points(NamedTuple):
             mine = used & (number == one.id)
             board[mine], local[mine] = i, one.local(points[mine])[:, :2]
             place[mine] = place[mine] @ one.axes.T
-        return cls(used, uv, weight, rows(camera)[..., 0].astype(np.int64), slot, known, board, local,
-                   place)
+        return cls(
+            used, uv, weight, rows(camera)[..., 0].astype(np.int64), slot, known, board, local,
+            place,
+        )
 
 
 class Grid(NamedTuple):
@@ -136,8 +139,8 @@ def design(linear: Linearised, finest: bool = False) -> Design:
     grids, fields = _grids(points, finest), _board_fields(points, of_landmark, local, linear)
     parts = [_static_columns(points, grid) for grid in grids]
     parts += [_field_columns(points, field) for field in fields]
-    names = [part.name for part in (*grids, *fields)]
-    of = [np.full(part.shape[1], NAMES.index(name)) for name, part in zip(names, parts, strict=True)]
+    names = [grid.name for grid in grids] + [field.name for field in fields]
+    of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
     rows = points.weight.size * 2
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')

@@ -42,7 +42,7 @@ class Fitted(NamedTuple):
 
 
 class Local(NamedTuple):
-    """Predicted local offsets: of landmarks (ids, (L, 3) m) and of the image (grids, (K, 2) px)."""
+    """Predicted local offsets: of landmarks (L, 3), m, and of the image (grids, (K, 2) px)."""
 
     landmark: Index
     offset: Array

@@ -11,6 +11,7 @@ a few that are far off do not widen the bulk.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,8 +32,8 @@ class Variances:
     """The variances of the null model.
 
     sigma: of the whitened noise; lam (components,): sigma^2 / tau^2, GONE for what has vanished;
-    weight (L,): factors on the precision of each landmark's offset; covariance (components + 1,)^2:
-    of log tau^2 and, last, log sigma^2.
+    weight (L,): factors on the precision of each landmark's offset; covariance: of log tau^2 of
+    all components and, last, log sigma^2.
     """
 
     sigma: float
@@ -148,7 +149,8 @@ def _sums(eq: Equations, e: Array, r: Array) -> Array:
     label = np.concatenate([eq.blocks.e_label.ravel(), eq.blocks.r_label])
     values = np.concatenate([e.ravel(), r])
     mine = label >= 0
-    return np.bincount(label[mine], weights=values[mine], minlength=len(NAMES))
+    sums = np.bincount(label[mine], weights=values[mine], minlength=len(NAMES))
+    return np.asarray(sums, dtype=float)
 
 
 def _determined(eq: Equations, f: Factored, solution: Solution) -> Array:
@@ -172,13 +174,13 @@ def _landmark_weights(eq: Equations, now: Variances, solution: Solution) -> Arra
     return weight
 
 
-def _landmark_rows(eq: Equations, e: Array, r: Array) -> Array:
+def _landmark_rows(eq: Equations, e: Any, r: Any) -> Any:
     return e if not eq.by_frame else r[len(r) - 3 * len(eq.landmarks) :].reshape(-1, 3)
 
 
 def landmark_labels(eq: Equations) -> Index:
     """Return the components (L, 3) of landmarks' offsets."""
-    return _landmark_rows(eq, eq.blocks.e_label, eq.blocks.r_label)
+    return np.asarray(_landmark_rows(eq, eq.blocks.e_label, eq.blocks.r_label))
 
 
 def without(now: Variances, name: str) -> Variances:

@@ -10,7 +10,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step, choose
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse, swept
-from fisheye_svp_ros.diagnosis.model import Data, State
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.diagnosis.model import fit as refit_by_least_squares
 from fisheye_svp_ros.diagnosis.noise import (
     Gross,
     NoiseCause,
@@ -20,24 +21,17 @@ from fisheye_svp_ros.diagnosis.noise import (
 )
 from fisheye_svp_ros.diagnosis.prediction import placed_terms
 from fisheye_svp_ros.diagnosis.refit import Fitted, fit_linear, refit
-from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.single_landmarks import single_landmarks
-from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.errors import ObservationError
 
 _ROUNDS = 6
 _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a round
-
-
-@dataclass(frozen=True)
-class Wanted:
-    """What the user knows: causes to take in, causes to leave out, whether time matters most."""
-
-    included: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
-    quick: bool = False
 
 
 @dataclass
@@ -67,7 +61,7 @@ def search(
     growth: NoiseCause | None = None
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
-        progress(f'weighing {len(CATALOGUE)} effects against random local errors, round {turn + 1}')
+        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
         evidence = gather_evidence(data, state, free, before, wanted.left_out)
         base, before = base or evidence, evidence.variances
         included, gone = _needed(evidence, wanted.included)
@@ -97,6 +91,7 @@ def search(
     if changed:
         evidence = gather_evidence(data, state, free, before, wanted.left_out)
         fitted = fit_linear(evidence.linear, evidence.variances)
+    assert base is not None
     return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)
 
 
@@ -132,18 +127,25 @@ def _cleaned(
 
 
 def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) -> State:
-    """Return the state with the causes that the user knows of, in their simplest forms."""
+    """Return the state with the causes that the user knows of, in their simplest forms.
+
+    Raises ObservationError for one that the data cannot hold.
+    """
     if not wanted.included:
         return state
-    scene = gather_evidence(data, state, free).linear.scene
+    scene = Linearised(data, state, free).scene
     for name in wanted.included:
-        state = with_effect(state, next(iter(CATALOGUE[name].candidates(scene))))
-    return state
+        try:
+            state = with_effect(state, next(iter(CATALOGUE[name].candidates(scene))))
+        except Untestable as why:
+            raise ObservationError(f'{data.observations.source}: {name}: {why}') from why
+    return refit_by_least_squares(data, state, free)
 
 
 def _needed(evidence: Evidence, kept: Sequence[str]) -> tuple[Index, list[str]]:
     """Return the columns of what is still needed, given the others, and the names of the rest."""
-    included, gone = np.arange(evidence.own), []
+    included = np.arange(evidence.own)
+    gone: list[str] = []
     while True:
         weakest, worst = None, SIGNIFICANCE
         for name, columns, _ in placed_terms(evidence):

@@ -26,7 +26,7 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, S
     """
     statistic, rank, offset = landmark_tests(evidence)
     count = len(statistic)
-    p = stats.chi2.sf(statistic, np.maximum(rank, 1))
+    p = np.asarray(stats.chi2.sf(statistic, np.maximum(rank, 1)))
     corrected = np.where(rank > 0, p * 2 * count * evidence.forms.names(), 1.0)
     found = np.flatnonzero(corrected < SIGNIFICANCE)
     bulk = evidence.variances.alive[_LANDMARK].any()
@@ -130,10 +130,14 @@ def _posterior(f: Factored) -> Array:
         through = linalg.solve_triangular(f.factor, flat.T, lower=True, check_finite=False)
         own = back @ f.inverse
         fixed = (back @ (f.block_border[..., :-1] - f.coupled @ by_border)).reshape(3 * count, -1)
-    through = through.reshape(-1, count, 3)
-    found = own + np.einsum('rla,rlb->lab', through, through)
+    found = own + _outer(through, count)
     if len(root):
         half = linalg.solve_triangular(root, fixed.T, lower=True, check_finite=False)
-        half = half.reshape(-1, count, 3)
-        found = found + np.einsum('rla,rlb->lab', half, half)
+        found = found + _outer(half, count)
     return np.asarray(found)
+
+
+def _outer(columns: Array, count: int) -> Array:
+    """Return the products (L, 3, 3) of each landmark's columns (R, 3 L) with each other."""
+    parts = columns.reshape(-1, count, 3)
+    return np.asarray(np.einsum('rla,rlb->lab', parts, parts))
