@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.budget import stage_of
+from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.measured import Measured
 from fisheye_svp_ros.diagnosis.noise import VIEW
@@ -29,8 +29,10 @@ class Advice:
     gain: float = 0.0
 
 
-def advise(found: Found, causes: Sequence[Cause], measured: Measured) -> list[Advice]:
-    """Return what to do, what brings most first."""
+def advise(
+    found: Found, causes: Sequence[Cause], measured: Measured, parts: Sequence[Component]
+) -> list[Advice]:
+    """Return what to do, what brings most first; parts: the random components that are there."""
     gains = measured.gains()
     advice = []
     stages = {stage_of(cause.effect) for cause in causes}
@@ -45,7 +47,8 @@ def advise(found: Found, causes: Sequence[Cause], measured: Measured) -> list[Ad
             landmarks=[n for c in causes if c.effect == 'landmark_survey' for n in _landmarks(c)],
             gain=target,
         ))
-    advice += _local(found, measured, (1 - gains['named'].value) * gains['local'].value)
+    if any(part.stage == 'target' for part in parts):
+        advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
     advice += _frames(found)
     advice += [
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
@@ -64,7 +67,7 @@ def _landmarks(cause: Cause) -> list[int]:
     return list(dict.fromkeys(int(name.partition('.')[0]) for name in cause.parameters))
 
 
-def _local(found: Found, measured: Measured, gain: float) -> list[Advice]:
+def _local(measured: Measured, gain: float) -> list[Advice]:
     """Return the landmarks whose predicted offsets stand out, where predicting them helps."""
     far = np.linalg.norm(measured.local.offset, axis=1)
     if gain <= 0 or not far.any():

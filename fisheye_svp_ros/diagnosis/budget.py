@@ -23,8 +23,10 @@ _OF_STAGE = {'target': 'target', 'noise': 'noise'}
 
 
 class Component(NamedTuple):
-    """One part of the misfit: sd_px of a coordinate; share of all, named_share what of it has a
-    name; p_value of its being there at all.
+    """One part of the misfit.
+
+    sd_px: of a coordinate; share: of all, named_share: what of it has a name; p_value: of its
+    being there at all.
     """
 
     name: str

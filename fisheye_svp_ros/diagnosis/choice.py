@@ -17,6 +17,7 @@ SIGNIFICANCE = 0.01
 CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
 _BETTER = 6.0  # by so much another effect must describe the data better to take a cause's place
+_ABSURD = 30.0  # times what would be a large value of a parameter
 _HELD_OUT = 1.0  # standard errors by which held-out frames must be predicted better
 
 
@@ -87,9 +88,14 @@ def _candidate(evidence: Evidence, form: int, score: Score) -> Candidate:
 
 
 def _impossible(effect: Effect, score: Score) -> bool:
-    """Whether a size comes out negative where only a positive one has a meaning."""
-    return any(value < 0 for value, parameter in zip(score.estimate, effect.parameters,
-                                                     strict=True) if parameter.positive)
+    """Whether a size comes out negative where only a positive one has a meaning, or is absurd.
+
+    A scale that poses take up all but entirely would have to be a hundred per cent.
+    """
+    sizes = list(zip(score.estimate, effect.parameters, strict=True))
+    if any(value < 0 for value, parameter in sizes if parameter.positive):
+        return True
+    return all(abs(value) > _ABSURD * parameter.large for value, parameter in sizes)
 
 
 def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:

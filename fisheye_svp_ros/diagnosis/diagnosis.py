@@ -30,7 +30,6 @@ from fisheye_svp_ros.diagnosis.refit import Local
 from fisheye_svp_ros.diagnosis.search import Found, search
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
 from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
-from fisheye_svp_ros.diagnosis.table import growth_cause, gross_rows, table_causes, with_outliers
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.optics.lens import Lens
@@ -159,9 +158,9 @@ def _judged(
         lens_only=measured.lens_only,
         extended=measured.extended,
         gross=gross_rows(observations, found.gross),
-        advice=advise(found, causes, measured),
+        advice=advise(found, causes, measured, found_components(components)),
         remaining=left,
-        untestable=evidence.forms.untestable,
+        untestable=found.base.untestable,
         trace=found.trace,
         gain=measured.gain,
         intrinsics=measured.intrinsics,

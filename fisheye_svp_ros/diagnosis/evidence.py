@@ -84,6 +84,17 @@ class Evidence:
             found.append(factored(eq, self.variances.lam, self.variances.weight))
         return found
 
+    @cached_property
+    def untestable(self) -> dict[str, str]:
+        """Effects that the data cannot test, and why."""
+        left = swept(self.information, np.arange(self.own))
+        ranks: dict[str, int] = {}
+        for form, effect in enumerate(self.forms.effects):
+            rank = self.score(left, self.columns_of(form)).rank
+            ranks[effect.name] = max(rank, ranks.get(effect.name, 0))
+        taken = 'what it would do is taken up by what is free already'
+        return self.forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
+
     def columns_of(self, form: int) -> Index:
         """Return the border's columns of a form."""
         at = self.forms.at[form]
@@ -92,7 +103,10 @@ class Evidence:
     def score(self, left: Array, columns: Index) -> Score:
         """Test columns by the information `left` once what is in the model is swept out."""
         block, gradient = left[np.ix_(columns, columns)], left[columns, -1]
-        inverse, rank = pseudo_inverse(block)
+        # A normalised column alone has information 1 / sigma^2.
+        inverse, rank = pseudo_inverse(
+            block, least=IDENTIFIABLE / self.variances.sigma**2
+        )
         estimate = inverse @ gradient
         statistic = float(estimate @ gradient)
         p = float(stats.chi2.sf(statistic, rank)) if rank else 1.0
@@ -168,12 +182,17 @@ def identifiable(pose: Array, columns: Array, chosen: Index) -> Array:
     return basis
 
 
-def pseudo_inverse(matrix: Array, floor: float = IDENTIFIABLE) -> tuple[Array, int]:
-    """Return the pseudoinverse of a symmetric matrix and its rank, relative to its largest."""
+def pseudo_inverse(
+    matrix: Array, floor: float = IDENTIFIABLE, least: float = 1e-300
+) -> tuple[Array, int]:
+    """Return the pseudoinverse of a symmetric matrix and its rank.
+
+    floor: of its largest eigenvalue, and least: below which an eigenvalue is taken as nothing.
+    """
     if not len(matrix):
         return matrix, 0
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
-    kept = values > max(floor * float(values[-1]), 1e-300)
+    kept = values > max(floor * float(values[-1]), least)
     return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T, int(kept.sum())
 
 

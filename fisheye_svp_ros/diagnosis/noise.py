@@ -108,6 +108,10 @@ def outlying(
     limit = -2 * np.log(_OUTLYING / max(int(views.used.sum()), 1))
     mask = views.used & (pairs > limit)
     mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]
+    # A landmark that is off in most of its views is not where it is said to be.
+    every = np.bincount(views.landmark[views.used])
+    off = np.bincount(views.landmark[mask], minlength=len(every))
+    mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
     px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
     return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
 

@@ -36,8 +36,9 @@ _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a rou
 
 @dataclass
 class Found:
-    """The state with its causes, the evidence around it, the fit, the trace; base: the first
-    evidence; growth: of the noise with the angle, if it is a cause.
+    """The state with its causes, the evidence around it, the fit, the trace.
+
+    base: the first evidence; growth: of the noise with the angle, if it is a cause.
     """
 
     state: State
@@ -59,6 +60,7 @@ def search(
     base: Evidence | None = None
     dropped: set[str] = set()
     growth: NoiseCause | None = None
+    cleaned = False
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
@@ -76,21 +78,21 @@ def search(
             effect, offset, step = found
             trace.append(step)
             state, changed = with_effect(state, effect, offset), True
-        fitted = refit(data, state, free, before) if changed else fit_linear(
-            evidence.linear, before
-        )
-        state = fitted.state
-        if not turn and not wanted.quick:
+        if not changed and growth is None and not cleaned and not wanted.quick:
             # Once the causes are known: what is far off even beside random errors, and the noise.
-            data, gross, growth, shifted = _cleaned(data, fitted, gross, wanted)
+            fitted = fit_linear(evidence.linear, before)
+            data, gross, growth, changed = _cleaned(data, fitted, gross, wanted)
+            cleaned = True
             if growth is not None:
                 state = with_noise_growth(state, growth.value)
-            changed |= shifted
-        if not changed or wanted.quick:
+        if not changed:
+            break
+        state = refit(data, state, free, before).state
+        if wanted.quick:
             break
     if changed:
         evidence = gather_evidence(data, state, free, before, wanted.left_out)
-        fitted = fit_linear(evidence.linear, evidence.variances)
+    fitted = fit_linear(evidence.linear, evidence.variances)
     assert base is not None
     return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)
 

@@ -16,6 +16,7 @@ from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEff
 # So many landmarks are no single ones any more: of those that are exact, and of those that err
 # from landmark to landmark anyway.
 _MANY, _MANY_OF_BULK = 0.12, 3
+_OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
 _LANDMARK = np.array([name.startswith('landmark') for name in NAMES])
 
 
@@ -30,7 +31,11 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, S
     corrected = np.where(rank > 0, p * 2 * count * evidence.forms.names(), 1.0)
     found = np.flatnonzero(corrected < SIGNIFICANCE)
     bulk = evidence.variances.alive[_LANDMARK].any()
-    if not found.size or found.size > (_MANY_OF_BULK if bulk else max(3, _MANY * count)):
+    most = _MANY_OF_BULK if bulk else max(3, int(_MANY * count))
+    if found.size > most:
+        # A landmark that is far off makes others seem so.
+        found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED]
+    if not found.size or found.size > most:
         return None
     found = found[np.argsort(corrected[found], kind='stable')]
     ids = evidence.design.landmark[found]

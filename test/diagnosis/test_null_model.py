@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 SIGMA = 0.2
+TESTED = ('viewpoint_shift', 'decentering', 'skew', 'target_shape')
 
 
 def linearised(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
@@ -26,7 +27,8 @@ def linearised(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
     pose, views = scene(rng, cameras, frames)
     observations = observe(lens(), (), pose, views, SIGMA, rng)
     if offsets:
-        true = views._replace(points=views.points + rng.normal(size=views.points[0].shape) * offsets)
+        moves = rng.normal(size=views.points[0].shape) * offsets
+        true = views._replace(points=views.points + moves)
         observations = observe(lens(), (), pose, true, SIGMA, rng)
         nominal = dict(enumerate(views.points[0]))
         xyz = np.array([nominal[i] for i in observations.landmark.tolist()])
@@ -112,7 +114,8 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
         np.ones(5 * random.frame.shape[-1]), np.repeat(now.weight, 3),
         np.ones(random.shared.shape[1]),
     ])
-    x = np.concatenate([dense_poses(linear), border[..., :1].reshape(-1, 1)[linear.used.ravel()]], 1)
+    probe = border[..., :1].reshape(-1, 1)[linear.used.ravel()]
+    x = np.concatenate([dense_poses(linear), probe], axis=1)
     full = np.concatenate([x, z], axis=1)
     matrix = full.T @ full + np.diag(np.concatenate([np.zeros(x.shape[1]), precision]))
     scale = np.sqrt(np.diag(matrix))
@@ -225,10 +228,11 @@ def test_p_values_are_uniform_without_an_effect():
         left = swept(evidence.information, np.arange(evidence.own))
         for form, effect in enumerate(evidence.forms.effects):
             simplest = effect == next(e for e in evidence.forms.effects if e.name == effect.name)
-            if simplest and effect.name in ('viewpoint_shift', 'decentering', 'skew', 'target_shape'):
+            if simplest and effect.name in TESTED:
                 columns = evidence.columns_of(form)
                 score = evidence.score(left, columns)
-                p_values.append(evidence.confident(score, np.arange(evidence.own), columns).p_value)
+                sure = evidence.confident(score, np.arange(evidence.own), columns)
+                p_values.append(sure.p_value)
     # 40 values; a sound build fails this less than once in ten thousand runs.
     assert stats.kstest(p_values, 'uniform').pvalue > 1e-4
 
