@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
 from benchmark.blind_hidden import Hidden, Rng, centre_of, focal_of, unit
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, Gennery, ImageHeight, invert_height
+from fisheye_svp_ros.optics.curve_base import ImageHeight
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, Gennery
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import rotation_from_vector
 
@@ -35,24 +35,15 @@ def viewpoint_shift(scene: Scene, rng: Rng) -> Hidden:
 
 
 @dataclass(frozen=True)
-class _Height:
+class _Height(ImageHeight):
     """An image height with a change added to it: for projecting only."""
 
     base: ImageHeight
     change: Callable[[Array], Array]
-    limit: float = np.pi
-    coefficients: tuple[float, ...] = ()
-    coefficient_names: ClassVar[tuple[str, ...]] = ()
 
     def value_and_slope(self, theta: Array) -> tuple[Array, Array]:
         height, slope = self.base.value_and_slope(theta)
         return height + self.change(theta), slope
-
-    def angle(self, height: Array) -> Array:
-        return invert_height(self, height)
-
-    def columns(self, theta: Array) -> Array:
-        return np.empty((*np.shape(theta), 0))
 
 
 def radial_profile(scene: Scene, rng: Rng) -> Hidden:

@@ -8,16 +8,14 @@ import numpy as np
 from scipy import optimize, stats
 
 from benchmark.blind_hidden import Hidden
+from benchmark.blind_projection import Nuisance, basis
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.model import Linearised, State, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.projection import Nuisance
-from fisheye_svp_ros.diagnosis.selection import SIGNIFICANCE
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
-
-_RANK = 1e-4
 
 
 class LinearScene:
@@ -79,7 +77,7 @@ def oracle_finds(
     if name == 'noise_vs_angle':
         return _growth_p_value(linear, residual) < level
     if name == 'wrong_ids':
-        size = np.median(np.abs(residual[linear.linear.rows.used])) / 0.6745
+        size = np.median(np.abs(residual[linear.linear.used])) / 0.6745
         p = 2 * stats.norm.sf(np.abs(residual).max() / size) * linear.nuisance.rows
         return bool(p < level)
     return True  # rounded numbers show without a test
@@ -113,7 +111,8 @@ def _f_test(
     signal = nuisance.outside(moved[..., None])[..., 0].ravel()
     best = (-1.0, False)
     for form in forms:
-        q = _directions(nuisance, linear.linear.effect_columns(form) / linear.scene.noise)
+        columns = linear.linear.effect_columns(form) / linear.scene.noise
+        q = basis(nuisance.outside(columns), np.sqrt((columns**2).sum(axis=(0, 1))))
         rank = q.shape[1]
         left = nuisance.freedom - rank
         limit = stats.f.isf(level / count, rank, left)
@@ -125,17 +124,9 @@ def _f_test(
     return best[1]
 
 
-def _directions(nuisance: Nuisance, columns: Array) -> Array:
-    """Return an orthonormal basis (rows, R) of columns (F, M, P) outside the nuisance."""
-    norms = np.sqrt((columns**2).sum(axis=(0, 1)))
-    flat = (nuisance.outside(columns) / np.maximum(norms, 1e-300)).reshape(-1, len(norms))
-    u, s, _ = np.linalg.svd(flat, full_matrices=False)
-    return np.asarray(u[:, s > _RANK])
-
-
 def _growth_p_value(linear: LinearScene, residual: Array) -> float:
     """Likelihood-ratio test of sigma(theta) = sigma0 exp(growth theta^2)."""
-    used = linear.linear.rows.used
+    used = linear.linear.used
     theta = linear.linear.data.blocks(linear.linear.scene.theta[..., None] * np.ones(2))[used]
     z = theta**2 - np.mean(theta**2)
     e2 = residual[used] ** 2

@@ -15,10 +15,8 @@ from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import Needs, Scene, draw_scene
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.projection import Nuisance, score
-from fisheye_svp_ros.effects.base import Untestable
-from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.diagnosis.evidence import gather_evidence, swept
+from fisheye_svp_ros.diagnosis.model import intrinsic_names
 
 MODES = ('one', 'clean', 'outside', 'two')
 _WEAKEST = 0.02  # an effect of which what is free leaves less than this is drawn again
@@ -114,7 +112,7 @@ def run_trial(task: Task) -> Outcome:
         outcome.errors = _errors(case, task, found)
         outcome.recovered = None if test is None else _recovered(case, found)
     if task.mode == 'clean':
-        outcome.p_values = _null_p_values(found)
+        outcome.p_values = _null_p_values(found, scene.free)
     return outcome
 
 
@@ -259,25 +257,23 @@ def _recovered(case: Case, found: Diagnosis) -> float | None:
     return float((before**2 - after**2) / (before**2 - truth**2))
 
 
-def _null_p_values(found: Diagnosis) -> dict[str, float]:
-    """Return the p-value of the simplest form of each effect in the first screening."""
+def _null_p_values(found: Diagnosis, free: bool) -> dict[str, float]:
+    """Return the p-value of the simplest form of each effect beside the null model."""
     linear = found.before
-    nuisance = Nuisance(linear)
-    values = {}
-    for name, kind in CATALOGUE.items():
-        if kind.stage == 'noise':
-            continue
-        try:
-            form = min(kind.candidates(linear.scene), key=lambda form: len(form.parameters))
-        except Untestable:
-            continue
-        if isinstance(form, LandmarkSurveyEffect):
-            form = LandmarkSurveyEffect(form.landmarks[:1])
-        result = score(nuisance, linear.effect_columns(form))
+    names = intrinsic_names(linear.state.lens) if free else ()
+    evidence = gather_evidence(linear.data, linear.state, names)
+    own = np.arange(evidence.own)
+    left = swept(evidence.information, own)
+    values: dict[str, float] = {}
+    for form, effect in enumerate(evidence.forms.effects):
+        if effect.name in values:
+            continue  # the simplest form stands first
+        columns = evidence.columns_of(form)
+        result = evidence.confident(evidence.score(left, columns), own, columns)
         wrong = [
-            value < 0 for value, parameter in zip(result.estimate, form.parameters, strict=True)
+            value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
             if parameter.positive
         ]
         if result.rank and not any(wrong):
-            values[name] = round(result.p_value, 5)
+            values[effect.name] = round(result.p_value, 5)
     return values

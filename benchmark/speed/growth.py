@@ -12,11 +12,9 @@ from benchmark.speed.engines import use
 from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
-from fisheye_svp_ros.diagnosis.correlation import Correlation
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
-from fisheye_svp_ros.diagnosis.projection import Nuisance
-from fisheye_svp_ros.diagnosis.screening import screen
+from fisheye_svp_ros.diagnosis.evidence import gather_evidence
+from fisheye_svp_ros.diagnosis.model import fit, prepare, start
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
@@ -71,7 +69,7 @@ def growths() -> list[Growth]:
         Growth('a localization, ShiftVP', 'landmarks', (100, 1000, 10_000), _landmarks),
         Growth('localizations, ShiftVP', 'views', (100, 1000, 10_000), _views),
         Growth('stereo calibration', 'views', (10, 40, 160), _stereo),
-        Growth('screening, 30 frames', 'effects', (5, 10, 20), _screening),
+        Growth('null model and tests, 30 frames', 'effects', (5, 10, 20), _evidence),
         Growth('diagnosis', 'frames', (10, 20, 40), _diagnosis),
     ]
 
@@ -99,12 +97,11 @@ def _stereo(count: int) -> Callable[[], Any]:
     return lambda: calibrate_stereo(model, model, scene.left, scene.right)
 
 
-def _screening(count: int) -> Callable[[], Any]:
+def _evidence(count: int) -> Callable[[], Any]:
     data = prepare(_seen(30))
-    linear = Linearised(data, fit(data, start(data, shift_lens().svp()), ()), ())
-    nuisance, independent = Nuisance(linear), Correlation(0.0, 1.0, lambda _: 1.0)
-    names = [name for name, effect in CATALOGUE.items() if effect.stage != 'noise'][:count]
-    return lambda: screen(linear, nuisance, independent, names)
+    state = fit(data, start(data, shift_lens().svp()), ())
+    left_out = list(CATALOGUE)[count:]
+    return lambda: gather_evidence(data, state, (), left_out=left_out)
 
 
 def _diagnosis(count: int) -> Callable[[], Any]:

@@ -29,6 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--held-out', metavar='TEST',
                         help='other observations of the same camera and target to measure the '
                         'gain on; by default frames of OBS in turn')
+    parser.add_argument('--with', dest='included', action='append', default=[], metavar='NAME',
+                        help='a cause that is known to be there: it is fitted without a test')
+    parser.add_argument('--without', dest='left_out', action='append', default=[], metavar='NAME',
+                        help='an effect that is known not to be there: it is not tried')
+    parser.add_argument('--quick', action='store_true',
+                        help='a first answer: one round, without held-out frames in the choice')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for report.html and its pictures, diagnosis.json, '
                         'extended_lens.yaml, residuals.csv')
@@ -40,6 +46,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis.inputs import poses_by_frame
     from fisheye_svp_ros.diagnosis.known_truth import known_errors
     from fisheye_svp_ros.diagnosis.model import intrinsic_names
+    from fisheye_svp_ros.diagnosis.wanted import Wanted
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.io.share import lens_path
@@ -55,6 +62,7 @@ def run(args: argparse.Namespace) -> None:
     with stages('diagnosing') as progress:
         diagnosis = diagnose(
             observations, lens, free_intrinsics=free, poses=poses, held_out=held_out,
+            wanted=Wanted(tuple(args.included), tuple(args.left_out), args.quick),
             progress=progress,
         )
         progress('errors where the truth is known')
@@ -84,6 +92,9 @@ def _print(
 
     print_paragraphs(
         text.VERDICTS[diagnosis.verdict], text.verdict_sentences(diagnosis, known)
+    )
+    print_table(
+        'variance budget', text.BUDGET_HEADER, text.budget_rows(diagnosis), words=text.BUDGET_WORDS
     )
     if diagnosis.causes:
         print_table(

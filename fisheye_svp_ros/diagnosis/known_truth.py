@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.held_out import splits
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.solve.localization import localize
@@ -59,8 +58,13 @@ def known_errors(
 
 def _trained(linear: Linearised, free: Sequence[str]) -> Iterator[tuple[Data, State]]:
     """Yield held-out data and a state with the poses of the first camera's views in it."""
-    for part, train, held_out in splits(linear.data, linear.state, _FOLDS):
-        trained = fit(train, part, free)
+    data = linear.data
+    folds = np.arange(data.frames) % min(_FOLDS, data.frames)
+    for fold in np.unique(folds):
+        kept = folds != fold
+        part = replace(linear.state, pose=linear.state.pose.take(np.flatnonzero(kept)))
+        trained = fit(chosen_views(data, kept[data.frame_of]), part, free)
+        held_out = chosen_views(data, ~kept[data.frame_of])
         model = ForwardModel(trained.lens, trained.terms)
         solved = localize(model, held_out.views.take(_first(held_out))).pose
         yield held_out, replace(trained, pose=solved)

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.optics.camera import lens_columns
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
@@ -24,11 +22,10 @@ from fisheye_svp_ros.solve.localization import localize
 
 @dataclass(frozen=True)
 class Data:
-    """A table in the batch forms that criticism needs.
+    """A table in the batch forms that a diagnosis needs.
 
     views: S views of up to N points; frame_of, camera_of (S,): which frame (0..F-1) and camera
-    (0..C-1) a view belongs to; poses: true poses (F,) of the rig where they are known; displaced:
-    landmarks so far off in most of their views that they have to be tested together.
+    (0..C-1) a view belongs to; poses: true poses (F,) of the rig where they are known.
     """
 
     observations: Observations
@@ -36,7 +33,6 @@ class Data:
     frame_of: Index
     camera_of: Index
     poses: Pose | None = None
-    displaced: tuple[int, ...] = ()
 
     @property
     def frames(self) -> int:
@@ -82,6 +78,16 @@ def prepare(observations: Observations, poses: dict[int, Pose] | None = None) ->
         chosen = [poses[int(number)] for number in numbers]
         known = Pose.stack(chosen)
     return Data(observations, views, frame_of.reshape(-1), camera_of.reshape(-1), known)
+
+
+def chosen_views(data: Data, kept: Mask) -> Data:
+    """Return the data of some of the views (S,)."""
+    frames, frame_of = np.unique(data.frame_of[kept], return_inverse=True)
+    poses = None if data.poses is None else data.poses.take(frames)
+    return replace(
+        data, views=data.views.take(kept), frame_of=frame_of.reshape(-1),
+        camera_of=data.camera_of[kept], poses=poses,
+    )
 
 
 def intrinsic_names(lens: Lens) -> tuple[str, ...]:
@@ -150,9 +156,9 @@ class Linearised:
         self.shared_columns = self.whitened(np.concatenate(shared, axis=-1))
 
     @cached_property
-    def rows(self) -> Rows:
-        """What each row (F, M) belongs to."""
-        return Rows.of(self)
+    def used(self) -> Mask:
+        """Which rows (F, M) are observations and not padding."""
+        return self.data.blocks((self.weight > 0)[..., None] * np.ones(2)) > 0
 
     def whitened(self, columns: Array) -> Array:
         """Gather columns (S, N, 2, P) as (F, M, P), whitened, zero for padding."""
@@ -178,51 +184,9 @@ class Linearised:
         return frame, columns.reshape(*rig.shape[:3], -1)
 
 
-class Rows(NamedTuple):
-    """Labels of the rows (F, M): used, landmark, camera, point (which observation of the frame).
-
-    survey (F, M): place among the landmarks that are free, -1 for none.
-    """
-
-    used: Mask
-    landmark: Index
-    survey: Index
-
-    @classmethod
-    def of(cls, linear: Linearised) -> Rows:
-        """Label the rows of a linearised state."""
-        data, both = linear.data, np.ones(2)
-        used = data.blocks((linear.weight > 0)[..., None] * both) > 0
-        landmark = data.blocks(data.views.landmark[..., None] * both).astype(np.int64)
-        free = survey_of(linear.state.terms)
-        survey = np.full(landmark.shape, -1) if free is None else free.slots(landmark)
-        return cls(used, landmark, np.where(used, survey, -1))
-
-
-def survey_of(terms: Sequence[Term]) -> LandmarkSurveyEffect | None:
-    """Return the effect that frees every landmark, if it is among the terms."""
-    for effect, _ in terms:
-        if isinstance(effect, LandmarkSurveyEffect) and effect.everywhere:
-            return effect
-    return None
-
-
 def is_shared(effect: Effect) -> bool:
-    """Whether an effect's parameters stand among the shared ones of a fit.
-
-    Not those of noise effects, and not a survey of all landmarks, which has blocks of its own.
-    """
-    everywhere = isinstance(effect, LandmarkSurveyEffect) and effect.everywhere
-    return effect.stage != 'noise' and not everywhere
-
-
-def on_target(linear: Linearised) -> Mask:
-    """Which shared columns (K,) belong to effects on the target."""
-    effects = [effect for effect, _ in linear.state.terms if is_shared(effect)]
-    mine = [effect.stage == 'target' for effect in effects for _ in effect.parameters]
-    mask = np.zeros(linear.shared_columns.shape[-1], dtype=bool)
-    mask[len(mask) - len(mine) :] = mine
-    return mask
+    """Whether an effect's parameters stand among the shared ones of a fit: not those of noise."""
+    return effect.stage != 'noise'
 
 
 def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
@@ -235,22 +199,26 @@ def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
 
 
 def fit(data: Data, state: State, free: Sequence[str]) -> State:
-    """Refit poses, rig, free intrinsics and effect values together (maximum likelihood).
+    """Refit poses, rig, free intrinsics and effect values together by least squares.
 
-    The frames are the blocks of one arrow; with all landmarks free, the landmarks are.
+    The frames are the blocks of one arrow.
     """
-    problem: _Fit = _Fit(data, state, free)
-    iterations = 30
-    if survey_of(state.terms) is not None:
-        # Free landmarks leave the target's own place open: after a few steps only that moves.
-        problem, iterations = _SurveyFit(data, state, free), 6
-    return problem.unpack(levenberg_marquardt(problem, problem.pack(state), iterations).state)
+    problem = _Fit(data, state, free)
+    return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
 def fit_poses(data: Data, state: State) -> State:
     """Refit the poses of the frames alone."""
     problem = _Fit(data, state, (), poses_only=True)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
+
+
+def moved(
+    data: Data, state: State, free: Sequence[str], frame: Array, shared: Array
+) -> State:
+    """Return the state after a step of the poses (F, 6) and of what is shared (K,)."""
+    problem = _Fit(data, state, free)
+    return problem.unpack(problem.retract(problem.pack(state), (frame[None], shared[None])))
 
 
 class _Fit:
@@ -265,28 +233,20 @@ class _Fit:
     def pack(self, state: State) -> Arrays:
         lens = [state.lens.parameters[name] for name in self._free]
         values = [v for effect, v in state.terms if is_shared(effect)]
-        survey = [v for effect, v in self._own_terms(state)]
         parts = (*state.pose, *state.rig, np.concatenate([np.array(lens), *values]))
-        return tuple(array[None] for array in (*parts, np.concatenate([np.zeros(0), *survey])))
+        return tuple(array[None] for array in parts)
 
     def unpack(self, packed: Arrays) -> State:
-        rotation, position, rig_rotation, rig_position, shared, own = (a[0] for a in packed)
+        rotation, position, rig_rotation, rig_position, shared = (a[0] for a in packed)
         count = len(self._free)
         lens = self._template.lens.with_parameters(self._free, list(shared[:count]))
-        solved: dict[str, Array] = {}
-        both = [term for term in self._template.terms if is_shared(term[0])]
-        for parts, values in ((both, shared[count:]), (self._own_terms(self._template), own)):
-            for effect, known in parts:
-                solved[effect.name] = values[: len(known)]
-                values = values[len(known) :]
-        terms = [(effect, solved[effect.name]) for effect, _ in self._template.terms]
+        values, terms = shared[count:], []
+        for effect, known in self._template.terms:
+            if is_shared(effect):
+                known, values = values[: len(known)], values[len(known) :]
+            terms.append((effect, known))
         rig = Pose(rig_rotation, rig_position)
         return State(Pose(rotation, position), rig, lens, tuple(terms))
-
-    def _own_terms(self, state: State) -> list[Term]:
-        """Return the terms outside the shared parameters: the survey first, then noise."""
-        own = [term for term in state.terms if not is_shared(term[0])]
-        return sorted(own, key=lambda term: isinstance(term[0], NoiseEffect))
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):
@@ -300,11 +260,8 @@ class _Fit:
         return arrow_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
-        block, change = step
-        return self._moved(state, block, change, np.zeros_like(state[5]))
-
-    def _moved(self, state: Arrays, frame: Array, shared: Array, own: Array) -> Arrays:
-        rotation, position, rig_rotation, rig_position, values, survey = state
+        frame, shared = step
+        rotation, position, rig_rotation, rig_position, values = state
         cameras = 6 * (self._data.cameras - 1)
         move = np.zeros((len(shared), self._data.cameras, 6))
         move[:, 1:] = shared[:, :cameras].reshape(len(shared), -1, 6)
@@ -312,38 +269,7 @@ class _Fit:
             *Pose(rotation, position).retract(frame),
             *Pose(rig_rotation, rig_position).retract(move),
             values + shared[:, cameras:],
-            survey + own,
         )
-
-
-class _SurveyFit(_Fit):
-    """The same with every landmark free: landmarks are the blocks, poses join what is shared."""
-
-    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
-        if not len(index):
-            return np.zeros(0), ()
-        linear = Linearised(self._data, self.unpack(state), self._free)
-        place = linear.whitened(linear.linear.d_target)
-        group = landmark_groups(linear.rows.landmark, linear.rows.used)
-        slot = gather(linear.rows.survey[..., None].astype(float), group)[:, :1].astype(int)
-        block = np.where(slot >= 0, gather(place, group), 0.0)
-        # Other effects on the target are contained in free landmarks: they stay as they were.
-        shared = linear.shared_columns * ~on_target(linear)
-        others = np.concatenate([dense_frames(linear.frame_columns), shared], axis=-1)
-        self._slots = slot[:, 0, 0]
-        residual = gather(linear.residual[..., None], group)[..., 0]
-        return _equations(residual, block, gather(others, group))
-
-    def retract(self, state: Arrays, step: Arrays) -> Arrays:
-        block, change = step
-        frames = 6 * self._data.frames
-        own = np.zeros_like(state[5])
-        free = self._slots >= 0
-        # The survey's values stand first; what follows belongs to noise effects and stays.
-        places = 3 * self._slots[free][:, None] + np.arange(3)
-        own[:, places] = block[:, free]
-        frame = change[:, :frames].reshape(1, -1, 6)
-        return self._moved(state, frame, change[:, frames:], own)
 
 
 def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arrays]:
@@ -364,31 +290,6 @@ def _equations(residual: Array, block: Array, shared: Array) -> tuple[Array, Arr
     return np.array([cost]), tuple(equations)
 
 
-def landmark_groups(landmark: Index, used: Mask) -> Index:
-    """Return the flat rows (L, m) of each landmark, padded with the number of rows (a blank)."""
-    flat = np.flatnonzero(used)
-    ids, group, counts = np.unique(landmark.ravel()[flat], return_inverse=True, return_counts=True)
-    order = np.argsort(group, kind='stable')
-    rank = np.arange(len(flat)) - np.repeat(np.cumsum(counts) - counts, counts)
-    rows = np.full((len(ids), counts.max()), used.size)
-    rows[group[order], rank] = flat[order]
-    return rows
-
-
-def gather(columns: Array, group: Index) -> Array:
-    """Return columns (F, M, P) by group, (L, m, P), zero for padding."""
-    flat = flat_rows(columns)
-    return np.concatenate([flat, np.zeros_like(flat[:1])])[group]
-
-
 def flat_rows(columns: Array) -> Array:
     """Return columns (..., P) as (rows, P), also where P is 0."""
     return columns.reshape(int(np.prod(columns.shape[:-1])), columns.shape[-1])
-
-
-def dense_frames(columns: Array) -> Array:
-    """Return columns by single frames (F, M, 6) as (F, M, 6 F), zero in all other frames."""
-    frames, rows, width = columns.shape
-    dense = np.zeros((frames, rows, frames, width))
-    dense[np.arange(frames), :, np.arange(frames)] = columns
-    return dense.reshape(frames, rows, -1)

@@ -9,9 +9,8 @@ import numpy as np
 from scipy import optimize, stats
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
-from fisheye_svp_ros.diagnosis.projection import Nuisance
-from fisheye_svp_ros.diagnosis.structure import standardised_squares
+from fisheye_svp_ros.diagnosis.model import Data, State, chosen_views
+from fisheye_svp_ros.diagnosis.refit import Fitted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.pose import Pose
@@ -21,16 +20,32 @@ from fisheye_svp_ros.solve.localization import localize
 _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
 _GATE = 6.0  # and within which it belongs to another one
 _SUSPECT = 6.0  # below this no point is worth a robust fit
+SWAPPED = 'it lies where another landmark is predicted'
+FAR = 'far from its prediction'
+VIEW = 'the whole view is off: its points may be in another order'
+_VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
+_OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
 
 
 class Gross(NamedTuple):
-    """Gross errors of a table: outlying rows of it, and which of them fit another landmark."""
+    """Gross errors of a table: outlying rows of it, how far (px), and why."""
 
     rows: Index
-    swapped: Mask
+    px: Array
+    why: tuple[str, ...]
+
+    def with_more(self, rows: Index, px: Array, why: str) -> Gross:
+        """Return these and other rows."""
+        return Gross(np.concatenate([self.rows, rows]), np.concatenate([self.px, px]),
+                     (*self.why, *[why] * len(rows)))
+
+    @property
+    def swapped(self) -> int:
+        """How many lie where another landmark is predicted."""
+        return self.why.count(SWAPPED)
 
 
 class NoiseCause(NamedTuple):
@@ -42,12 +57,12 @@ class NoiseCause(NamedTuple):
 
 
 def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
-    """Return the data without gross errors and with `displaced`, and what the errors were.
+    """Return the data without gross errors, and what the errors were.
 
     Every view is localized with weights that fade for points far from their prediction (Cauchy),
     on the scale of the median residual of that view or of all, whichever is larger: a view that
     a model error bends as a whole holds no gross error, nor does a landmark that is off in most
-    of its views.
+    of its views.  A view out of all proportion belongs elsewhere as a whole.
     """
     model = ForwardModel(state.lens, state.terms)
     views, pose = data.views, state.view_poses(data)
@@ -59,16 +74,46 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
             pose = localize(model, views._replace(weight=weight), pose).pose
             scale, offset = _scale(views, _offset(model, pose, views))
     of_landmark = _scale_of_landmark(views, offset)
-    far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark))
-    displaced = np.unique(views.landmark[views.used & (of_landmark > _GROSS * scale)])
-    swapped = _fits_another(model, pose, views, far, _GATE * float(np.median(scale)))
-    rows = views.row[far]
-    order = np.argsort(rows)
-    clean = views._replace(
-        weight=np.where(far, 0.0, views.weight), row=np.where(far, -1, views.row)
+    typical = float(np.median(scale))
+    whole = scale[:, 0] > max(_VIEW * typical, _VIEW_PX)
+    whole = np.asarray(whole & (whole.mean() < 0.2))
+    far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
+    swapped = _fits_another(model, pose, views, far, _GATE * typical)
+    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
+    for mask, why in ((swapped, SWAPPED), (far & ~swapped, FAR),
+                      (views.used & whole[:, None], VIEW)):
+        gross = gross.with_more(views.row[mask], offset[mask], why)
+    return set_aside(data, far | (views.used & whole[:, None])), gross
+
+
+def set_aside(data: Data, mask: Mask) -> Data:
+    """Return the data without some points (S, N), and without views that have none left."""
+    views = data.views
+    views = views._replace(
+        weight=np.where(mask, 0.0, views.weight), row=np.where(mask, -1, views.row)
     )
-    found = replace(data, views=clean, displaced=tuple(displaced.tolist()))
-    return found, Gross(rows[order], swapped[far][order])
+    return chosen_views(replace(data, views=views), np.asarray(views.used.any(axis=1)))
+
+
+def outlying(
+    data: Data, fitted: Fitted, gross: Gross, squares: Array
+) -> tuple[Data, Gross]:
+    """Set aside points that are too far off once every random part is predicted.
+
+    squares: of the standardised residuals (F, M).
+    """
+    views = data.views
+    pairs = squares.reshape(data.frames, data.cameras, -1, 2).sum(axis=-1)
+    pairs = pairs[data.frame_of, data.camera_of]
+    limit = -2 * np.log(_OUTLYING / max(int(views.used.sum()), 1))
+    mask = views.used & (pairs > limit)
+    mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]
+    # A landmark that is off in most of its views is not where it is said to be.
+    every = np.bincount(views.landmark[views.used])
+    off = np.bincount(views.landmark[mask], minlength=len(every))
+    mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
+    px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
+    return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
 
 
 def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
@@ -103,10 +148,14 @@ def quantisation_step(uv: Array) -> float:
     return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
 
 
-def noise_growth(linear: Linearised, nuisance: Nuisance) -> NoiseCause:
-    """Fit sigma(theta) = sigma0 exp(growth theta^2) to the residuals (likelihood-ratio test)."""
-    used = linear.rows.used
-    e2 = standardised_squares(linear, nuisance)[used]
+def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
+    """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
+
+    Those of outlying points count as little as the limit allows.
+    """
+    linear = fitted.linear
+    used = linear.used
+    e2 = np.minimum(squares[used], 20.0)
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[used]
     z = theta**2 - (theta**2).mean()
 
@@ -115,9 +164,11 @@ def noise_growth(linear: Linearised, nuisance: Nuisance) -> NoiseCause:
         return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
 
     best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
-    gain = deviance(0.0) - float(best.fun)
-    stderr = 1 / np.sqrt(2 * float((z**2).sum()))
-    return NoiseCause(float(best.x), float(stderr), float(stats.chi2.sf(max(gain, 0.0), 1)))
+    # Heavier tails than the normal distribution's scatter the squares more.
+    tails = max(float(e2.var()) / 2, 1.0)
+    gain = (deviance(0.0) - float(best.fun)) / tails
+    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
+    return NoiseCause(float(best.x), stderr, float(stats.chi2.sf(max(gain, 0.0), 1)))
 
 
 def with_noise_growth(state: State, growth: float) -> State:

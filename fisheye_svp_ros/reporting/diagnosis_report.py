@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
-import numpy as np
 
+from fisheye_svp_ros.diagnosis.budget import stage_shares
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.points import PointResiduals
-from fisheye_svp_ros.diagnosis.selection import SIGNIFICANCE, Step
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting import diagnosis_text as text
@@ -38,7 +39,7 @@ _CAPTIONS = {
 }
 _PICTURE_OF = {
     'image': 'field', 'theta': 'theta', 'range': 'range', 'landmark': 'landmark',
-    'frame': 'frame', 'time': 'frame', 'pixel_phase': 'phase', 'neighbour_correlation': 'field',
+    'frame': 'frame', 'time': 'frame', 'pixel_phase': 'phase',
     'outliers': 'histogram', 'scatter_vs_theta': 'theta', 'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
@@ -76,7 +77,7 @@ def write_report(
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, **{p.stem: _data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
-        **_causes(diagnosis), **_evidence(diagnosis), **_rest(diagnosis, points),
+        **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
         known=list(text.known_rows(known)), free=_free(inputs),
     )
     report = inputs.folder / 'report.html'
@@ -121,7 +122,9 @@ def _free(inputs: Inputs) -> str:
 def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
     causes = []
     for cause, row in zip(diagnosis.causes, text.cause_rows(diagnosis), strict=True):
-        fields = dict(zip(('effect', 'size', 'p', 'rms', 'gain', 'same'), row, strict=True))
+        fields = dict(zip(
+            ('effect', 'size', 'p', 'share', 'rms', 'gain', 'same'), row, strict=True
+        ))
         shown = list(cause.parameters.items())[:_ROWS]
         causes.append({
             **fields, 'what': text.what(cause.effect),
@@ -137,31 +140,46 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
-    misfit = float((diagnosis.before.residual**2).sum())
     return {
-        'steps': [_step(step, misfit) for step in diagnosis.trace],
+        'steps': [_step(step) for step in diagnosis.trace],
         'tested': len(CATALOGUE) - len(diagnosis.untestable),
     }
 
 
-def _step(step: Step, misfit: float) -> dict[str, Any]:
-    gains = (step.held_out.get(name) for name in ('frames', 'landmarks', 'range_bands'))
+def _step(step: Step) -> dict[str, Any]:
     tried = step.statistic > 0
+    held_out = ''
+    if math.isfinite(step.held_out):
+        held_out = f'{step.held_out:.1f} ± {step.held_out_stderr:.1f}'
     return {
         'effect': step.effect, 'accepted': step.accepted, 'why': step.why,
         'rank': step.rank if tried else '',
-        'explains': f'{100 * step.statistic / misfit:.1f}' if tried else '',
+        'explains': f'{step.statistic:.1f}' if tried else '',
         'p': text.probability(step.corrected).removeprefix('p ').removeprefix('= ')
         if tried else '',
-        'held_out': ['' if g is None else f'{100 * g / misfit:.1f}' for g in gains],
+        'held_out': held_out,
     }
 
 
-def _rest(diagnosis: Diagnosis, points: PointResiduals) -> dict[str, Any]:
+def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Return the bars of the budget: stage, percent without and with a name."""
+    shares = stage_shares(diagnosis.components)
+    total = diagnosis.base.rms_px**2
+    return {
+        'bars': [
+            (stage, text.STAGE_WORDS[stage], 100 * (share - named), 100 * named)
+            for stage, (share, named) in shares.items()
+        ],
+        'total_px2': f'{total:.3g}',
+        'budget_rows': list(text.budget_rows(diagnosis)),
+        'intrinsics': list(text.intrinsic_rows(diagnosis)),
+        'advice': [(text.advice_text(one), text.percent(one.gain) if one.gain > 0 else '')
+                   for one in diagnosis.advice],
+    }
+
+
+def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
     strongest = sorted(diagnosis.remaining, key=lambda structure: -structure.share)
-    far = np.flatnonzero(points.outlier)
-    distance = np.linalg.norm(points.after, axis=1)
-    far = far[np.argsort(-np.nan_to_num(distance[far], nan=np.inf))]
     return {
         'remaining': [
             {
@@ -178,10 +196,9 @@ def _rest(diagnosis: Diagnosis, points: PointResiduals) -> dict[str, Any]:
             (effect, why, CATALOGUE[effect].signature)
             for effect, why in diagnosis.untestable.items()
         ],
-        'outlier_count': len(far),
+        'outlier_count': len(diagnosis.gross),
         'outliers': [
-            (points.frame[i], points.landmark[i], f'{points.uv[i, 0]:.2f}',
-             f'{points.uv[i, 1]:.2f}', f'{distance[i]:.2f}')
-            for i in far[:_ROWS]
+            (row['frame'], row['landmark'], f'{row["px"]:.2f}', row['why'])
+            for row in diagnosis.gross[:_ROWS]
         ],
     }

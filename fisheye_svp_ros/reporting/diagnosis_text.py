@@ -9,7 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.diagnosis.advice import Advice
+from fisheye_svp_ros.diagnosis.budget import stage_of
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import with_error
@@ -32,7 +35,6 @@ VARIABLES = {
     'pixel_phase': 'the place within a pixel',
 }
 _OTHERWISE = {
-    'neighbour_correlation': 'neighbours in the image err alike',
     'outliers': 'a few points lie far off',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
@@ -47,9 +49,27 @@ _MEASURES = {
     'axis_error_rad': ('error of the viewing axis', 180 / math.pi, 'deg'),
     'depth_error_m': ('stereo error', 1e3, 'mm'),
 }
+COMPONENTS = {
+    'named_lens': 'lens, by name', 'named_target': 'target, by name',
+    'named_frame': 'frames, by name',
+    'image_coarse': 'image field of a sixth', 'image_fine': 'image field of a fourteenth',
+    'image_finest': 'finer image field', 'landmark_in_plane': 'landmarks along their board',
+    'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
+    'board_in_plane': 'board field along it', 'board_normal': 'board field off it',
+    'frame_focal': 'focal length of each frame', 'frame_centre': 'centre of each frame',
+    'frame_linear': 'linear field of each frame',
+    'frame_quadratic': 'quadratic field of each frame',
+    'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
+    'noise': 'noise of image points',
+}
+STAGE_WORDS = {
+    'lens': 'lens (stays in the image)', 'target': 'target (stays with the board)',
+    'frame': 'frames (motion, detector, light)', 'noise': 'noise',
+}
 _NAMED = 3  # causes that one sentence can bear
 _UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
 _NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
+_MOST = 6  # names in one sentence
 _FEW = 4  # parameters that are read one by one
 
 
@@ -80,6 +100,7 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     named = [
         f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
         if abs(entry['value']) > max(_NOTHING, _UNDETERMINED * entry['stderr'])
+        or (math.isnan(entry['stderr']) and abs(entry['value']) > _NOTHING)
     ]
     if len(named) <= _FEW:
         return ', '.join(named)
@@ -127,7 +148,7 @@ def verdict_sentences(
 ) -> tuple[str, str, str]:
     """Return what is wrong, what correcting it gains, and what to do next.
 
-    known: errors where the truth is known, of `criticism.known_truth`.
+    known: errors where the truth is known, of `diagnosis.known_truth`.
     """
     return _wrong(diagnosis), _gained(diagnosis, known or {}), _next(diagnosis)
 
@@ -155,17 +176,28 @@ def _name(cause: Cause) -> str:
 
 
 def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
-    before, after = d.base.heldout_rms_px, d.extended.heldout_rms_px
+    before, named, best = (f.heldout_rms_px for f in (d.base, d.named, d.extended))
     moving = [c for c in d.causes if CATALOGUE[c.effect].stage != 'noise']
-    if not d.causes:
-        why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
-        return f'The lens as it is predicts held-out data to {before:.3g} px rms; {why}.'
+    local = ''
+    if best < 0.99 * named:
+        local = (f'; with the local offsets of single landmarks and of the image, which have no '
+                 f'name, to {best:.3g} px')
     if not moving:
-        return (f'Held-out data are predicted to {after:.3g} px rms as before: the cause is in '
-                'the table of image points, not in the lens.')
-    text = (f'Corrected, held-out data are predicted to {after:.3g} px rms instead of '
-            f'{before:.3g}, which takes away {percent(d.gain.value)} (95 % interval '
+        why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
+        if d.causes:
+            why = 'the cause is in the table of image points, not in the lens'
+        return (f'The lens as it is predicts held-out data to {before:.3g} px rms; {why}{local}.')
+    if named >= before:
+        return (f'Held-out data do not bear it out: {named:.3g} px rms instead of {before:.3g}; '
+                f'the causes are no correction{local}.')
+    text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
+            f'{before:.3g}{local}, which takes away {percent(d.gain.value)} (95 % interval '
             f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
+    lens = d.lens_only.heldout_rms_px
+    if 'target' in {stage_of(c.effect) for c in moving}:
+        better = lens < before
+        text += (f'; the lens alone, on the target as it is said to be, '
+                 f'{"reaches" if better else "does not help:"} {lens:.3g} px')
     for (label, base, extended, _), compared in zip(
         known_rows(known), known.values(), strict=True
     ):
@@ -179,12 +211,7 @@ def _next(d: Diagnosis) -> str:
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
         return f'Keep the lens as it is{blind}.'
-    stages = {CATALOGUE[c.effect].stage for c in d.causes}
-    steps = []
-    if stages - {'noise'}:
-        steps.append(f'solve with {EXTENDED}')
-    if 'target' in stages:
-        steps.append('measure the target again (the correction holds for this target alone)')
+    steps = [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
@@ -192,8 +219,41 @@ def _next(d: Diagnosis) -> str:
     steps += [_remedy(c) for c in d.causes if CATALOGUE[c.effect].stage == 'noise']
     if d.remaining:
         steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
-    text = '; '.join(steps)
+    text = '; '.join(steps) or 'keep the lens as it is'
     return text[0].upper() + text[1:] + '.'
+
+
+def advice_text(advice: Advice) -> str:
+    """Return one thing to do, with the names of what it is about."""
+    about = [
+        f'{name}s {listed([str(n) for n in numbers[:_MOST]])}' if len(numbers) > 1
+        else f'{name} {numbers[0]}'
+        for name, numbers in (('frame', advice.frames), ('board', advice.boards),
+                              ('landmark', advice.landmarks)) if numbers
+    ]
+    what = advice.what.replace('the extended lens file', EXTENDED)
+    return f'{what} ({", ".join(about)})' if about else what
+
+
+def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]]:
+    """Yield the variance budget: part, stage, sd in px, share, p-value."""
+    for part in diagnosis.components:
+        p = probability(part.p_value).removeprefix('p ').removeprefix('= ')
+        yield (COMPONENTS[part.name], part.stage, f'{part.sd_px:.3f}', percent(part.share),
+               '-' if part.name == 'noise' else p)
+
+
+BUDGET_HEADER = ('part', 'stage', 'sd px', 'share', 'p')
+BUDGET_WORDS = ('part', 'stage')
+
+
+def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:
+    """Yield each free intrinsic before and after, with its standard error."""
+    for name, value in diagnosis.intrinsics.items():
+        yield (
+            name, ' ± '.join(with_error(value.before, value.before_stderr)),
+            ' ± '.join(with_error(value.after, value.after_stderr)),
+        )
 
 
 def _remedy(cause: Cause) -> str:
@@ -210,15 +270,17 @@ def known_rows(known: Mapping[str, Compared]) -> Iterable[tuple[str, str, str, s
 
 
 def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
-    """Yield the table of causes: effect, size, p-value, held-out rms, gain, its class."""
+    """Yield the table of causes: effect, size, p-value, share, held-out rms, gain, its class."""
     for c in diagnosis.causes:
         rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
         same = ', '.join(c.indistinguishable_from) or '-'
         p_value = probability(c.p_value).removeprefix('p ').removeprefix('= ')
-        yield c.effect, size(diagnosis, c), p_value, rms, percent(c.gain), same
+        same += '' if c.survives else ' (not needed with another cause out)'
+        share = percent(c.share) if c.share else '-'
+        yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
 
 
-CAUSE_HEADER = ('cause', 'size', 'p', 'held-out rms px', 'gain', 'may as well be')
+CAUSE_HEADER = ('cause', 'size', 'p', 'share', 'held-out rms px', 'gain', 'may as well be')
 CAUSE_WORDS = ('size', 'may as well be')
 
 

@@ -20,15 +20,14 @@ _REFUSED = '#cbd5e1'
 def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     """What each step of the search explains, and how well held-out data are predicted after it."""
     steps = [step for step in diagnosis.trace if step.statistic > 0]
-    count = max(len(steps), len(diagnosis.causes) + 1)
-    misfit = float((diagnosis.before.residual**2).sum())
+    count = max(len(steps), len(diagnosis.causes) + 2)
     with picture(path, 9.2, 1.4 + 0.3 * count) as figure:
         left, right = figure.subplots(1, 2)
         left.barh(
-            [step.effect for step in steps], [100 * step.statistic / misfit for step in steps],
+            [step.effect[:40] for step in steps], [step.statistic for step in steps],
             color=[AFTER if step.accepted else _REFUSED for step in steps],
         )
-        left.set(xlabel='explains % of the misfit at the start', title='steps of the search')
+        left.set(xlabel='score statistic', title='steps of the search', xscale='log')
         left.plot([], [], 's', color=AFTER, label='accepted')
         left.plot([], [], 's', color=_REFUSED, label='refused')
         left.legend(loc='lower right', fontsize=8)
@@ -40,9 +39,10 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
 
 def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
     causes = [c for c in diagnosis.causes if math.isfinite(c.heldout_rms_px)]
-    names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes)]
-    rms = [diagnosis.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes)]
-    axis.barh(names, rms, color=[BEFORE, *[AFTER] * len(causes)], height=0.6)
+    names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes), '+ local offsets']
+    rms = [diagnosis.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes),
+           diagnosis.extended.heldout_rms_px]
+    axis.barh(names, rms, color=[BEFORE, *[AFTER] * (len(causes) + 1)], height=0.6)
     for place, value in enumerate(rms):
         axis.annotate(f' {value:.3f}', (value, place), va='center', fontsize=8.5)
     axis.axvline(math.sqrt(2) * diagnosis.noise_px, color=INK, ls=':', label='noise')

@@ -105,7 +105,18 @@ class TestFiles:
         e0 = cause['parameters']['e0']
         assert e0['unit'] == 'm'
         assert e0['value'] == pytest.approx(0.002, abs=5 * e0['stderr'])
+        assert cause['survives'] is True and 0 < cause['share'] < 1
         assert isinstance(found['remaining']['structure'], list)
+        parts = {part['name']: part for part in found['components']}
+        assert all(set(part) == {'name', 'stage', 'sd_px', 'share', 'named_share', 'p_value'}
+                   for part in parts.values())
+        assert {part['stage'] for part in parts.values()} <= {'lens', 'target', 'frame', 'noise'}
+        assert sum(part['share'] for part in parts.values()) == pytest.approx(1)
+        assert parts['named_lens']['named_share'] == pytest.approx(cause['share'])
+        assert parts['noise']['sd_px'] == pytest.approx(0.05, rel=0.1)
+        for fit in ('named', 'lens'):
+            assert set(found[fit]) == {'rms_px', 'heldout_rms_px'}
+        assert found['advice'][0]['gain'] > 0.5 and found['gross'] == []
         assert {tuple(entry) for entry in found['untestable']} == {('effect', 'why')}
         assert found['extended']['heldout_rms_px'] < 0.9 * found['base']['heldout_rms_px']
 
@@ -120,7 +131,7 @@ class TestFiles:
             figures.append(json.loads((tmp_path / 'localize.json').read_text())['rms_px'])
         found = document(output)
         assert figures[0] == pytest.approx(found['base']['rms_px'], rel=1e-3)
-        assert figures[1] == pytest.approx(found['extended']['rms_px'], rel=1e-3)
+        assert figures[1] == pytest.approx(found['named']['rms_px'], rel=5e-3)
         assert figures[1] < 0.9 * figures[0]
 
     def test_everything_means_the_extended_lens(self, output, tmp_path):
@@ -140,7 +151,7 @@ class TestFiles:
                                       given.numbers('frame', 'landmark', 'u', 'v'))
         assert not table.whole('outlier').any()
         found = document(output)
-        for side, fit in (('before', 'base'), ('after', 'extended')):
+        for side, fit in (('before', 'base'), ('after', 'named')):
             squares = (table.numbers(f'du_{side}', f'dv_{side}') ** 2).sum(axis=1)
             assert np.sqrt(squares.mean()) == pytest.approx(found[fit]['rms_px'])
         theta, distance = table.numbers('theta', 'range').T
@@ -223,7 +234,7 @@ class TestWords:
         left = [Structure('outliers', 0.0, 0.5), Structure('theta', 1e-9, 0.1),
                 Structure('range', 1e-9, 0.3)]
         wrong, gained, following = verdict_sentences(
-            replace(found, verdict='unexplained', causes=[], remaining=left))
+            replace(found, verdict='unexplained', causes=[], advice=[], remaining=left))
         assert 'depend on the distance of the landmark and the incidence angle' in wrong
         assert 'a few points lie far off' in wrong
         assert 'no extension improved on it' in gained

@@ -1,0 +1,102 @@
+"""What to do, in the order of what it brings; nothing that held-out data refute."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.budget import Component, stage_of
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.measured import Measured
+from fisheye_svp_ros.diagnosis.noise import VIEW
+from fisheye_svp_ros.diagnosis.residuals import standardised_squares
+from fisheye_svp_ros.diagnosis.search import Found
+
+_STANDS_OUT = 2.0  # times the typical one
+_MOST = 8
+
+
+@dataclass(frozen=True)
+class Advice:
+    """One thing to do: what, to which frames, landmarks and boards; gain: of held-out misfit."""
+
+    what: str
+    frames: list[int] = field(default_factory=list)
+    landmarks: list[int] = field(default_factory=list)
+    boards: list[int] = field(default_factory=list)
+    gain: float = 0.0
+
+
+def advise(
+    found: Found, causes: Sequence[Cause], measured: Measured, parts: Sequence[Component]
+) -> list[Advice]:
+    """Return what to do, what brings most first; parts: the random components that are there."""
+    gains = measured.gains()
+    advice = []
+    stages = {stage_of(cause.effect) for cause in causes}
+    if 'lens' in stages and gains['lens'].value > 0:
+        advice.append(Advice('solve with the extended lens file', gain=gains['lens'].value))
+    target = gains['named'].value - max(gains['lens'].value, 0.0)
+    if 'target' in stages and target > 0:
+        boards = sorted({b for c in causes if stage_of(c.effect) == 'target' for b in _boards(c)})
+        advice.append(Advice(
+            'measure the target again (the extended lens file corrects it for this target alone)',
+            boards=boards,
+            landmarks=[n for c in causes if c.effect == 'landmark_survey' for n in _landmarks(c)],
+            gain=target,
+        ))
+    if any(part.stage == 'target' for part in parts):
+        advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
+    advice += _frames(found)
+    advice += [
+        Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
+        if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
+    ]
+    # Advice without a figure keeps its order, after all that has one.
+    return sorted(advice, key=lambda one: -one.gain)
+
+
+def _boards(cause: Cause) -> list[int]:
+    heads = [name.partition('.')[0] for name in cause.parameters]
+    return [int(head[5:]) for head in heads if head.startswith('board') and head[5:].isdigit()]
+
+
+def _landmarks(cause: Cause) -> list[int]:
+    return list(dict.fromkeys(int(name.partition('.')[0]) for name in cause.parameters))
+
+
+def _local(measured: Measured, gain: float) -> list[Advice]:
+    """Return the landmarks whose predicted offsets stand out, where predicting them helps."""
+    far = np.linalg.norm(measured.local.offset, axis=1)
+    if gain <= 0 or not far.any():
+        return []
+    typical = float(np.median(far[far > 0]))
+    order = np.argsort(-far)[:_MOST]
+    chosen = [int(measured.local.landmark[i]) for i in order if far[i] > _STANDS_OUT * typical]
+    what = 'measure single landmarks: they lie off by more than the others'
+    return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
+
+
+def _frames(found: Found) -> list[Advice]:
+    """Return the frames that scatter more than the others, and views that are off as a whole."""
+    data = found.evidence.linear.data
+    squares = standardised_squares(found.fitted)
+    used = found.evidence.linear.used
+    size = squares.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
+    numbers = data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
+    bad = size > _STANDS_OUT * np.median(size)
+    advice = []
+    if bad.any():
+        order = np.flatnonzero(bad)[np.argsort(-size[bad])][:_MOST]
+        advice.append(Advice(
+            'take these photographs again: they scatter more than the others',
+            frames=[int(numbers[i]) for i in order],
+        ))
+    gross = found.gross
+    off = sorted({int(data.observations.frame[row]) for row, why in
+                  zip(gross.rows, gross.why, strict=True) if why == VIEW})
+    if off:
+        advice.append(Advice('look at these photographs: ' + VIEW, frames=off))
+    return advice

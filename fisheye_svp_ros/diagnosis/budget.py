@@ -1,0 +1,121 @@
+"""The variance budget: of so many px^2, how much is lens, target, frame and noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.components import component_traces
+from fisheye_svp_ros.diagnosis.evidence import Evidence, swept
+from fisheye_svp_ros.diagnosis.mixed import factored
+from fisheye_svp_ros.diagnosis.prediction import placed_terms
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
+from fisheye_svp_ros.diagnosis.reml import GONE
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+
+STAGES = ('lens', 'target', 'frame', 'noise')
+_OF_FRAMES = {'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
+              'dot_centroid', 'detector_bias'}
+_OF_STAGE = {'target': 'target', 'noise': 'noise'}
+
+
+class Component(NamedTuple):
+    """One part of the misfit.
+
+    sd_px: of a coordinate; share: of all, named_share: what of it has a name; p_value: of its
+    being there at all.
+    """
+
+    name: str
+    stage: str
+    sd_px: float
+    share: float
+    named_share: float
+    p_value: float
+
+
+def stage_of(effect: str) -> str:
+    """Return the stage of the budget that an effect belongs to."""
+    if effect in _OF_FRAMES:
+        return 'frame'
+    return _OF_STAGE.get(CATALOGUE[effect].stage, 'lens')
+
+
+def cause_squares(evidence: Evidence) -> dict[str, float]:
+    """Return the mean squared displacement of each cause, px^2, poses and intrinsics taken out.
+
+    What two causes do together is shared between them, so that the sum is what all of them do.
+    """
+    nothing = np.full(len(NAMES), GONE)
+    f = factored(
+        evidence.full.trimmed(nothing < GONE), nothing, evidence.variances.weight
+    )
+    terms = placed_terms(evidence)
+    first = evidence.own - sum(len(values) for _, _, values in terms)
+    left = swept(f.information, np.arange(first))[: evidence.own, : evidence.own]
+    every = np.zeros(evidence.own)
+    for _, columns, values in terms:
+        every[columns] = values * evidence.scale[columns]
+    parts = every * (left @ every) * _px2(evidence)
+    return {name: max(float(parts[columns].sum()), 0.0) for name, columns, _ in terms}
+
+
+def _px2(evidence: Evidence) -> float:
+    """Return the factor from whitened squares to px^2 a point."""
+    weight = evidence.linear.weight[evidence.linear.weight > 0]
+    return float(2 / evidence.full.rows * np.mean(1 / weight**2))
+
+
+def budget(
+    evidence: Evidence, p_values: Mapping[str, float], causes: Mapping[str, float]
+) -> list[Component]:
+    """Return all parts: of the catalogue (p-values by name), random components, noise.
+
+    p_values: of the random components that are there; causes: p-values of the named effects.
+    """
+    px, variances = _px2(evidence), evidence.variances
+    traces = component_traces(evidence.full, evidence.variances)
+    squares = cause_squares(evidence)
+    parts: list[tuple[str, str, float, bool, float]] = []
+    for stage in STAGES[:3]:
+        named = [name for name in squares if stage_of(name) == stage]
+        if named:
+            size = sum(squares[name] for name in named)
+            parts.append((f'named_{stage}', stage, size, True, min(causes[n] for n in named)))
+    for i, name in enumerate(NAMES):
+        if traces.get(name, 0.0) > 0:
+            size = float(variances.tau[i] ** 2 * traces[name]) * px
+            parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
+    freedom = evidence.full.rows - evidence.full.poses - evidence.own
+    parts.append(('noise', 'noise', variances.sigma**2 * freedom * px, False, 0.0))
+    total = sum(size for _, _, size, _, _ in parts)
+    return [
+        Component(name, stage, float(np.sqrt(size / 2)), size / total, named * size / total, p)
+        for name, stage, size, named, p in parts
+    ]
+
+
+def found_components(components: list[Component]) -> list[Component]:
+    """Return the random components that are there beyond chance."""
+    held = [c for c in components if c.name in STAGE_OF]
+    return [c for c in held if c.p_value * len(NAMES) < SIGNIFICANCE]
+
+
+def stage_shares(components: list[Component]) -> dict[str, tuple[float, float]]:
+    """Return the share of each stage and what of it has a name."""
+    return {
+        stage: (
+            sum(c.share for c in components if c.stage == stage),
+            sum(c.named_share for c in components if c.stage == stage),
+        )
+        for stage in STAGES
+    }
+
+
+def noise_px(evidence: Evidence) -> float:
+    """Return the standard deviation of the noise of one coordinate, px."""
+    weight = evidence.linear.weight[evidence.linear.weight > 0]
+    return float(evidence.variances.sigma * np.sqrt(np.mean(1 / weight**2)))

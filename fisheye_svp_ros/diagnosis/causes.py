@@ -1,0 +1,149 @@
+"""Causes: estimates with honest errors, what they may be mistaken for, whether they survive."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.choice import (
+    CLASS_SIGNIFICANCE,
+    CLASS_STRENGTH,
+    SIGNIFICANCE,
+    candidates,
+)
+from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse, swept
+from fisheye_svp_ros.diagnosis.prediction import placed_terms
+from fisheye_svp_ros.diagnosis.search import drop_test, restored
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+
+_GUARD = 0.99  # a jackknife so improbable under the model's own error takes its place
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One named cause with its parameters, evidence and what it may be mistaken for.
+
+    share: of the misfit of the simulation; survives: whether it is still needed with any one other
+    cause left out; heldout_rms_px, gain: of held-out frames once it is in the model.
+    """
+
+    effect: str
+    form: str
+    parameters: dict[str, dict[str, Any]]
+    p_value: float
+    share: float
+    survives: bool
+    heldout_rms_px: float
+    gain: float
+    indistinguishable_from: list[str]
+    to_separate: str
+
+
+def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
+    """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
+
+    From the information of the null model; where estimates without each part of the frames
+    scatter by more than that allows, from that scatter (jackknife).
+    NaN where the data leave a parameter open.
+    """
+    own = np.arange(evidence.own)
+    scale = evidence.scale[: evidence.own]
+    variance, open_ = _variances(evidence.information[np.ix_(own, own)])
+    errors = np.sqrt(variance) / scale
+    if jackknife and len(evidence.folds) > 2:
+        estimates = np.array([_step(f.information, own) for f in evidence.folds]) / scale
+        count = len(estimates)
+        squares = (count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(axis=0)
+        limit = stats.chi2.ppf(_GUARD, count - 1) / (count - 1)
+        errors = np.where(squares > limit * errors**2, np.sqrt(squares), errors)
+    return np.where(open_, np.nan, errors)
+
+
+def _step(information: Array, own: Index) -> Array:
+    inverse, _ = pseudo_inverse(information[np.ix_(own, own)], 1e-13)
+    return np.asarray(inverse @ information[own, -1])
+
+
+def _variances(information: Array) -> tuple[Array, Array]:
+    """Return the variances (K,) and which parameters the information leaves open."""
+    if not len(information):
+        return np.zeros(0), np.zeros(0, dtype=bool)
+    values, vectors = np.linalg.eigh(information)
+    kept = values > 1e-12 * max(float(values[-1]), 1e-300)
+    variance = ((vectors[:, kept] ** 2) / values[kept]).sum(axis=1)
+    return variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+
+
+def mean_causes(
+    evidence: Evidence, errors: Array, shares: dict[str, float],
+    held_out: Sequence[tuple[float, float]],
+) -> list[Cause]:
+    """Return the causes that move predictions; held_out: rms and gain once each is in."""
+    causes = []
+    placed = placed_terms(evidence)
+    terms = {effect.name: effect for effect, _ in evidence.linear.state.terms}
+    for (name, columns, values), (rms, gain) in zip(placed, held_out, strict=True):
+        effect = terms[name]
+        parameters = {
+            p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
+            for p, v, e in zip(effect.parameters, values, errors[columns], strict=True)
+        }
+        included = np.arange(evidence.own)
+        causes.append(Cause(
+            name, effect.key, parameters, drop_test(evidence, included, columns),
+            shares[name], _survives(evidence, columns), rms, gain,
+            _look_alikes(evidence, name, columns), effect.to_separate,
+        ))
+    return causes
+
+
+def _survives(evidence: Evidence, columns: Index) -> bool:
+    """Whether an effect is needed whichever one other cause is left out."""
+    factor = evidence.forms.names()
+    for _, other, _ in placed_terms(evidence):
+        if np.array_equal(other, columns):
+            continue
+        rest = np.setdiff1d(np.arange(evidence.own), np.concatenate([other, columns]))
+        information = restored(evidence, np.concatenate([other, columns]))
+        score = evidence.score(swept(information, rest), columns)
+        if evidence.confident(score, rest, columns).p_value * factor > SIGNIFICANCE:
+            return False
+    return True
+
+
+def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
+    """Return the effects with which in the model this one would no longer be needed."""
+    if name == LandmarkSurveyEffect.name:
+        return []
+    rest = np.setdiff1d(np.arange(evidence.own), columns)
+    information = restored(evidence, columns)
+    left = swept(information, rest)
+    strength = evidence.score(left, columns).statistic
+    known = {effect.name for effect, _ in evidence.linear.state.terms}
+    same: list[str] = []
+    for other in candidates(evidence, rest, information=information):
+        if other.effect.name in known or other.effect.name in same:
+            continue
+        if other.score.statistic < CLASS_STRENGTH * strength:
+            continue
+        both = np.concatenate([rest, evidence.columns_of(other.form)])
+        own = evidence.score(swept(information, both), columns)
+        if own.p_value > CLASS_SIGNIFICANCE:
+            same.append(other.effect.name)
+    return same
+
+
+def plain_cause(
+    name: str, parameters: dict[str, dict[str, Any]], p_value: float, share: float
+) -> Cause:
+    """Return a cause that moves no prediction: it lies in the table or in the noise."""
+    return Cause(
+        name, name, parameters, p_value, share, True, float('nan'), 0.0, [],
+        CATALOGUE[name].to_separate,
+    )

@@ -1,0 +1,188 @@
+"""Which effects: one at a time, by score test and by the prediction of held-out frames."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Score, pseudo_inverse, swept
+from fisheye_svp_ros.effects.base import Effect
+
+# False alarms: this much for all effects together, the same again for the random components.
+SIGNIFICANCE = 0.01
+# An effect is in the class of another unless, with it in the model, the other is still needed.
+CLASS_SIGNIFICANCE = 0.002
+CLASS_STRENGTH = 0.3
+_BETTER = 6.0  # by so much another effect must describe the data better to take a cause's place
+_ABSURD = 30.0  # times what would be a large value of a parameter
+_HELD_OUT = 1.0  # standard errors by which held-out frames must be predicted better
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One form of one effect with its test.
+
+    form: its place among the forms; corrected: the p-value times the numbers of effects and of
+    this effect's forms; merit: twice the gain in log likelihood less what so many parameters do
+    by chance (BIC).
+    """
+
+    form: int
+    effect: Effect
+    score: Score
+    corrected: float
+    merit: float
+
+
+@dataclass(frozen=True)
+class HeldOutGain:
+    """Gain in log predictive density of frames left out in turn, and its standard error."""
+
+    value: float
+    stderr: float
+
+    @property
+    def convincing(self) -> bool:
+        """Whether the gain is worth more than its error."""
+        return self.value > _HELD_OUT * self.stderr
+
+
+@dataclass(frozen=True)
+class Step:
+    """One line of the trace: what was tried, its evidence, and what came of it."""
+
+    effect: str
+    statistic: float
+    rank: int
+    p_value: float
+    corrected: float
+    held_out: float
+    held_out_stderr: float
+    accepted: bool
+    why: str
+
+
+def candidates(
+    evidence: Evidence, included: Index, information: Array | None = None
+) -> list[Candidate]:
+    """Return all forms, best merit first; information: in place of the evidence's own."""
+    left = swept(evidence.information if information is None else information, included)
+    found = []
+    for form, effect in enumerate(evidence.forms.effects):
+        columns = evidence.columns_of(form)
+        score = evidence.score(left, columns)
+        if not score.rank or _impossible(effect, score):
+            continue
+        found.append(_candidate(evidence, form, score))
+    return sorted(found, key=lambda candidate: -candidate.merit)
+
+
+def _candidate(evidence: Evidence, form: int, score: Score) -> Candidate:
+    effect, forms = evidence.forms.effects[form], evidence.forms
+    factor = forms.names() * forms.count[effect.name]
+    merit = score.statistic - score.rank * np.log(evidence.full.rows)
+    return Candidate(form, effect, score, min(1.0, score.p_value * factor), float(merit))
+
+
+def _impossible(effect: Effect, score: Score) -> bool:
+    """Whether a size comes out negative where only a positive one has a meaning, or is absurd.
+
+    A scale that poses take up all but entirely would have to be a hundred per cent.
+    """
+    sizes = list(zip(score.estimate, effect.parameters, strict=True))
+    if any(value < 0 for value, parameter in sizes if parameter.positive):
+        return True
+    return all(abs(value) > _ABSURD * parameter.large for value, parameter in sizes)
+
+
+def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:
+    """Yield what is significant, best merit first, the variances' uncertainty taken in."""
+    for candidate in candidates(evidence, included):
+        if candidate.corrected >= SIGNIFICANCE or candidate.merit <= 0:
+            continue
+        columns = evidence.columns_of(candidate.form)
+        sure = _candidate(
+            evidence, candidate.form, evidence.confident(candidate.score, included, columns)
+        )
+        if sure.corrected < SIGNIFICANCE:
+            yield sure
+
+
+def held_out_gain(
+    evidence: Evidence, included: Index, columns: Index, effect: Effect
+) -> HeldOutGain:
+    """Return what columns add to the log predictive density of frames left out in turn.
+
+    Of log p(all) - log p(all but a part); a wide normal prior keeps what a part does not tell.
+    """
+    prior = np.diag([1 / p.large**2 for p in effect.parameters]) / np.outer(
+        evidence.scale[columns], evidence.scale[columns]
+    )
+    everything = _marginal(evidence.information, included, columns, prior)
+    variance = evidence.variances.sigma**2
+    gains = np.array([
+        everything - _marginal(f.information / variance, included, columns, prior)
+        for f in evidence.folds
+    ])
+    count = len(gains)
+    stderr = float(gains.std(ddof=1) * np.sqrt(count)) if count > 1 else np.inf
+    return HeldOutGain(float(gains.sum()), stderr)
+
+
+def _marginal(information: Array, included: Index, columns: Index, prior: Array) -> float:
+    """Return what columns add to the log marginal likelihood, up to the prior's own constant."""
+    chosen = np.concatenate([included, columns, [len(information) - 1]])
+    left = swept(information[np.ix_(chosen, chosen)], np.arange(len(included)))
+    block = left[len(included) : -1, len(included) : -1] + prior
+    gradient = left[len(included) : -1, -1]
+    inverse, _ = pseudo_inverse(block, 1e-14)
+    return float(gradient @ inverse @ gradient - np.linalg.slogdet(block)[1]) / 2
+
+
+@dataclass
+class Choice:
+    """The forms that were chosen, in order, and the trace."""
+
+    forms: list[int]
+    trace: list[Step]
+
+
+def choose(
+    evidence: Evidence, included: Index, most: int, refused: Container[str], quick: bool
+) -> Choice:
+    """Add forms for as long as one is significant and predicts held-out frames better.
+
+    included: the border's columns in the model; refused: effects that are not asked again; quick:
+    do without held-out frames.
+    """
+    choice, failed = Choice([], []), set()
+    while len(choice.forms) < most:
+        best = next((
+            c for c in eligible(evidence, included)
+            if c.form not in failed and c.effect.name not in refused
+        ), None)
+        if best is None:
+            break
+        columns = evidence.columns_of(best.form)
+        gain = HeldOutGain(np.inf, 0.0)
+        if not (best.effect.per_frame or quick):
+            gain = held_out_gain(evidence, included, columns, best.effect)
+        choice.trace.append(_step(best, gain))
+        if gain.convincing:
+            included = np.concatenate([included, columns])
+            choice.forms.append(best.form)
+        else:
+            failed.add(best.form)
+    return choice
+
+
+def _step(candidate: Candidate, gain: HeldOutGain) -> Step:
+    score = candidate.score
+    why = 'significant and predicts better' if gain.convincing else 'does not predict better'
+    return Step(
+        candidate.effect.key, score.statistic, score.rank, score.p_value, candidate.corrected,
+        gain.value, gain.stderr, gain.convincing, why,
+    )

@@ -1,0 +1,138 @@
+"""Which random components the data call for: score tests of variances at zero, and REML."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.mixed import Equations, factored, solve
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.reml import (
+    GONE,
+    Variances,
+    estimate,
+    start_variances,
+    without,
+)
+
+_CALLED, _CALLED_LATE = 0.3, 0.01
+_LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
+_SHARE = 0.02
+_DOUBTFUL = (6.0, 100.0)  # likelihood ratios between which the other variances are found anew
+
+
+def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
+    """Return the variances of the components that the data call for.
+
+    eq: with the whole catalogue free in its border, of full rank, or a real effect would widen
+    the component that resembles it; before: variances of a similar state to start from.
+    """
+    first = start_variances(eq, _SHARE)
+    if before is None:
+        nothing = Variances(1.0, np.full(len(NAMES), GONE), first.weight)
+        p = score_components(eq, nothing, [n for n in NAMES if n not in _LATE])
+        lam = np.array([first.lam[i] if p.get(n, 1.0) < _CALLED else GONE
+                        for i, n in enumerate(NAMES)])
+        now = Variances(1.0, lam, first.weight)
+    else:
+        now = before
+    now, _ = estimate(eq, now)
+    missing = [n for n, there in zip(NAMES, now.alive, strict=True) if not there]
+    p = score_components(eq, now, missing)
+    lam = now.lam.copy()
+    for name in missing:
+        if p.get(name, 1.0) < _CALLED_LATE:
+            lam[NAMES.index(name)] = first.lam[NAMES.index(name)]
+    if (lam < GONE).sum() > now.alive.sum():
+        now, _ = estimate(eq, Variances(now.sigma, lam, now.weight))
+    return now
+
+
+def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[str, float]:
+    """Return p-values of variances at zero, for components that the data could hold.
+
+    The sum of squares of the columns' products with the residual against a gamma distribution of
+    the same mean and variance.  Source: Lin, Variance component testing in generalised linear
+    models with random effects, Biometrika 84 (1997).
+    """
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    solution = solve(f, spread=False)
+    change = np.append(-solution.values, 1.0)
+    found = {}
+    for name in names:
+        products = _products(eq, now, NAMES.index(name))
+        if products is None:
+            continue
+        own, ge, gr, gx = products
+        pull = gx.T @ change - np.einsum('ekc,ek->c', ge, solution.e) - gr.T @ solution.r
+        left = own - f.taken(ge, gr, gx[:-1])
+        mean, spread = float(np.trace(left)), 2 * float((left**2).sum())
+        size = float(pull @ pull) / solution.variance
+        if mean > 1e-9 and spread > 0:
+            found[name] = float(stats.gamma.sf(size, mean**2 / spread, scale=spread / mean))
+    return found
+
+
+def component_traces(eq: Equations, now: Variances) -> dict[str, float]:
+    """Return what each component that is there adds per unit of its variance, poses out.
+
+    Sums of squares of its columns once poses are projected out, landmarks by their weights.
+    """
+    nothing = np.full(len(NAMES), GONE)
+    f = factored(eq.trimmed(nothing < GONE), nothing, now.weight)
+    found = {}
+    for name, there in zip(NAMES, now.alive, strict=True):
+        products = _products(eq, Variances(1.0, nothing, now.weight), NAMES.index(name))
+        if there and products is not None:
+            own, ge, gr, _ = products
+            found[name] = float(np.trace(own) - np.trace(f.taken(ge, gr, None)))
+    return found
+
+
+def _products(
+    eq: Equations, now: Variances, kind: int
+) -> tuple[Array, Array, Array, Array] | None:
+    """Return the products of a component's columns with themselves and all that is there."""
+    b = eq.blocks
+    keep, columns, rest = eq.kept(now.alive)
+    in_r = np.flatnonzero(b.r_label == kind)
+    if len(in_r):
+        ge = b.er[keep][:, columns][..., in_r]
+        return b.rr[np.ix_(in_r, in_r)], ge, b.rr[np.ix_(rest, in_r)], b.rx[in_r].T
+    block, column = np.nonzero(b.e_label == kind)
+    if not len(block):
+        return None
+    same = block[:, None] == block
+    own = np.where(same, b.ee[block[:, None], column[:, None], column], 0.0)
+    ge = np.zeros((int(keep.sum()), int(columns.sum()), len(block)))
+    place = np.cumsum(keep) - 1
+    at = np.flatnonzero(keep[block])
+    chosen = np.flatnonzero(columns)
+    ge[place[block[at]], :, at] = b.ee[block[at][:, None], chosen, column[at][:, None]]
+    return own, ge, b.er[block, column][:, rest].T, b.ex[block, column].T
+
+
+def significance(eq: Equations, now: Variances) -> dict[str, float]:
+    """Return p-values of the components that are there, each by leaving it out.
+
+    Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
+    JASA 82 (1987)); the other variances follow.
+    """
+    full = _deviance(eq, now)
+    found = {}
+    for name, there in zip(NAMES, now.alive, strict=True):
+        if not there:
+            continue
+        rest = without(now, name)
+        ratio = _deviance(eq, rest) - full
+        # The other variances only ever take up a part of it.
+        if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
+            rest, _ = estimate(eq, rest, steps=2)
+            ratio = _deviance(eq, rest) - full
+        found[name] = float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
+    return found
+
+
+def _deviance(eq: Equations, now: Variances) -> float:
+    return solve(factored(eq.trimmed(now.alive), now.lam, now.weight), spread=False).deviance

@@ -1,0 +1,209 @@
+"""What every effect explains beside the random parts of the null model: generalised score tests.
+
+One factorisation serves all: poses and random parts are eliminated, what is left is a small
+information matrix of everything fixed, the forms of the catalogue among it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
+from fisheye_svp_ros.diagnosis.components import find_variances
+from fisheye_svp_ros.diagnosis.fields import mean_fields
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored, less_frames
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
+from fisheye_svp_ros.diagnosis.random_effects import Design, design
+from fisheye_svp_ros.diagnosis.reml import Variances
+
+IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
+FOLDS = 5
+
+
+class Score(NamedTuple):
+    """A score test: statistic, rank, p-value, estimate (P,), degrees of freedom of its scale."""
+
+    statistic: float
+    rank: int
+    p_value: float
+    estimate: Array
+    freedom: float
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A linearised state with its null model and everything that could be added to it.
+
+    scale (X,): norms that the border's columns were divided by: what is in the model (the first
+    `own` of them), then the forms, then probes (`fields`); full: equations of all of them and
+    all components.
+    """
+
+    linear: Linearised
+    forms: Forms
+    design: Design
+    full: Equations
+    variances: Variances
+    own: int
+    scale: Array
+    border: Array
+    probes: dict[str, Index]
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The equations of the components that are there."""
+        return self.full.trimmed(self.variances.alive)
+
+    @cached_property
+    def factored(self) -> Factored:
+        """The equations of the components that are there, factored."""
+        return factored(self.equations, self.variances.lam, self.variances.weight)
+
+    @cached_property
+    def information(self) -> Array:
+        """Information (X + 1, X + 1) of the border, its last row and column the gradient."""
+        return self.factored.information / self.variances.sigma**2
+
+    @cached_property
+    def folds(self) -> list[Factored]:
+        """The equations without each part of the frames, factored."""
+        alive = self.design.kept(self.variances.alive)
+        found = []
+        part = frame_folds(self.linear.data.frames)
+        for fold in range(int(part.max()) + 1):
+            out = np.flatnonzero(part == fold)
+            own = equations(alive, self.linear.frame_columns, self.border, self.full, out)
+            eq = less_frames(self.equations, own.trimmed(self.variances.alive), out)
+            found.append(factored(eq, self.variances.lam, self.variances.weight))
+        return found
+
+    @cached_property
+    def untestable(self) -> dict[str, str]:
+        """Effects that the data cannot test, and why."""
+        left = swept(self.information, np.arange(self.own))
+        ranks: dict[str, int] = {}
+        for form, effect in enumerate(self.forms.effects):
+            rank = self.score(left, self.columns_of(form)).rank
+            ranks[effect.name] = max(rank, ranks.get(effect.name, 0))
+        taken = 'what it would do is taken up by what is free already'
+        return self.forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
+
+    def columns_of(self, form: int) -> Index:
+        """Return the border's columns of a form."""
+        at = self.forms.at[form]
+        return np.arange(at.start, at.stop) + self.own
+
+    def score(self, left: Array, columns: Index) -> Score:
+        """Test columns by the information `left` once what is in the model is swept out."""
+        block, gradient = left[np.ix_(columns, columns)], left[columns, -1]
+        # A normalised column alone has information 1 / sigma^2.
+        inverse, rank = pseudo_inverse(
+            block, least=IDENTIFIABLE / self.variances.sigma**2
+        )
+        estimate = inverse @ gradient
+        statistic = float(estimate @ gradient)
+        p = float(stats.chi2.sf(statistic, rank)) if rank else 1.0
+        return Score(statistic, rank, p, estimate / self.scale[columns], np.inf)
+
+    def confident(self, score: Score, included: Index, columns: Index) -> Score:
+        """Return the score with what the uncertainty of the variances does to its p-value.
+
+        F test with Satterthwaite's degrees of freedom, of the direction that was estimated.
+        """
+        covariance = self.variances.covariance
+        if covariance is None or not score.rank:
+            return score
+        freedom = self._freedom(score.estimate * self.scale[columns], included, columns)
+        p = float(stats.f.sf(score.statistic / score.rank, score.rank, freedom))
+        return score._replace(p_value=p, freedom=freedom)
+
+    def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
+        info, f = self.factored.information, self.factored
+        inside, _ = pseudo_inverse(info[np.ix_(included, included)])
+        way = np.zeros(len(info))
+        way[columns] = estimate
+        way[included] -= inside @ (info[np.ix_(included, columns)] @ estimate)
+        size = float(way @ info @ way)
+        e, r = f.coefficients(way)
+        shares = f.shares(e, r) / max(size, 1e-300)
+        slope = -np.append(shares, 1 - shares.sum())
+        assert self.variances.covariance is not None
+        spread = float(slope @ self.variances.covariance @ slope)
+        return float(np.clip(2 / max(spread, 1e-9), 2.0, 1e6))
+
+
+def frame_folds(frames: int) -> Index:
+    """Return the part (F,) that each frame belongs to."""
+    return np.arange(frames) % min(FOLDS, frames)
+
+
+def gather_evidence(
+    data: Data, state: State, free: Sequence[str], before: Variances | None = None,
+    left_out: Sequence[str] = (),
+) -> Evidence:
+    """Linearise a state, find the variances of its null model, multiply out all forms."""
+    linear = Linearised(data, state, free)
+    forms = forms_of(linear, left_out)
+    fields = mean_fields(linear)
+    columns = np.concatenate([linear.shared_columns, forms.columns, *fields.values()], axis=-1)
+    scale = np.sqrt((columns**2).sum(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
+    random = design(linear)
+    full = equations(random, linear.frame_columns, border)
+    own = linear.shared_columns.shape[-1]
+    free_ones = np.concatenate([np.arange(own), own + forms.generic])
+    basis = identifiable(linear.frame_columns, border[..., :-1], free_ones)
+    variances = find_variances(full.bordered(basis), before)
+    probes, at = {}, own + forms.columns.shape[-1]
+    for name, field in fields.items():
+        probes[name] = np.arange(at, at + field.shape[-1])
+        at += field.shape[-1]
+    return Evidence(linear, forms, random, full, variances, own, scale, border, probes)
+
+
+def identifiable(pose: Array, columns: Array, chosen: Index) -> Array:
+    """Return combinations (K, m) of chosen columns (F, M, K), orthonormal once poses are out."""
+    part = columns[..., chosen]
+    q = block_basis(pose)
+    clean = part - q @ (np.swapaxes(q, -1, -2) @ part)
+    flat = flat_rows(clean)
+    values, vectors = np.linalg.eigh(flat.T @ flat)
+    kept = values > IDENTIFIABLE
+    basis = np.zeros((columns.shape[-1], int(kept.sum())))
+    basis[chosen] = vectors[:, kept] / np.sqrt(values[kept])
+    return basis
+
+
+def pseudo_inverse(
+    matrix: Array, floor: float = IDENTIFIABLE, least: float = 1e-300
+) -> tuple[Array, int]:
+    """Return the pseudoinverse of a symmetric matrix and its rank.
+
+    floor: of its largest eigenvalue, and least: below which an eigenvalue is taken as nothing.
+    """
+    if not len(matrix):
+        return matrix, 0
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    kept = values > max(floor * float(values[-1]), least)
+    return (vectors[:, kept] / values[kept]) @ vectors[:, kept].T, int(kept.sum())
+
+
+def swept(information: Array, included: Index) -> Array:
+    """Return the information with what is included swept out."""
+    inverse, _ = pseudo_inverse(information[np.ix_(included, included)])
+    return np.asarray(information - information[:, included] @ inverse @ information[included])
+
+
+def block_basis(columns: Array) -> Array:
+    """Orthonormal bases (B, M, 6) of each block's columns; zero columns where rank is missing."""
+    scale = np.sqrt((columns**2).sum(axis=1, keepdims=True))
+    u, s, _ = np.linalg.svd(columns / np.maximum(scale, 1e-300), full_matrices=False)
+    return np.asarray(u * (s > 1e-9)[:, None, :])

@@ -1,0 +1,204 @@
+"""What a search found, measured: budget, errors, prediction of held-out frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.budget import (
+    Component,
+    budget,
+    cause_squares,
+    noise_px,
+    stage_of,
+)
+from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
+from fisheye_svp_ros.diagnosis.components import significance
+from fisheye_svp_ros.diagnosis.evidence import identifiable
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, fit, prepare, start_poses
+from fisheye_svp_ros.diagnosis.noise import find_gross_errors
+from fisheye_svp_ros.diagnosis.prediction import (
+    Gain,
+    HeldOut,
+    frames_in_turn,
+    gain_between,
+    on_other_data,
+    placed_terms,
+    without_causes,
+)
+from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
+from fisheye_svp_ros.diagnosis.residuals import conditional_residuals
+from fisheye_svp_ros.diagnosis.search import Found, drop_test
+from fisheye_svp_ros.scene.observations import Observations
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a model describes the data it was fitted to and the data held out."""
+
+    rms_px: float
+    heldout_rms_px: float
+    chi2_per_dof: float | None = None
+
+
+@dataclass(frozen=True)
+class Intrinsic:
+    """One intrinsic before and after, each with its standard error under the null model."""
+
+    before: float
+    before_stderr: float
+    after: float
+    after_stderr: float
+
+
+class Measured:
+    """Figures of what was found; held_out: other frames, None for frames left out in turn."""
+
+    def __init__(
+        self, found: Found, free: Sequence[str], held_out: Observations | None, quick: bool
+    ) -> None:
+        self.found, self.free, self.quick = found, tuple(free), quick
+        self.evidence = found.evidence
+        self.noise = noise_px(found.evidence)
+        self.names = [e.name for e, _ in found.state.terms if e.stage != 'noise']
+        self.local: Local = local_offsets(found.fitted)
+        self.test: Data | None = None
+        if held_out is not None:
+            # Held-out outliers are no measure of a model.
+            test = prepare(held_out)
+            self.test, _ = find_gross_errors(test, start_poses(test, found.base.linear.state))
+
+    @cached_property
+    def errors(self) -> Array:
+        """Standard errors of all that is shared."""
+        return standard_errors(self.evidence, not self.quick)
+
+    def held_out(self, without: Sequence[str] = (), local: bool = False) -> HeldOut:
+        """Predict held-out frames without some causes, with or without local offsets."""
+        if self.test is None:
+            return frames_in_turn(self.evidence, without, local)
+        if set(without) >= set(self.names):
+            state = self.found.base.linear.state
+        elif without:
+            state = without_causes(self.evidence, without, self.free)
+        else:
+            state = self.found.state
+        return on_other_data(self.test, state, self.local if local else None)
+
+    @cached_property
+    def _base(self) -> HeldOut:
+        return self.held_out(self.names)
+
+    @cached_property
+    def _prefixes(self) -> list[HeldOut]:
+        """Predictions with the first 0, 1, ... causes."""
+        return [self._base, *(
+            self.held_out(self.names[i + 1 :]) for i in range(len(self.names))
+        )]
+
+    @cached_property
+    def _best(self) -> HeldOut:
+        return self.held_out(local=True)
+
+    @cached_property
+    def _lens(self) -> HeldOut:
+        return self.held_out(self._elsewhere)
+
+    @property
+    def _elsewhere(self) -> list[str]:
+        return [name for name in self.names if stage_of(name) != 'lens']
+
+    @property
+    def base(self) -> Fit:
+        """The simulation as it was fitted."""
+        linear = self.found.base.linear
+        freedom = self.evidence.full.rows - self.evidence.full.poses - len(self.free)
+        chi2 = float((linear.residual**2).sum()) / max(freedom, 1)
+        return Fit(rms_px(linear, linear.residual), self._base.rms, chi2)
+
+    @property
+    def named(self) -> Fit:
+        """All causes, without local offsets."""
+        linear = self.evidence.linear
+        return Fit(rms_px(linear, linear.residual), self._prefixes[-1].rms)
+
+    @property
+    def lens_only(self) -> Fit:
+        """Only what moves with the lens, fitted without the rest."""
+        linear = self.found.base.linear
+        if set(self._elsewhere) < set(self.names):
+            state = without_causes(self.evidence, self._elsewhere, self.free)
+            data = self.evidence.linear.data
+            linear = Linearised(data, fit(data, state, self.free), self.free)
+        return Fit(rms_px(linear, linear.residual), self._lens.rms)
+
+    @property
+    def extended(self) -> Fit:
+        """Causes and predicted local offsets."""
+        left = conditional_residuals(self.found.fitted)
+        chi2 = float((left**2).sum()) / self.evidence.variances.sigma**2 / self.evidence.full.rows
+        return Fit(rms_px(self.evidence.linear, left), self._best.rms, chi2)
+
+    @property
+    def gain(self) -> Gain:
+        """Of the best prediction over the simulation."""
+        return gain_between(self._base, self._best, self.noise)
+
+    def gains(self) -> dict[str, Gain]:
+        """Return what the lens alone, and then the target and its offsets, gain."""
+        return {
+            'lens': gain_between(self._base, self._lens, self.noise),
+            'named': gain_between(self._base, self._prefixes[-1], self.noise),
+            'local': gain_between(self._prefixes[-1], self._best, self.noise),
+        }
+
+    def causes(self, components: Sequence[Component]) -> list[Cause]:
+        """Return the causes that move predictions, with what each adds."""
+        squares = cause_squares(self.evidence)
+        named = sum(c.share for c in components if c.named_share)
+        total = sum(squares.values())
+        shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
+        held_out = [
+            (after.rms, gain_between(before, after, self.noise).value)
+            for before, after in zip(self._prefixes, self._prefixes[1:], strict=False)
+        ]
+        return mean_causes(self.evidence, self.errors, shares, held_out)
+
+    def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
+        """Return the variance budget; noise_causes: p-values of causes in the noise."""
+        evidence = self.evidence
+        own = np.arange(evidence.own)
+        eq = evidence.full.bordered(
+            identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
+        )
+        p_values = significance(eq, evidence.variances)
+        found = {name: drop_test(evidence, own, columns)
+                 for name, columns, _ in placed_terms(evidence)}
+        return budget(evidence, p_values, found | dict(noise_causes))
+
+    @property
+    def intrinsics(self) -> dict[str, Intrinsic]:
+        """Free intrinsics before and after, with errors under the null model."""
+        base = self.found.base
+        before = standard_errors(base, jackknife=False)
+        rig = base.own - len(self.free) - sum(
+            len(values) for effect, values in base.linear.state.terms if effect.stage != 'noise'
+        )
+        was, now = base.linear.state.lens.parameters, self.found.state.lens.parameters
+        return {
+            name: Intrinsic(
+                was[name], float(before[rig + i]), now[name], float(self.errors[rig + i])
+            )
+            for i, name in enumerate(self.free)
+        }
+
+
+def rms_px(linear: Linearised, whitened: Array) -> float:
+    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M)."""
+    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+    used = weight > 0
+    return float(np.sqrt(2 * np.mean((whitened[used] / weight[used]) ** 2)))

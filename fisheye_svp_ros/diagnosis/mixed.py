@@ -1,0 +1,443 @@
+"""Henderson's mixed-model equations of a linearised state, solved block by block.
+
+Rows are whitened; all matrices are in units of the noise variance, so the prior precision of a
+coefficient is lambda = sigma^2 / tau^2.  Poses (fixed) and what single frames have of their own
+make one block a frame, the offsets of a landmark one block of three; the larger of the two sets is
+eliminated in a batch, the rest is one dense matrix.
+Source: Henderson, Best linear unbiased estimation and prediction under a selection model,
+Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), chapter 7.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design
+
+FIXED, ABSENT = -1, -2  # labels: without a prior; not there
+_RIDGE = 1e-10  # of a pose's normalised columns: known poses have none
+_NEVER = 1e12
+
+
+class Blocks(NamedTuple):
+    """Products of columns: e, the E blocks of k eliminated coefficients; r, the rest; x, border.
+
+    ee (E, k, k), er (E, k, R), rr (R, R), ex (E, k, X), rx (R, X), xx (X, X); e_label (E, k),
+    r_label (R,): components.  The border is fixed columns and, last, the residual itself.
+    """
+
+    ee: Array
+    er: Array
+    rr: Array
+    ex: Array
+    rx: Array
+    xx: Array
+    e_label: Index
+    r_label: Index
+
+
+@dataclass(frozen=True)
+class Equations:
+    """The mixed-model equations before any variance is known.
+
+    by_frame: whether frames are the eliminated blocks; rows: numbers in the residual; poses: fixed
+    coefficients of the frames; pose_scale (F, 6): norms that pose columns were divided by; width:
+    coefficients of one frame; landmarks: those that have offsets.
+    """
+
+    blocks: Blocks
+    by_frame: bool
+    rows: int
+    poses: int
+    pose_scale: Array
+    width: int
+    landmarks: Index
+
+    def bordered(self, basis: Array) -> Equations:
+        """Return the equations with combinations (X - 1, m) of the fixed columns as border."""
+        full = linalg.block_diag(basis, np.eye(1))
+        b = self.blocks
+        parts = b._replace(ex=b.ex @ full, rx=b.rx @ full, xx=full.T @ b.xx @ full)
+        return replace(self, blocks=parts)
+
+    def kept(self, alive: Mask) -> tuple[Mask, Mask, Mask]:
+        """Return which blocks (E,), columns of them (k,) and of the rest (R,) are there.
+
+        alive: the components that are; a landmark keeps its three places if it has any.
+        """
+        b, known = self.blocks, np.concatenate([alive, [False, True]])
+        rest = known[b.r_label]
+        if not self.by_frame:
+            return np.asarray(known[b.e_label].any(axis=1)), np.ones(3, dtype=bool), rest
+        own = rest[len(rest) - 3 * len(self.landmarks) :].reshape(-1, 3).any(axis=1)
+        rest[len(rest) - 3 * len(self.landmarks) :] = np.repeat(own, 3)
+        return np.ones(len(b.ee), dtype=bool), known[b.e_label[0]], rest
+
+    def trimmed(self, alive: Mask) -> Equations:
+        """Return the equations without the coefficients of some components."""
+        b, known = self.blocks, np.concatenate([alive, [False, True]])
+        blocks, e, r = self.kept(alive)
+        if self.by_frame:
+            width = int(e.sum())
+            left = r[len(r) - 3 * len(self.landmarks) :].reshape(-1, 3).any(axis=1)
+        else:
+            width = int(r[: len(self.pose_scale) * self.width].sum()) // len(self.pose_scale)
+            left = blocks
+        parts = Blocks(
+            b.ee[blocks][:, e][..., e], b.er[blocks][:, e][..., r], b.rr[np.ix_(r, r)],
+            b.ex[blocks][:, e], b.rx[r], b.xx,
+            np.where(known[b.e_label], b.e_label, ABSENT)[blocks][:, e],
+            np.where(known[b.r_label], b.r_label, ABSENT)[r],
+        )
+        return replace(self, blocks=parts, width=width, landmarks=self.landmarks[left])
+
+    def times(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
+        """Multiply coefficients (E, k, C), (R, C): products with blocks, rest and border."""
+        b = self.blocks
+        flat = e.reshape(-1, e.shape[-1])
+        return (
+            b.ee @ e + b.er @ r,
+            b.er.reshape(len(flat), len(r)).T @ flat + b.rr @ r,
+            b.ex.reshape(len(flat), len(b.xx)).T @ flat + b.rx.T @ r,
+        )
+
+    def sorted(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
+        """Sort coefficients (E, k), (R,): by frame (F, b), by landmark (L, 3), shared (Q,)."""
+        if self.by_frame:
+            count = len(r) - 3 * len(self.landmarks)
+            return e, r[count:].reshape(-1, 3), r[:count]
+        count = len(self.pose_scale) * self.width
+        return r[:count].reshape(-1, self.width), e, r[count:]
+
+
+def equations(
+    design: Design, pose: Array, border: Array, like: Equations | None = None,
+    frames: Index | None = None,
+) -> Equations:
+    """Multiply out the columns of a design, of poses (F, M, 6) and of a border (F, M, X).
+
+    frames: those that count; like: equations of the same frames, to arrange these like them.
+    """
+    scale = np.sqrt((pose**2).sum(axis=1)) if like is None else like.pose_scale
+    scale = np.where(scale < 1e-9, np.inf, scale)
+    chosen = np.arange(len(pose)) if frames is None else frames
+    products = _products(design, pose / scale[:, None], border, chosen)
+    width = products.ff.shape[-1]
+    l_label = np.where(design.landmark_label < 0, ABSENT, design.landmark_label)
+    by_frame = len(pose) * width >= l_label.size if like is None else like.by_frame
+    f_label = np.concatenate([np.full(6, FIXED), design.frame_label])
+    blocks = _arranged(
+        products, np.broadcast_to(f_label, (len(pose), width)), l_label, design.shared_label,
+        by_frame,
+    )
+    filled = (np.abs(pose).sum(axis=-1) + np.abs(border).sum(axis=-1))[chosen] > 0
+    poses = int(np.isfinite(scale).sum())
+    found = Equations(
+        blocks, by_frame, int(filled.sum()), poses, scale, width, np.arange(len(l_label))
+    )
+    return found if frames is not None else _held(found, np.where(np.isfinite(scale), _RIDGE, 1.0))
+
+
+def less_frames(eq: Equations, part: Equations, frames: Index) -> Equations:
+    """Return equations without some frames, whose own equations are `part`."""
+    b, c = eq.blocks, part.blocks
+    left = Blocks(
+        b.ee - c.ee, b.er - c.er, b.rr - c.rr, b.ex - c.ex, b.rx - c.rx, b.xx - c.xx,
+        b.e_label, b.r_label,
+    )
+    # Poses that no row depends on any more stay where they are.
+    ridge = np.zeros(eq.pose_scale.shape)
+    ridge[frames] = 1.0
+    return _held(replace(eq, blocks=left), ridge)
+
+
+def _held(eq: Equations, ridge: Array) -> Equations:
+    """Add a ridge (F, 6) to the poses."""
+    b, six = eq.blocks, np.arange(6)
+    if eq.by_frame:
+        ee = b.ee.copy()
+        ee[:, six, six] += ridge
+        return replace(eq, blocks=b._replace(ee=ee))
+    rr = b.rr.copy()
+    at = (np.arange(len(ridge))[:, None] * eq.width + six).ravel()
+    rr[at, at] += ridge.ravel()
+    return replace(eq, blocks=b._replace(rr=rr))
+
+
+class _Products(NamedTuple):
+    """Products of columns by frame (f), landmark (l), shared (s) and border (x)."""
+
+    ff: Array
+    ll: Array
+    lf: Array
+    ss: Array
+    sf: Array
+    ls: Array
+    fx: Array
+    lx: Array
+    sx: Array
+    xx: Array
+
+
+def _products(design: Design, pose: Array, border: Array, frames: Index) -> _Products:
+    """Multiply out some frames; the other frames' blocks are zero."""
+    count, height, _ = pose.shape
+    labels = design.landmark_label
+    landmarks, shared, edge = len(labels), design.shared.shape[1], border.shape[-1]
+    width = 6 + design.frame.shape[-1]
+    p = _Products(
+        np.zeros((count, width, width)), np.zeros((landmarks, 3, 3)),
+        np.zeros((landmarks, 3, count, width)), np.zeros((shared, shared)),
+        np.zeros((shared, count, width)), np.zeros((landmarks, 3, shared)),
+        np.zeros((count, width, edge)), np.zeros((landmarks, 3, edge)), np.zeros((shared, edge)),
+        np.zeros((edge, edge)),
+    )
+    offsets = bool((labels >= 0).any())
+    for f in frames:
+        own = np.concatenate([pose[f], design.frame[f]], axis=-1)
+        s = design.shared[f * height : (f + 1) * height].toarray()
+        p.ff[f], p.fx[f] = own.T @ own, own.T @ border[f]
+        p.ss[:] += s.T @ s
+        p.sf[:, f], p.sx[:] = s.T @ own, p.sx + s.T @ border[f]
+        p.xx[:] += border[f].T @ border[f]
+        n = np.flatnonzero(design.slot[f] >= 0)
+        if not offsets or not len(n):
+            continue
+        slot = design.slot[f, n]
+        place = np.where(labels[slot][:, None] >= 0, design.place[f, n], 0.0)
+        across = np.swapaxes(place, -1, -2)
+        pairs = (2 * n[:, None] + np.arange(2)).ravel()
+        all_rows = np.concatenate([own, border[f], s], axis=-1)
+        crossed = across @ all_rows[pairs].reshape(len(n), 2, -1)
+        for first in _once(slot):  # two cameras see a landmark twice
+            at, part = slot[first], crossed[first]
+            p.ll[at] += (across @ place)[first]
+            p.lf[at, :, f] += part[..., :width]
+            p.lx[at] += part[..., width : width + edge]
+            p.ls[at] += part[..., width + edge :]
+    return p
+
+
+def _once(slot: Index) -> list[Index]:
+    """Return groups of places in `slot` in each of which every value stands once."""
+    groups, left = [], np.arange(len(slot))
+    while len(left):
+        first = np.unique(slot[left], return_index=True)[1]
+        groups.append(left[first])
+        left = np.delete(left, first)
+    return groups
+
+
+def _arranged(
+    p: _Products, f_label: Index, l_label: Index, s_label: Index, by_frame: bool
+) -> Blocks:
+    """Put the products in their places as blocks and rest."""
+    count, width, edge = p.fx.shape
+    landmarks = len(p.ll)
+    if by_frame:
+        by_landmark = np.moveaxis(p.lf, (2, 3), (0, 1)).reshape(count, width, 3 * landmarks)
+        er = np.concatenate([np.moveaxis(p.sf, 0, -1), by_landmark], axis=-1)
+        rr = _assembled(p.ss, p.ls.reshape(3 * landmarks, -1).T, p.ll, False)
+        rx = np.concatenate([p.sx, p.lx.reshape(3 * landmarks, edge)])
+        label = np.concatenate([s_label, l_label.ravel()])
+        return Blocks(p.ff, er, rr, p.fx, rx, p.xx, f_label, label)
+    by_frames = p.lf.reshape(landmarks, 3, count * width)
+    er = np.concatenate([by_frames, p.ls], axis=-1)
+    rr = _assembled(p.ss, p.sf.reshape(len(p.ss), count * width), p.ff, True)
+    rx = np.concatenate([p.fx.reshape(count * width, edge), p.sx])
+    label = np.concatenate([f_label.ravel(), s_label])
+    return Blocks(p.ll, er, rr, p.lx, rx, p.xx, l_label, label)
+
+
+def _assembled(shared: Array, crossed: Array, blocks: Array, blocks_first: bool) -> Array:
+    """Return one matrix of shared products (Q, Q), crossed (Q, E k) and diagonal blocks."""
+    count, width = blocks.shape[:2]
+    diagonal = np.zeros((count, width, count, width))
+    diagonal[np.arange(count), :, np.arange(count)] = blocks
+    flat = diagonal.reshape(count * width, count * width)
+    parts = [[flat, crossed.T], [crossed, shared]]
+    if not blocks_first:
+        parts = [row[::-1] for row in parts[::-1]]
+    return np.block(parts)
+
+
+@dataclass(frozen=True)
+class Factored:
+    """The equations with given variances, factored.
+
+    inverse (E, k, k): of the blocks' Cholesky factors; coupled (E, k, R), block_border (E, k, X),
+    border (R, X): right-hand sides after their forward substitution; factor (R, R), lower;
+    information (X, X): of the border, everything else eliminated.
+    """
+
+    equations: Equations
+    precision: tuple[Array, Array]
+    inverse: Array
+    coupled: Array
+    block_border: Array
+    factor: Array
+    border: Array
+    information: Array
+
+    def coefficients(self, way: Array) -> tuple[Array, Array]:
+        """Return the coefficients (E, k), (R,) that follow a combination (X,) of the border."""
+        r = _back(self.factor, self.border @ way)
+        right = self.block_border @ way - self.coupled @ r
+        return (np.swapaxes(self.inverse, -1, -2) @ right[..., None])[..., 0], r
+
+    def solved(self, e: Array, r: Array, x: Array) -> tuple[Array, Array, Array]:
+        """Return the coefficients (E, k, C), (R, C), (X, C) of vectors with such products."""
+        first = self.inverse @ e
+        flat = first.reshape(-1, first.shape[-1])
+        second = r - self.coupled.reshape(len(flat), len(r)).T @ flat
+        if len(second):
+            second = linalg.solve_triangular(self.factor, second, lower=True, check_finite=False)
+        bent = self.block_border.reshape(len(flat), len(x) + 1)[:, :-1]
+        third = x - bent.T @ flat - self.border[:, :-1].T @ second
+        values = linalg.solve(self.information[:-1, :-1], third, assume_a='pos')
+        rest = _back(self.factor, second - self.border[:, :-1] @ values)
+        right = first - self.block_border[..., :-1] @ values - self.coupled @ rest
+        return np.swapaxes(self.inverse, -1, -2) @ right, rest, values
+
+    def shares(self, e: Array, r: Array) -> Array:
+        """Return the squares of coefficients over their prior variances, by component."""
+        b = self.equations.blocks
+        label = np.concatenate([b.e_label.ravel(), b.r_label])
+        squares = np.concatenate([(self.precision[0] * e**2).ravel(), self.precision[1] * r**2])
+        mine = label >= 0
+        return np.asarray(
+            np.bincount(label[mine], weights=squares[mine], minlength=len(NAMES)), dtype=float
+        )
+
+    def taken(self, e: Array, r: Array, x: Array | None) -> Array:
+        """Return v' A (A' A + D)^-1 A' v (C, C) of vectors v.
+
+        e (E, k, C), r (R, C): their products with the columns A; x (X, C): those with the border's
+        fixed ones, None to leave these out.
+        """
+        first = self.inverse @ e
+        flat = first.reshape(-1, first.shape[-1])
+        second = r - self.coupled.reshape(len(flat), len(r)).T @ flat
+        if len(second):
+            second = linalg.solve_triangular(self.factor, second, lower=True, check_finite=False)
+        found = flat.T @ flat + second.T @ second
+        if x is None:
+            return np.asarray(found)
+        bent = self.block_border.reshape(len(flat), len(x) + 1)[:, :-1]
+        third = x - bent.T @ flat - self.border[:, :-1].T @ second
+        last = linalg.solve(self.information[:-1, :-1], third, assume_a='pos')
+        return np.asarray(found + third.T @ last)
+
+
+def precisions(eq: Equations, lam: Array, weight: Array) -> tuple[Array, Array]:
+    """Return prior precisions (E, k), (R,); weight (L,): factors of each landmark's."""
+    table = np.concatenate([lam, [_NEVER, 0.0]])  # by label: ..., ABSENT (-2), FIXED (-1)
+    e, r = table[eq.blocks.e_label], table[eq.blocks.r_label]
+    if len(eq.landmarks):
+        if eq.by_frame:
+            r[-3 * len(eq.landmarks) :] *= np.repeat(weight[eq.landmarks], 3)
+        else:
+            e *= weight[eq.landmarks, None]
+    return e, r
+
+
+def factored(eq: Equations, lam: Array, weight: Array) -> Factored:
+    """Factor the equations; lam (components,): sigma^2 / tau^2 of each."""
+    b = eq.blocks
+    e, r = precisions(eq, lam, weight)
+    diagonal = np.arange(b.ee.shape[1])
+    ee = b.ee.copy()
+    ee[:, diagonal, diagonal] += e
+    inverse = np.linalg.inv(np.linalg.cholesky(ee))
+    coupled, block_border = inverse @ b.er, inverse @ b.ex
+    count = b.e_label.size
+    flat, bent = coupled.reshape(count, len(b.rr)), block_border.reshape(count, len(b.xx))
+    rr = b.rr - flat.T @ flat
+    rr[np.diag_indices_from(rr)] += r
+    if len(rr):
+        factor = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
+        border = linalg.solve_triangular(
+            factor, b.rx - flat.T @ bent, lower=True, check_finite=False
+        )
+    else:
+        factor, border = rr, b.rx
+    information = b.xx - bent.T @ bent - border.T @ border
+    return Factored(eq, (e, r), inverse, coupled, block_border, factor, border, information)
+
+
+class Solution(NamedTuple):
+    """What the equations say: of the fixed columns, the noise variance, every coefficient.
+
+    values (X - 1,), variance, e (E, k), r (R,); spread_e, spread_r: posterior variances of the
+    coefficients over the noise variance; deviance: -2 log restricted likelihood.
+    """
+
+    values: Array
+    variance: float
+    e: Array
+    r: Array
+    spread_e: Array
+    spread_r: Array
+    deviance: float
+
+
+def solve(f: Factored, spread: bool = True) -> Solution:
+    """Solve for all coefficients; the border must be of full rank."""
+    info, gradient = f.information[:-1, :-1], f.information[:-1, -1]
+    root = linalg.cholesky(info, lower=True, check_finite=False)
+    half = linalg.solve_triangular(root, gradient, lower=True, check_finite=False)
+    values = linalg.solve_triangular(root, half, lower=True, trans=1, check_finite=False)
+    freedom = f.equations.rows - f.equations.poses - len(values)
+    variance = float(f.information[-1, -1] - half @ half) / max(freedom, 1)
+    e, r = f.coefficients(np.append(-values, 1.0))
+    deviance = _deviance(f, root, freedom, variance)
+    if not spread:
+        return Solution(values, variance, e, r, np.zeros(0), np.zeros(0), deviance)
+    spread_e, spread_r = _spread(f, root)
+    return Solution(values, variance, e, r, spread_e, spread_r, deviance)
+
+
+def _back(factor: Array, right: Array) -> Array:
+    if not len(factor):
+        return right
+    return np.asarray(
+        linalg.solve_triangular(factor, right, lower=True, trans=1, check_finite=False)
+    )
+
+
+def _spread(f: Factored, root: Array) -> tuple[Array, Array]:
+    """Return the diagonal of the inverse of the whole matrix."""
+    inverse_t = np.swapaxes(f.inverse, -1, -2)
+    e = (f.inverse**2).sum(axis=-2)
+    r = np.zeros(len(f.factor))
+    shape = e.shape
+    by_border = _back(f.factor, f.border[:, :-1])
+    bent = f.block_border[..., :-1] - f.coupled @ by_border
+    if len(f.factor):
+        inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
+        r = (inverse**2).sum(axis=0)
+        flat = (inverse_t @ f.coupled).reshape(e.size, len(inverse))
+        through = linalg.blas.dtrmm(1.0, inverse, flat.T, lower=1)
+        e = e + (through**2).sum(axis=0).reshape(shape)
+    if len(root):
+        fixed = linalg.lapack.dtrtri(root, lower=1)[0].T
+        r = r + ((by_border @ fixed) ** 2).sum(axis=1)
+        e = e + (((inverse_t @ bent) @ fixed) ** 2).sum(axis=-1)
+    return e, r
+
+
+def _deviance(f: Factored, root: Array, freedom: int, variance: float) -> float:
+    """Return -2 log restricted likelihood, the noise variance profiled out."""
+    e, r = f.precision
+    priors = np.concatenate([e.ravel(), r])
+    priors = priors[priors > 0]
+    logs = sum(
+        2 * float(np.log(np.maximum(np.abs(np.diagonal(part, axis1=-2, axis2=-1)), 1e-300)).sum())
+        for part in (f.factor, root)
+    ) - 2 * float(np.log(np.diagonal(f.inverse, axis1=-2, axis2=-1)).sum())
+    return float(freedom * np.log(max(variance, 1e-300)) + logs - np.log(priors).sum())

@@ -1,0 +1,309 @@
+"""The random parts of the null model: what targets, frames and lenses have of their own.
+
+Every component is a set of columns whose coefficients are drawn from one normal distribution (the
+offsets of landmarks from a t distribution); the variances come from the data (`mixed`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.model import Linearised
+
+MILLIMETRE = 1e-3  # unit of offsets on the target
+STAGE_OF = {
+    'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
+    'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
+    'board_in_plane': 'target', 'board_normal': 'target',
+    'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
+    'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
+}
+NAMES = tuple(STAGE_OF)
+_STATIC = (('image_coarse', 6, 0.0), ('image_fine', 14, 3.0), ('image_finest', 26, 4.5))
+_FRAME_CELLS, _BOARD_CELLS = 4, 4
+_FEWEST_ON_BOARD = 12
+_REACH = 3.0  # of a bump, in its standard deviations
+_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
+
+
+class Points(NamedTuple):
+    """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
+
+    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
+    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on
+    the board over its size; place (F, N, 2, 3): whitened derivatives by an offset along the
+    board's axes, per mm.
+    """
+
+    used: Mask
+    uv: Array
+    weight: Array
+    camera: Index
+    slot: Index
+    landmark: Index
+    board: Index
+    local: Array
+    place: Array
+
+    @classmethod
+    def of(cls, linear: Linearised) -> Points:
+        """Gather the points of a linearised state."""
+        data, views = linear.data, linear.data.views
+
+        def rows(values: Array | Index) -> Array:
+            return data.blocks(np.asarray(values, dtype=float)[..., None, :])
+
+        weight = rows(linear.weight[..., None])[..., 0]
+        used = weight > 0
+        landmark = rows(views.landmark[..., None])[..., 0].astype(np.int64)
+        known = np.unique(landmark[used])
+        slot = np.where(used, np.searchsorted(known, landmark), -1)
+        number = rows(views.board[..., None])[..., 0].astype(np.int64)
+        boards = linear.scene.boards
+        camera = np.broadcast_to(data.camera_of[:, None, None], (*views.landmark.shape, 1))
+        points, uv = rows(views.points), rows(np.nan_to_num(linear.linear.uv))
+        place = linear.whitened(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
+        board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
+        for i, one in enumerate(boards):
+            mine = used & (number == one.id)
+            board[mine], local[mine] = i, one.local(points[mine])[:, :2]
+            place[mine] = place[mine] @ one.axes.T
+        return cls(
+            used, uv, weight, rows(camera)[..., 0].astype(np.int64), slot, known, board, local,
+            place,
+        )
+
+
+class Grid(NamedTuple):
+    """Bumps over the image of one camera: component, camera, centres (K, 2) and pitch, px."""
+
+    name: str
+    camera: int
+    centres: Array
+    pitch: float
+
+
+class BoardField(NamedTuple):
+    """Smooth displacements of one board along some of its axes: values (L, K) at the landmarks."""
+
+    name: str
+    axes: tuple[int, ...]
+    values: Array
+
+
+class Design(NamedTuple):
+    """Columns of the random coefficients, whitened, and the component of each.
+
+    frame (F, M, B): of coefficients that each frame has for itself, frame_label (B,);
+    place (F, N, 2, 3) by landmark_slot (F, N): offsets of landmarks (L,), landmark_label (L, 3);
+    shared: sparse (F M, Q), shared_label (Q,), of grids (u and v of each bump), then of fields
+    (axis by axis); axes (L, 3, 3): of the board of each landmark; -1 labels what is not there.
+    """
+
+    frame: Array
+    frame_label: Index
+    place: Array
+    slot: Index
+    landmark: Index
+    landmark_label: Index
+    shared: sparse.csr_array
+    shared_label: Index
+    grids: tuple[Grid, ...]
+    fields: tuple[BoardField, ...]
+    axes: Array
+
+    def kept(self, alive: Mask) -> Design:
+        """Return the design with some of the components (`NAMES`) only."""
+        known = np.append(alive, False)
+        columns, shared = known[self.frame_label], known[self.shared_label]
+        landmark = np.where(known[self.landmark_label], self.landmark_label, -1)
+        return self._replace(
+            frame=self.frame[..., columns], frame_label=self.frame_label[columns],
+            landmark_label=landmark, shared=self.shared[:, shared],
+            shared_label=self.shared_label[shared],
+            grids=tuple(g for g in self.grids if known[NAMES.index(g.name)]),
+            fields=tuple(f for f in self.fields if known[NAMES.index(f.name)]),
+        )
+
+
+def design(linear: Linearised, finest: bool = False) -> Design:
+    """Build the columns of every component that the data can hold; finest: of the image, too."""
+    points = Points.of(linear)
+    frame, label = _frame_columns(points)
+    boards = linear.scene.boards
+    of_landmark, local = _by_landmark(points)
+    grids, fields = _grids(points, finest), _board_fields(points, of_landmark, local, linear)
+    parts = [_static_columns(points, grid) for grid in grids]
+    parts += [_field_columns(points, field) for field in fields]
+    names = [grid.name for grid in grids] + [field.name for field in fields]
+    of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
+    rows = points.weight.size * 2
+    in_plane, normal, free = (
+        NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
+    )
+    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3 for one in boards]
+    return Design(
+        frame, label, points.place, points.slot, points.landmark, np.array(kinds)[of_landmark],
+        sparse.hstack([sparse.csr_array((rows, 0)), *parts], format='csr'),
+        np.concatenate([np.zeros(0, dtype=np.int64), *of]), tuple(grids), tuple(fields),
+        np.stack([one.axes for one in boards])[of_landmark],
+    )
+
+
+def _by_landmark(points: Points) -> tuple[Index, Array]:
+    """Return the board (L,) of each landmark and its place (L, 2) on it."""
+    count = len(points.landmark)
+    board, local = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
+    board[points.slot[points.used]] = points.board[points.used]
+    local[points.slot[points.used]] = points.local[points.used]
+    return board, local
+
+
+def _frame_columns(points: Points) -> tuple[Array, Index]:
+    """Return columns (F, M, B) and labels (B,) of what single frames have of their own."""
+    blocks: list[tuple[str, Array]] = []
+    for camera in range(int(points.camera.max()) + 1):
+        mine = points.used & (points.camera == camera)
+        if not mine.any():
+            continue
+        low, high = points.uv[mine].min(axis=0), points.uv[mine].max(axis=0)
+        half = float((high - low).max()) / 2
+        x, y = np.moveaxis((points.uv - (low + high) / 2) / half, -1, 0)
+        weight = points.weight * mine
+        radial = np.stack([x, y], axis=-1)[..., None] * weight[..., None, None]
+        blocks.append(('frame_focal', radial))
+        for name, degree in (('frame_centre', 0), ('frame_linear', 1), ('frame_quadratic', 2)):
+            powers = np.stack([x ** (degree - j) * y**j for j in range(degree + 1)], axis=-1)
+            blocks.append((name, _both(powers * weight[..., None])))
+        pitch = 2 * half / _FRAME_CELLS
+        bumps = bump_values(points.uv, mine, hexagons(low, high, pitch), pitch)
+        blocks.append(('frame_bumps', _both(_compact(bumps * weight[..., None]))))
+    blocks.append(('frame_bend', _bend_columns(points)))
+    columns = np.concatenate([block for _, block in blocks], axis=-1)
+    label = np.concatenate([
+        np.full(block.shape[-1], NAMES.index(name)) for name, block in blocks
+    ])
+    frames, count = points.used.shape
+    return columns.reshape(frames, 2 * count, -1), label
+
+
+def _bend_columns(points: Points) -> Array:
+    """Return columns (F, N, 2, 3 boards) of a bend of each board, anew in every frame."""
+    x, y = np.moveaxis(points.local, -1, 0)
+    powers = np.stack([x * x, x * y, y * y], axis=-1)
+    bend = points.place[..., 2:] * powers[..., None, :]
+    boards = int(points.board.max()) + 1
+    mine = points.used[..., None] & (points.board[..., None] == np.arange(boards))
+    columns = bend[..., None, :] * mine[..., None, :, None]
+    return np.asarray(columns.reshape(*columns.shape[:3], -1))
+
+
+def _grids(points: Points, finest: bool) -> list[Grid]:
+    """Return bumps over the image that all frames share, camera by camera, coarse to fine."""
+    grids = []
+    for camera in range(int(points.camera.max()) + 1):
+        mine = points.used & (points.camera == camera)
+        if not mine.any():
+            continue
+        uv = points.uv[mine]
+        low, high = uv.min(axis=0), uv.max(axis=0)
+        for name, cells, fewest in _STATIC[: 3 if finest else 2]:
+            pitch = max(float((high - low).max()) / cells, 1e-9)
+            centres = hexagons(low, high, pitch)
+            seen = bump_values(points.uv, mine, centres, pitch).sum(axis=(0, 1)) > 4.0
+            # A grid finer than the points is noise by another name.
+            if seen.any() and mine.sum() >= fewest * seen.sum():
+                grids.append(Grid(name, camera, centres[seen], pitch))
+    return grids
+
+
+def _static_columns(points: Points, grid: Grid) -> sparse.csr_array:
+    mine = points.used & (points.camera == grid.camera)
+    values = bump_values(points.uv, mine, grid.centres, grid.pitch)
+    return _sparse(_both(values * points.weight[..., None]))
+
+
+def _board_fields(
+    points: Points, of_landmark: Index, local: Array, linear: Linearised
+) -> list[BoardField]:
+    """Return smooth displacements of boards, along and across them: neighbours err alike.
+
+    What the catalogue has for a whole board is taken out: its pose and scale along it, its smooth
+    shape across it.
+    """
+    fields = []
+    for i, board in enumerate(linear.scene.boards):
+        mine = of_landmark == i
+        if not board.flat or mine.sum() < _FEWEST_ON_BOARD:
+            continue
+        at = local[mine]
+        pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
+        centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
+        bumps = bump_values(at[None], np.ones((1, len(at)), dtype=bool), centres, pitch)[0]
+        for name, axes, degree in (('board_in_plane', (0, 1), 1), ('board_normal', (2,), 4)):
+            values = np.zeros((len(local), len(centres)))
+            values[mine] = _outside_powers(bumps, at, degree)
+            kept = np.sqrt((values**2).sum(axis=0)) > 0.05
+            if kept.any():
+                fields.append(BoardField(name, axes, values[:, kept]))
+    return fields
+
+
+def _outside_powers(values: Array, at: Array, degree: int) -> Array:
+    """Take the best polynomial of places (L, 2) out of values (L, K)."""
+    x, y = at.T
+    powers = np.stack(
+        [x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=-1
+    )
+    return np.asarray(values - powers @ np.linalg.lstsq(powers, values, rcond=1e-9)[0])
+
+
+def _field_columns(points: Points, field: BoardField) -> sparse.csr_array:
+    values = np.where(points.used[..., None], field.values[points.slot], 0.0)
+    columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
+    return _sparse(np.concatenate(columns, axis=-1))
+
+
+def hexagons(low: Array, high: Array, pitch: float) -> Array:
+    """Return the centres (K, 2) of a hexagonal grid of a pitch over a rectangle."""
+    columns = np.arange(low[0] - pitch / 2, high[0] + pitch, pitch)
+    rows = np.arange(low[1] - pitch / 2, high[1] + pitch, pitch * np.sqrt(0.75))
+    return np.array([(x + pitch / 2 * (j % 2), y) for j, y in enumerate(rows) for x in columns])
+
+
+def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> Array:
+    """Return Gaussian bumps (F, N, K) at places (F, N, 2), zero out of reach and not of `mine`."""
+    points = at[mine]
+    squares = np.zeros((len(points), len(centres)))
+    for i in (0, 1):
+        squares += (points[:, i, None] - centres[:, i]) ** 2
+    squares /= (_WIDTH * pitch) ** 2
+    values = np.zeros((*mine.shape, len(centres)))
+    values[mine] = np.where(squares < _REACH**2, np.exp(-squares / 2), 0.0)
+    return values
+
+
+def _compact(columns: Array) -> Array:
+    """Move the columns (F, N, K) that a frame has to the front: most frames lack most of them."""
+    weight = columns.sum(axis=1)
+    kept = weight > 2.0 * np.median(columns.max(axis=(1, 2)))
+    width = int(kept.sum(axis=1).max())
+    order = np.argsort(~kept, axis=1, kind='stable')[:, :width]
+    packed = np.take_along_axis(columns * kept[:, None, :], order[:, None, :], axis=2)
+    return np.asarray(packed)
+
+
+def _both(values: Array) -> Array:
+    """Return columns (F, N, 2, 2 K) that move u and v apart by values (F, N, K)."""
+    columns = np.zeros((*values.shape[:2], 2, values.shape[-1], 2))
+    columns[..., 0, :, 0] = values
+    columns[..., 1, :, 1] = values
+    return columns.reshape(*values.shape[:2], 2, -1)
+
+
+def _sparse(columns: Array) -> sparse.csr_array:
+    return sparse.csr_array(columns.reshape(-1, columns.shape[-1]))

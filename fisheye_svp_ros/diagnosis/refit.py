@@ -1,0 +1,116 @@
+"""Estimates under the null model: generalised least squares, and predicted local offsets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.mixed import (
+    Factored,
+    Solution,
+    equations,
+    factored,
+    solve,
+)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
+from fisheye_svp_ros.diagnosis.random_effects import (
+    MILLIMETRE,
+    Design,
+    Grid,
+    bump_values,
+    design,
+)
+from fisheye_svp_ros.diagnosis.reml import Variances
+
+_ROUNDS = 4
+_SETTLED = 3e-3  # of the noise: what a step moves predictions by
+
+
+class Fitted(NamedTuple):
+    """A state fitted under a null model, with the equations that it solves."""
+
+    state: State
+    linear: Linearised
+    design: Design
+    factored: Factored
+    solution: Solution
+    scale: Array
+
+
+class Local(NamedTuple):
+    """Predicted local offsets: of landmarks (L, 3), m, and of the image (grids, (K, 2) px)."""
+
+    landmark: Index
+    offset: Array
+    grids: tuple[tuple[Grid, Array], ...]
+
+    def applied(self, data: Data) -> Data:
+        """Return data with landmarks where they are predicted and the image field taken out."""
+        views = data.views
+        order = np.clip(np.searchsorted(self.landmark, views.landmark), 0, len(self.landmark) - 1)
+        known = (self.landmark[order] == views.landmark) & views.used
+        points = views.points + np.where(known[..., None], self.offset[order], 0.0)
+        uv = views.uv.copy()
+        for grid, values in self.grids:
+            mine = views.used & (data.camera_of[:, None] == grid.camera)
+            uv -= bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
+        return replace(data, views=views._replace(points=points, uv=uv))
+
+
+def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> Fitted:
+    """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance."""
+    for _ in range(_ROUNDS):
+        fitted = fit_linear(Linearised(data, state, free), variances)
+        change = _steps(fitted)
+        moves = fitted.linear.frame_columns @ change[0][..., None]
+        moves = moves[..., 0] + fitted.linear.shared_columns @ change[1]
+        state = moved(data, state, free, *change)
+        if np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
+            break
+    return fitted._replace(state=state)
+
+
+def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
+    """Solve the mixed-model equations of one linearisation."""
+    random = design(linear).kept(variances.alive)
+    scale = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, 1.0)
+    border = np.concatenate(
+        [linear.shared_columns / scale, linear.residual[..., None]], axis=-1
+    )
+    eq = equations(random, linear.frame_columns, border).trimmed(variances.alive)
+    # What the data leave open stays where it is.
+    ridge = np.append(np.full(len(scale), 1e-9), 0.0)
+    eq = replace(eq, blocks=eq.blocks._replace(xx=eq.blocks.xx + np.diag(ridge)))
+    f = factored(eq, variances.lam, variances.weight)
+    return Fitted(linear.state, linear, random, f, solve(f, spread=False), scale)
+
+
+def _steps(fitted: Fitted) -> tuple[Array, Array]:
+    """Return the change of the poses (F, 6) and of what is shared (K,)."""
+    eq, solution = fitted.factored.equations, fitted.solution
+    frame, _, _ = eq.sorted(solution.e, solution.r)
+    return frame[:, :6] / eq.pose_scale, solution.values / fitted.scale
+
+
+def local_offsets(fitted: Fitted) -> Local:
+    """Return what the random parts of target and lens are predicted to be."""
+    eq, random = fitted.factored.equations, fitted.design
+    _, landmark, shared = eq.sorted(fitted.solution.e, fitted.solution.r)
+    offset = np.zeros((len(random.landmark), 3))
+    if len(eq.landmarks):
+        offset[eq.landmarks] = np.where(random.landmark_label[eq.landmarks] >= 0, landmark, 0.0)
+    grids = []
+    for grid in random.grids:
+        values, shared = np.split(shared, [2 * len(grid.centres)])
+        grids.append((grid, values.reshape(-1, 2)))
+    for field in random.fields:
+        for axis in field.axes:
+            values, shared = np.split(shared, [field.values.shape[1]])
+            offset[:, axis] += field.values @ values
+    in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
+    return Local(random.landmark, in_target, tuple(grids))

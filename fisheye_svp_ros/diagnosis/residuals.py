@@ -1,0 +1,82 @@
+"""What the null model leaves: residuals with everything predicted, and their leverages."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.model import flat_rows
+from fisheye_svp_ros.diagnosis.refit import Fitted
+
+_PROBES = 24
+
+
+def conditional_residuals(fitted: Fitted) -> Array:
+    """Return whitened residuals (F, M), every random part at its prediction."""
+    solution = fitted.solution
+    left = fitted.linear.residual - _rows(
+        fitted, solution.e[..., None], solution.r[:, None], solution.values[:, None]
+    )[..., 0]
+    return np.asarray(left * fitted.linear.used)
+
+
+def leverages(fitted: Fitted) -> Array:
+    """Return the diagonal (F, M) of the hat matrix, from random signs.
+
+    Source: Hutchinson, A stochastic estimator of the trace of the influence matrix,
+    Communications in Statistics 19 (1990).
+    """
+    shape = fitted.linear.residual.shape
+    rng = np.random.default_rng(0)
+    signs = rng.choice([-1.0, 1.0], (*shape, _PROBES)) * fitted.linear.used[..., None]
+    hat = _rows(fitted, *fitted.factored.solved(*_products(fitted, signs)))
+    return np.asarray(np.clip((signs * hat).mean(axis=-1), 0.0, 0.8))
+
+
+def standardised_squares(fitted: Fitted) -> Array:
+    """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
+    left = conditional_residuals(fitted)
+    return np.asarray(left**2 / (1 - leverages(fitted)) / fitted.solution.variance)
+
+
+def _own(fitted: Fitted) -> Array:
+    scale = fitted.factored.equations.pose_scale
+    return np.concatenate(
+        [fitted.linear.frame_columns / scale[:, None], fitted.design.frame], axis=-1
+    )
+
+
+def _rows(fitted: Fitted, e: Array, r: Array, values: Array) -> Array:
+    """Return what coefficients (E, k, C), (R, C) and fixed values (K, C) do to the rows."""
+    eq, random = fitted.factored.equations, fitted.design
+    count = values.shape[-1]
+    shape = fitted.linear.residual.shape
+    rows = fitted.linear.shared_columns @ (values / fitted.scale[:, None])
+    for c in range(count):
+        frame, landmark, shared = eq.sorted(e[..., c], r[:, c])
+        offset = np.zeros((len(random.landmark) + 1, 3))
+        offset[eq.landmarks] = np.where(random.landmark_label[eq.landmarks] >= 0, landmark, 0.0)
+        moved = (random.place @ offset[random.slot][..., None])[..., 0].reshape(shape)
+        rows[..., c] += moved + (random.shared @ shared).reshape(shape)
+        rows[..., c] += (_own(fitted) @ frame[..., None])[..., 0]
+    return np.asarray(rows)
+
+
+def _products(fitted: Fitted, rows: Array) -> tuple[Array, Array, Array]:
+    """Return the products (E, k, C), (R, C), (K, C) of all columns with rows (F, M, C)."""
+    eq, random = fitted.factored.equations, fitted.design
+    count = rows.shape[-1]
+    flat = rows.reshape(-1, count)
+    by_frame = np.swapaxes(_own(fitted), -1, -2) @ rows
+    by_point = rows.reshape(*random.slot.shape, 2, count)
+    landmark = np.zeros((len(random.landmark), 3, count))
+    f, n = np.nonzero(random.slot >= 0)
+    np.add.at(landmark, random.slot[f, n],
+              np.swapaxes(random.place[f, n], -1, -2) @ by_point[f, n])
+    landmark = np.where(random.landmark_label[..., None] >= 0, landmark, 0.0)[eq.landmarks]
+    shared = random.shared.T @ flat
+    columns = fitted.linear.shared_columns / fitted.scale
+    x = flat_rows(columns).T @ flat
+    if eq.by_frame:
+        return by_frame, np.concatenate([shared, landmark.reshape(-1, count)]), x
+    return landmark, np.concatenate([by_frame.reshape(-1, count), shared]), x

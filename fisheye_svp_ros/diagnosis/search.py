@@ -1,0 +1,230 @@
+"""The search for causes: rounds of evidence, choice and refit until nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step, choose
+from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse, swept
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.diagnosis.model import fit as refit_by_least_squares
+from fisheye_svp_ros.diagnosis.noise import (
+    Gross,
+    NoiseCause,
+    noise_growth,
+    outlying,
+    with_noise_growth,
+)
+from fisheye_svp_ros.diagnosis.prediction import placed_terms
+from fisheye_svp_ros.diagnosis.refit import Fitted, fit_linear, refit
+from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.residuals import standardised_squares
+from fisheye_svp_ros.diagnosis.single_landmarks import single_landmarks
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.errors import ObservationError
+
+_ROUNDS = 6
+_FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a round
+
+
+@dataclass
+class Found:
+    """The state with its causes, the evidence around it, the fit, the trace.
+
+    base: the first evidence; growth: of the noise with the angle, if it is a cause.
+    """
+
+    state: State
+    evidence: Evidence
+    fitted: Fitted
+    trace: list[Step]
+    base: Evidence
+    gross: Gross
+    growth: NoiseCause | None
+
+
+def search(
+    data: Data, state: State, free: Sequence[str], wanted: Wanted, gross: Gross,
+    progress: Callable[[str], None],
+) -> Found:
+    """Add causes to a fitted state until none is left that is significant and predicts better."""
+    trace: list[Step] = []
+    before: Variances | None = None
+    base: Evidence | None = None
+    dropped: set[str] = set()
+    growth: NoiseCause | None = None
+    cleaned = False
+    state = _with_wanted(data, state, free, wanted)
+    for turn in range(_ROUNDS):
+        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
+        evidence = gather_evidence(data, state, free, before, wanted.left_out)
+        base, before = base or evidence, evidence.variances
+        included, gone = _needed(evidence, wanted.included)
+        trace += [_gone(name) for name in gone]
+        dropped.update(gone)
+        choice = choose(evidence, included, _most(evidence, turn), dropped, wanted.quick)
+        trace += choice.trace
+        changed = bool(gone or choice.forms)
+        if changed:
+            state = _changed(evidence, state, included, gone, choice.forms)
+        elif (found := _landmarks(evidence, state, wanted)) is not None:
+            effect, offset, step = found
+            trace.append(step)
+            state, changed = with_effect(state, effect, offset), True
+        if not changed and growth is None and not cleaned and not wanted.quick:
+            # Once the causes are known: what is far off even beside random errors, and the noise.
+            fitted = fit_linear(evidence.linear, before)
+            data, gross, growth, changed = _cleaned(data, fitted, gross, wanted)
+            cleaned = True
+            if growth is not None:
+                state = with_noise_growth(state, growth.value)
+        if not changed:
+            break
+        state = refit(data, state, free, before).state
+        if wanted.quick:
+            break
+    if changed:
+        evidence = gather_evidence(data, state, free, before, wanted.left_out)
+    fitted = fit_linear(evidence.linear, evidence.variances)
+    assert base is not None
+    return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)
+
+
+def _most(evidence: Evidence, turn: int) -> int:
+    """Return how many causes may be taken in at once."""
+    misfit = float((evidence.linear.residual**2).mean()) / evidence.variances.sigma**2
+    return 1 if misfit > _FAR and not turn else 20
+
+
+def _changed(
+    evidence: Evidence, state: State, included: Index, gone: Sequence[str], forms: Sequence[int]
+) -> State:
+    """Return the state without some effects and with chosen forms of others."""
+    state = replace(state, terms=tuple(t for t in state.terms if t[0].name not in gone))
+    for effect, values in _estimated(evidence, included, forms):
+        state = with_effect(state, effect, values)
+    return state
+
+
+def _cleaned(
+    data: Data, fitted: Fitted, gross: Gross, wanted: Wanted
+) -> tuple[Data, Gross, NoiseCause | None, bool]:
+    """Set aside outlying points, then ask whether the noise grows with the angle."""
+    squares = standardised_squares(fitted)
+    cleaned, more = outlying(data, fitted, gross, squares)
+    shifted = len(more.rows) > len(gross.rows)
+    if 'noise_vs_angle' in wanted.left_out:
+        return cleaned, more, None, shifted
+    growth = noise_growth(fitted, squares)
+    if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
+        return cleaned, more, None, shifted
+    return cleaned, more, growth, True
+
+
+def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) -> State:
+    """Return the state with the causes that the user knows of, in their simplest forms.
+
+    Raises ObservationError for one that the data cannot hold.
+    """
+    if not wanted.included:
+        return state
+    scene = Linearised(data, state, free).scene
+    for name in wanted.included:
+        try:
+            state = with_effect(state, next(iter(CATALOGUE[name].candidates(scene))))
+        except Untestable as why:
+            raise ObservationError(f'{data.observations.source}: {name}: {why}') from why
+    return refit_by_least_squares(data, state, free)
+
+
+def _needed(evidence: Evidence, kept: Sequence[str]) -> tuple[Index, list[str]]:
+    """Return the columns of what is still needed, given the others, and the names of the rest."""
+    included = np.arange(evidence.own)
+    gone: list[str] = []
+    while True:
+        weakest, worst = None, SIGNIFICANCE
+        for name, columns, _ in placed_terms(evidence):
+            if name in gone or name in kept or name == LandmarkSurveyEffect.name:
+                continue
+            p = drop_test(evidence, included, columns) * evidence.forms.names()
+            if p > worst:
+                weakest, worst = (name, columns), p
+        if weakest is None:
+            return included, gone
+        gone.append(weakest[0])
+        included = np.setdiff1d(included, weakest[1])
+
+
+def drop_test(evidence: Evidence, included: Index, columns: Index) -> float:
+    """Return the p-value of an effect in the model given everything else that is included."""
+    rest = np.setdiff1d(included, columns)
+    information = restored(evidence, columns)
+    score = evidence.score(swept(information, rest), columns)
+    return evidence.confident(score, rest, columns).p_value
+
+
+def restored(evidence: Evidence, columns: Index) -> Array:
+    """Return the information as if some columns of the model had not been fitted."""
+    information = evidence.information.copy()
+    values = np.zeros(len(information) - 1)
+    for _, mine, value in placed_terms(evidence):
+        values[mine] = value * evidence.scale[mine]
+    chosen = np.intersect1d(columns, np.arange(evidence.own))
+    add = information[:, chosen] @ values[chosen]
+    information[:, -1] += add
+    information[-1] += np.append(add[:-1], add[-1])
+    return information
+
+
+def _estimated(
+    evidence: Evidence, included: Index, forms: Sequence[int]
+) -> list[tuple[Effect, Array]]:
+    """Return chosen forms with their joint estimates."""
+    columns = [evidence.columns_of(form) for form in forms]
+    every = np.concatenate([included, *columns])
+    information = evidence.information
+    inverse, _ = pseudo_inverse(information[np.ix_(every, every)], 1e-12)
+    values = (inverse @ information[every, -1]) / evidence.scale[every]
+    found, at = [], len(included)
+    for form, mine in zip(forms, columns, strict=True):
+        found.append((evidence.forms.effects[form], values[at : at + len(mine)]))
+        at += len(mine)
+    return found
+
+
+def _landmarks(
+    evidence: Evidence, state: State, wanted: Wanted
+) -> tuple[Effect, Array, Step] | None:
+    name = LandmarkSurveyEffect.name
+    if name in wanted.left_out or any(effect.name == name for effect, _ in state.terms):
+        return None
+    return single_landmarks(evidence)
+
+
+def with_effect(state: State, effect: Effect, values: Array | None = None) -> State:
+    """Return the state with one more effect, joined with an earlier form of the same."""
+    start = np.zeros(len(effect.parameters)) if values is None else values
+    for i, (old, known) in enumerate(state.terms):
+        if old.name == effect.name:
+            joined = old.joined(effect)
+            both = transferred(old, known, joined) + transferred(effect, start, joined)
+            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
+    return replace(state, terms=(*state.terms, (effect, start)))
+
+
+def transferred(old: Effect, values: Array, new: Effect) -> Array:
+    """Return start values of a form of an effect from another form's, by parameter name."""
+    known = dict(zip((p.name for p in old.parameters), values, strict=True))
+    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
+
+
+def _gone(name: str) -> Step:
+    return Step(name, 0.0, 0, 1.0, 1.0, np.nan, np.nan, False,
+                'removed: the other causes explain it')

@@ -1,0 +1,148 @@
+"""Single landmarks that are further off than the bulk of them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import linalg, optimize, stats
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
+from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
+from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve
+from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
+from fisheye_svp_ros.diagnosis.reml import GONE, landmark_labels, start_variances
+from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
+
+# So many landmarks are no single ones any more: of those that are exact, and of those that err
+# from landmark to landmark anyway.
+_MANY, _MANY_OF_BULK = 0.12, 3
+_OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
+_LANDMARK = np.array([name.startswith('landmark') for name in NAMES])
+
+
+def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, Step] | None:
+    """Return landmarks that stand out against the variance of all, their offsets and the test.
+
+    None where there is none, or where so many do that they are no single ones.
+    """
+    statistic, rank, offset = landmark_tests(evidence)
+    count = len(statistic)
+    p = np.asarray(stats.chi2.sf(statistic, np.maximum(rank, 1)))
+    corrected = np.where(rank > 0, p * 2 * count * evidence.forms.names(), 1.0)
+    found = np.flatnonzero(corrected < SIGNIFICANCE)
+    bulk = evidence.variances.alive[_LANDMARK].any()
+    most = _MANY_OF_BULK if bulk else max(3, int(_MANY * count))
+    if found.size > most:
+        # A landmark that is far off makes others seem so.
+        found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED]
+    if not found.size or found.size > most:
+        return None
+    found = found[np.argsort(corrected[found], kind='stable')]
+    ids = evidence.design.landmark[found]
+    effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
+    step = Step(
+        effect.key, float(statistic[found].sum()), int(rank[found].sum()), float(p[found[0]]),
+        float(corrected[found[0]]), np.nan, np.nan, True, 'further off than the bulk of landmarks',
+    )
+    return effect, offset[found].ravel(), step
+
+
+def landmark_tests(evidence: Evidence) -> tuple[Array, Array, Array]:
+    """Test the offset of every landmark: statistics, ranks (L,) and offsets (L, 3), m.
+
+    Against the variance of the bulk, so scaled that the median landmark is an ordinary one.
+    """
+    lam = evidence.variances.lam.copy()
+    tiny = start_variances(evidence.full, 1e-7).lam
+    lam[_LANDMARK] = np.where(lam < GONE, lam, tiny)[_LANDMARK]
+    own = np.arange(evidence.own)
+    basis = identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
+    eq = evidence.full.trimmed(lam < GONE).bordered(basis)
+    f = factored(eq, lam, evidence.variances.weight)
+    solution = solve(f, spread=False)
+    _, landmark, _ = eq.sorted(solution.e, solution.r)
+    label = landmark_labels(eq)
+    table = np.where(label >= 0, lam[label], GONE)
+    prior = table * evidence.variances.weight[eq.landmarks, None]
+    precise = np.linalg.inv(_posterior(f))
+    pull = (precise @ landmark[..., None])[..., 0]
+    information = precise - prior[:, :, None] * np.eye(3)
+    often = _often_seen(evidence)[eq.landmarks]
+    bulk = np.where(evidence.variances.alive[label], 1 / table, 0.0)
+    statistic, rank, offset = _against(
+        information, pull, bulk, often, evidence.variances.sigma**2
+    )
+    axes = evidence.design.axes[eq.landmarks]
+    return statistic, rank, np.einsum('la,lab->lb', offset, axes) * MILLIMETRE
+
+
+def _often_seen(evidence: Evidence) -> Mask:
+    views = np.zeros(len(evidence.design.landmark), dtype=np.int64)
+    for slot in evidence.design.slot:
+        views[np.unique(slot[slot >= 0])] += 1
+    return np.asarray(views >= MIN_VIEWS)
+
+
+def _against(
+    information: Array, pull: Array, bulk: Array, often: Mask, variance: float
+) -> tuple[Array, Array, Array]:
+    """Return statistics, ranks and least-squares offsets, in the boards' axes, of landmarks."""
+    values, vectors = np.linalg.eigh(information)
+    kept = (values > 1e-4 * values[:, -1:]) & (values > 0) & often[:, None]
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+    least = (vectors * inverse[:, None]) @ np.swapaxes(vectors, -1, -2)
+    offset = (least @ pull[..., None])[..., 0]
+    rank = kept.sum(axis=1)
+
+    def statistic(scale: float) -> Array:
+        spread = least + scale * bulk[:, :, None] * np.eye(3)
+        inside = np.swapaxes(vectors, -1, -2) @ spread @ vectors
+        mask = kept[:, :, None] & kept[:, None, :]
+        inside = np.where(mask, inside, np.eye(3))
+        way = np.where(kept, (np.swapaxes(vectors, -1, -2) @ offset[..., None])[..., 0], 0.0)
+        solved = np.linalg.solve(inside, way[..., None])[..., 0]
+        return np.asarray((way * solved).sum(axis=1) / variance)
+
+    if not bulk.any() or not (rank > 0).any():
+        return statistic(0.0), rank, offset
+    mine = rank > 0
+    typical = stats.chi2.ppf(0.5, rank[mine])
+
+    def off(log_scale: float) -> float:
+        return float(np.median(statistic(np.exp(log_scale))[mine] / typical) - 1)
+
+    low, high = off(0.0), off(7.0)
+    scale = 0.0 if low <= 0 else 7.0 if high >= 0 else optimize.brentq(off, 0.0, 7.0, xtol=0.05)
+    return statistic(np.exp(scale)), rank, offset
+
+
+def _posterior(f: Factored) -> Array:
+    """Return the posterior covariances (L, 3, 3) of landmarks' offsets over the noise variance."""
+    eq, info = f.equations, f.information[:-1, :-1]
+    root = linalg.cholesky(info, lower=True, check_finite=False) if len(info) else info
+    count = len(eq.landmarks)
+    by_border = linalg.solve_triangular(
+        f.factor, f.border[:, :-1], lower=True, trans=1, check_finite=False
+    )
+    if eq.by_frame:
+        unit = np.zeros((len(f.factor), 3 * count))
+        unit[-3 * count :] = np.eye(3 * count)
+        through = linalg.solve_triangular(f.factor, unit, lower=True, check_finite=False)
+        own, fixed = np.zeros((count, 3, 3)), by_border[-3 * count :]
+    else:
+        back = np.swapaxes(f.inverse, -1, -2)
+        flat = (back @ f.coupled).reshape(3 * count, -1)
+        through = linalg.solve_triangular(f.factor, flat.T, lower=True, check_finite=False)
+        own = back @ f.inverse
+        fixed = (back @ (f.block_border[..., :-1] - f.coupled @ by_border)).reshape(3 * count, -1)
+    found = own + _outer(through, count)
+    if len(root):
+        half = linalg.solve_triangular(root, fixed.T, lower=True, check_finite=False)
+        found = found + _outer(half, count)
+    return np.asarray(found)
+
+
+def _outer(columns: Array, count: int) -> Array:
+    """Return the products (L, 3, 3) of each landmark's columns (R, 3 L) with each other."""
+    parts = columns.reshape(-1, count, 3)
+    return np.asarray(np.einsum('rla,rlb->lab', parts, parts))

@@ -1,0 +1,252 @@
+"""The null model: its equations are those of the dense matrices, its variances those put in."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import lens, observe, scene
+from scipy import stats
+
+from fisheye_svp_ros.diagnosis.components import score_components, significance
+from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
+from fisheye_svp_ros.diagnosis.mixed import equations, factored, less_frames, solve
+from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, design
+from fisheye_svp_ros.diagnosis.refit import fit_linear, local_offsets
+from fisheye_svp_ros.diagnosis.reml import GONE, Variances, estimate, start_variances
+from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+
+SIGMA = 0.2
+TESTED = ('viewpoint_shift', 'decentering', 'skew', 'target_shape')
+
+
+def linearised(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
+    """Return a linearised fit to a scene whose landmarks are off by normal offsets, m."""
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng, cameras, frames)
+    observations = observe(lens(), (), pose, views, SIGMA, rng)
+    if offsets:
+        moves = rng.normal(size=views.points[0].shape) * offsets
+        true = views._replace(points=views.points + moves)
+        observations = observe(lens(), (), pose, true, SIGMA, rng)
+        nominal = dict(enumerate(views.points[0]))
+        xyz = np.array([nominal[i] for i in observations.landmark.tolist()])
+        observations = replace(observations, xyz=xyz)
+    data = prepare(observations)
+    return Linearised(data, fit(data, start(data, lens()), free), free)
+
+
+def dense_columns(linear, random):
+    """Return the columns (rows, P) of all random coefficients and their components."""
+    frames, height, width = random.frame.shape
+    blocks = np.zeros((frames, height, frames, width))
+    blocks[np.arange(frames), :, np.arange(frames)] = random.frame
+    place = np.zeros((frames, height // 2, 2, len(random.landmark), 3))
+    f, n = np.nonzero(random.slot >= 0)
+    place[f, n, :, random.slot[f, n]] = random.place[f, n]
+    columns = np.concatenate([
+        blocks.reshape(frames * height, -1), place.reshape(frames * height, -1),
+        random.shared.toarray(),
+    ], axis=1)
+    label = np.concatenate([
+        np.tile(random.frame_label, frames), random.landmark_label.ravel(), random.shared_label
+    ])
+    return columns[linear.used.ravel()], label
+
+
+def dense_poses(linear):
+    frames, height, _ = linear.frame_columns.shape
+    poses = np.zeros((frames, height, frames, 6))
+    poses[np.arange(frames), :, np.arange(frames)] = linear.frame_columns
+    return poses.reshape(frames * height, -1)[linear.used.ravel()]
+
+
+def some_variances(eq, seed=0):
+    """Return random variances of every component that there is."""
+    first = start_variances(eq, 0.05)
+    rng = np.random.default_rng(seed)
+    lam = np.where(first.lam < GONE, first.lam * np.exp(rng.normal(size=len(NAMES))), GONE)
+    return Variances(1.0, lam, np.exp(0.3 * rng.normal(size=len(first.weight))))
+
+
+@pytest.mark.parametrize(('cameras', 'frames'), [(1, 1), (2, 4), (1, 12)])
+def test_equations_are_those_of_the_dense_matrices(cameras, frames):
+    """Either order of elimination: generalised least squares with V = I + Z D Z'."""
+    linear = linearised(cameras=cameras, frames=frames)
+    random = design(linear)
+    probe = linear.effect_columns(CATALOGUE['skew']())
+    border = np.concatenate([probe, linear.residual[..., None]], axis=-1)
+    eq = equations(random, linear.frame_columns, border)
+    assert eq.by_frame == (frames > 1)
+    now = some_variances(eq)
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    z, label = dense_columns(linear, random)
+    weight = np.concatenate([
+        np.ones(random.frame.shape[-1] * frames), np.repeat(now.weight, 3),
+        np.ones(random.shared.shape[1]),
+    ])
+    v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
+    x = np.concatenate([dense_poses(linear), probe.reshape(-1, 1)[linear.used.ravel()]], axis=1)
+    y = linear.residual[linear.used]
+    poses = x[:, :-1]
+    whitened = np.linalg.solve(v, np.column_stack([x, y]))
+    inside = poses @ np.linalg.lstsq(poses.T @ whitened[:, : poses.shape[1]],
+                                     poses.T @ whitened[:, poses.shape[1] :], rcond=None)[0]
+    left = np.column_stack([x[:, -1], y]) - inside
+    np.testing.assert_allclose(f.information, left.T @ np.linalg.solve(v, left), rtol=1e-5)
+    solution = solve(f)
+    assert solution.values[0] == pytest.approx(f.information[0, 1] / f.information[0, 0])
+
+
+def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
+    linear = linearised(frames=5)
+    random = design(linear)
+    border = np.concatenate(
+        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1
+    )
+    eq = equations(random, linear.frame_columns, border)
+    now = some_variances(eq)
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    solution = solve(f)
+    z, label = dense_columns(linear, random)
+    precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate([
+        np.ones(5 * random.frame.shape[-1]), np.repeat(now.weight, 3),
+        np.ones(random.shared.shape[1]),
+    ])
+    probe = border[..., :1].reshape(-1, 1)[linear.used.ravel()]
+    x = np.concatenate([dense_poses(linear), probe], axis=1)
+    full = np.concatenate([x, z], axis=1)
+    matrix = full.T @ full + np.diag(np.concatenate([np.zeros(x.shape[1]), precision]))
+    scale = np.sqrt(np.diag(matrix))
+    inverse = np.linalg.inv(matrix / scale / scale[:, None]) / scale / scale[:, None]
+    expected = np.diag(inverse)[x.shape[1] :]
+    frame, landmark, shared = f.equations.sorted(solution.spread_e, solution.spread_r)
+    found = np.concatenate([frame[:, 6:].ravel(), landmark.ravel(), shared])
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+def test_frames_can_be_taken_out_again():
+    linear = linearised()
+    random = design(linear)
+    border = np.concatenate(
+        [linear.effect_columns(CATALOGUE['decentering']()), linear.residual[..., None]], axis=-1
+    )
+    eq = equations(random, linear.frame_columns, border)
+    now = some_variances(eq)
+    out = np.array([0, 7, 11])
+    part = equations(random, linear.frame_columns, border, eq, out)
+    fewer = factored(less_frames(eq, part, out).trimmed(now.alive), now.lam, now.weight)
+    data = linear.data
+    keep = ~np.isin(np.arange(data.frames), out)
+    gone = random._replace(
+        frame=random.frame * keep[:, None, None], place=random.place * keep[:, None, None, None],
+        shared=random.shared.multiply(np.repeat(keep, linear.residual.shape[1])[:, None]).tocsr(),
+        slot=np.where(keep[:, None], random.slot, -1),
+    )
+    rest = equations(gone, linear.frame_columns * keep[:, None, None],
+                     border * keep[:, None, None], eq)
+    direct = factored(rest.trimmed(now.alive), now.lam, now.weight)
+    np.testing.assert_allclose(fewer.information, direct.information, rtol=1e-4)
+
+
+def test_variances_that_were_put_in_come_out():
+    linear = linearised(seed=5, offsets=2e-4)
+    evidence = gather_evidence(linear.data, linear.state, ())
+    tau = dict(zip(NAMES, evidence.variances.tau, strict=True))
+    # Of a t distribution, so the scale is below the standard deviation of the bulk, 0.2 mm.
+    assert 0.1 < tau['landmark_in_plane'] < 0.25
+    assert evidence.variances.sigma == pytest.approx(SIGMA, rel=0.08)
+    own = np.arange(evidence.own)
+    basis = identifiable(linear.frame_columns, evidence.border[..., :-1], own)
+    p = significance(evidence.full.bordered(basis), evidence.variances)
+    assert p['landmark_in_plane'] < 1e-9
+
+
+def test_a_variance_of_zero_is_rarely_called_for():
+    p_values = []
+    for seed in range(8):
+        linear = linearised(seed=40 + seed, frames=12)
+        border = linear.residual[..., None]
+        eq = equations(design(linear), linear.frame_columns, border)
+        nothing = Variances(1.0, np.full(len(NAMES), GONE), np.ones(len(eq.landmarks)))
+        p_values += score_components(eq, nothing, list(NAMES)).values()
+    assert len(p_values) > 60
+    assert np.mean(np.array(p_values) < 0.1) < 0.2
+    assert min(p_values) > 1e-5
+
+
+def test_without_variances_there_is_nothing_but_noise():
+    linear = linearised(seed=6)
+    evidence = gather_evidence(linear.data, linear.state, ())
+    assert evidence.variances.sigma == pytest.approx(SIGMA, rel=0.08)
+    fitted = fit_linear(evidence.linear, evidence.variances)
+    left = conditional_residuals(fitted)[linear.used]
+    freedom = 1 - leverages(fitted)[linear.used].mean()
+    assert np.sqrt((left**2).mean() / freedom) == pytest.approx(SIGMA, rel=0.08)
+
+
+def test_estimates_lower_the_deviance():
+    linear = linearised(seed=7, offsets=3e-4)
+    border = linear.residual[..., None]
+    eq = equations(design(linear), linear.frame_columns, border)
+    first = start_variances(eq)
+    before = solve(factored(eq.trimmed(first.alive), first.lam, first.weight)).deviance
+    found, rest = estimate(eq, first)
+    after = solve(factored(rest, found.lam, found.weight)).deviance
+    assert after < before
+
+
+def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
+    free = intrinsic_names(lens())
+    linear = linearised(seed=8, free=free)
+    evidence = gather_evidence(linear.data, linear.state, free)
+    nothing = Variances(1.0, np.full(len(NAMES), GONE), evidence.variances.weight)
+    bare = replace(evidence, variances=nothing)
+    own = np.arange(evidence.own)
+    form = next(i for i, e in enumerate(evidence.forms.effects) if e.name == 'decentering')
+    columns = evidence.columns_of(form)
+    found = bare.score(swept(bare.information, own), columns)
+    used = linear.used.ravel()
+    wide = np.concatenate([dense_poses(linear), linear.shared_columns.reshape(len(used), -1)[used],
+                           linear.effect_columns(evidence.forms.effects[form])
+                           .reshape(len(used), -1)[used]], axis=1)
+    y = linear.residual[linear.used]
+    small, large = (
+        float(((y - m @ np.linalg.lstsq(m, y, rcond=None)[0]) ** 2).sum())
+        for m in (wide[:, :-2], wide)
+    )
+    assert found.rank == 2
+    assert found.statistic == pytest.approx(small - large, rel=1e-5)
+
+
+def test_p_values_are_uniform_without_an_effect():
+    p_values = []
+    for seed in range(10):
+        linear = linearised(seed=100 + seed, offsets=2e-4 * (seed % 2))
+        evidence = gather_evidence(linear.data, linear.state, ())
+        left = swept(evidence.information, np.arange(evidence.own))
+        for form, effect in enumerate(evidence.forms.effects):
+            simplest = effect == next(e for e in evidence.forms.effects if e.name == effect.name)
+            if simplest and effect.name in TESTED:
+                columns = evidence.columns_of(form)
+                score = evidence.score(left, columns)
+                sure = evidence.confident(score, np.arange(evidence.own), columns)
+                p_values.append(sure.p_value)
+    # 40 values; a sound build fails this less than once in ten thousand runs.
+    assert stats.kstest(p_values, 'uniform').pvalue > 1e-4
+
+
+def test_predicted_offsets_are_near_the_true_ones():
+    rng = np.random.default_rng(9)
+    pose, views = scene(rng)
+    moves = rng.normal(size=views.points[0].shape) * 1e-3
+    table = observe(lens(), (), pose, views._replace(points=views.points + moves), SIGMA, rng)
+    table = replace(table, xyz=views.points[0][table.landmark])
+    data = prepare(table)
+    state = fit(data, start(data, lens()), ())
+    evidence = gather_evidence(data, state, ())
+    found = local_offsets(fit_linear(evidence.linear, evidence.variances))
+    true = moves[found.landmark]
+    # Poses and the catalogue take up part of what all landmarks do together.
+    assert np.corrcoef(found.offset.ravel(), true.ravel())[0, 1] > 0.7
