@@ -1,4 +1,4 @@
-"""What degenerate and spoilt views do to poses: are wrong ones said to be wrong?
+"""What spoilt views do to poses, and whether wrong ones are said to be wrong.
 
 `python -m benchmark.poses` writes the section "Poses" of docs/reliability.md.
 """

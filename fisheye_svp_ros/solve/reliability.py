@@ -60,6 +60,7 @@ def examine(
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
     single one against its own median residual, and covariances are scaled by the estimate.
     """
+    model = model.seeing(views)
     if sigma_known:
         return _examined(model, views, found, 1.0, 1.0)
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
@@ -102,7 +103,9 @@ def _examined(
         elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
             excess = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
             result.covariance[i] *= excess
-            reasons[i] = _joined(misfit_reason(excess, int(freedom[i])), reasons[i])
+            reasons[i] = _joined(
+                f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
+                reasons[i])
     return Examined(result, gross, tuple(reasons), None)
 
 
@@ -116,7 +119,7 @@ def misfit_reason(excess: float, freedom: int) -> str:
     return (
         f'the misfit is {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
         'freedom) and no few points are to blame: lens, image size, landmarks or their unit may '
-        'be wrong; the covariance is scaled by it'
+        'be wrong'
     )
 
 

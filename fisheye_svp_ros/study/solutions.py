@@ -15,7 +15,7 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize
-from fisheye_svp_ros.solve.reliability import examine
+from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import (
     epipolar_offset,
@@ -100,7 +100,14 @@ def calibrated(
     metrics = stereo_calibration_metrics(
         found.rig, found.left_residual, found.right_residual, true
     )
-    return Solved(found, metrics, found.converged, _NO_RIG)
+    points = [(view.weight > 0).reshape(systems, -1).sum(axis=1) for view in (left, right)]
+    freedom = 2 * sum(points) - 6 * (found.pose.shape[1] + 1)
+    reasons = tuple(
+        misfit_reason(float(cost) / max(int(free), 1), int(free)) if fails else ''
+        for cost, free, fails in
+        zip(found.cost, freedom, misfit_fails(found.cost, freedom), strict=True)
+    )
+    return Solved(found, metrics, found.converged, _NO_RIG, reasons)
 
 
 def measured(
