@@ -62,7 +62,7 @@ class Localizer(SolverNode):
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        self.publish_result(stamp, found.metrics, found.reasons[0], warn=bool(found.reasons[0]))
+        self.publish_result(stamp, found.metrics, found.reasons[0])
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))

@@ -125,7 +125,7 @@ class TestLocalize:
         rows = [line.split() for line in capsys.readouterr().out.splitlines()]
         shown = np.array([row[-2:] for row in rows if row and row[0] in '012345'], dtype=float)
         axes = ('x', 'y', 'z', 'rx', 'ry', 'rz')
-        table = Table(output / 'covariance.csv', ['frame'])
+        table = CsvTable(output / 'covariance.csv', ['frame'])
         covariance = table.numbers(*(f'{a}_{b}' for a in axes for b in axes)).reshape(-1, 6, 6)
         worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, p, p]).max(axis=1))
                  for p in (slice(0, 3), slice(3, 6))]
