@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent bench mutation test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent bench mutation poses test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -49,6 +49,10 @@ bench: .venv-bench/ready
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
+
+# What spoilt views do to poses, into docs/reliability.md; ten minutes.
+poses: $(VENV)/ready
+	$(BIN)/python -m benchmark.poses
 
 # How many of 300 small faults the tests find, into docs/mutation.md; takes an hour or two.
 mutation: $(VENV)/ready

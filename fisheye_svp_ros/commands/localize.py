@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    from fisheye_svp_ros.commands.notes import note_left_out
+    from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_observations
@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> None:
         measured = localize_measured(model, observations)
     _print(measured, args.observations)
     note_left_out(measured.left_out)
+    note_doubtful(measured.views.frame.tolist(), measured.reasons)
     if args.output:
         _write(args.output, model, measured)
 
@@ -59,13 +60,13 @@ def _print(measured: MeasuredPoses, source: str) -> None:
     for i, frame in enumerate(views.frame[:_SHOWN]):
         place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
         rows.append((
-            str(frame), str(int(views.used[i].sum())), f'{rms_px(result.residual[i]):.4f}', *place,
+            str(frame), str(int(views.used[i].sum())), f'{rms_px(measured.fitted[i]):.4f}', *place,
             f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
         ))
     header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm', 'and deg')
     print_table(
         f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
-        f'rms {rms_px(result.residual):.4f} px',
+        f'rms {rms_px(measured.fitted):.4f} px',
         header, rows,
     )
     if len(views.frame) > _SHOWN:
@@ -100,9 +101,18 @@ def _write(folder: Path, model: ForwardModel, measured: MeasuredPoses) -> None:
         {'frame': views.frame, **dict(zip(names, entries, strict=True))},
     )
     write_json(folder / 'localize.json', {
-        'rms_px': rms_px(result.residual),
+        'rms_px': rms_px(measured.fitted),
         'frames': len(views.frame),
         'observations': int(used.sum()),
         'left_out': measured.left_out,
         'sigma_px': measured.sigma,
+        'gross': [
+            {'frame': int(views.frame[i]), 'landmark': int(views.landmark[i, j]),
+             'px': float(np.linalg.norm(result.residual[i, j]))}
+            for i, j in np.argwhere(measured.gross)
+        ],
+        'doubtful': [
+            {'frame': int(frame), 'reason': reason}
+            for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
+        ],
     })

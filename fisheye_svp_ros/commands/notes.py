@@ -28,3 +28,12 @@ def note_left_out(frames: Sequence[int]) -> None:
         names = ', '.join(map(str, frames[:_SHOWN]))
         more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
         say(f'left out, since their points do not fix a pose: frames {names}{more}')
+
+
+def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
+    """Name the frames whose poses should not be relied on as they are, and why."""
+    doubtful = [(frame, reason) for frame, reason in zip(frames, reasons, strict=True) if reason]
+    for frame, reason in doubtful[:_SHOWN]:
+        say(f'frame {frame}: {reason}')
+    if len(doubtful) > _SHOWN:
+        say(f'and {len(doubtful) - _SHOWN} more frames like these')

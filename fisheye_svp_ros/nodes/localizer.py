@@ -62,7 +62,7 @@ class Localizer(SolverNode):
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, world))
-        self.publish_result(stamp, found.metrics)
+        self.publish_result(stamp, found.metrics, found.reasons[0])
         if self._markers.get_subscription_count():
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
@@ -72,11 +72,11 @@ class Localizer(SolverNode):
     ) -> Solved[Localization]:
         """Solve from where the camera was, which is faster; from anywhere if that is not near."""
         start, before = self._before
-        found = localized(model, views, true, start)
+        found = localized(model, views, true, start, examined=start is None)
         if start is not None and not (
             _rms_px(found) < _AS_WELL * before and _is_near(start, found.solution.pose, views)
         ):
-            found = localized(model, views, true)
+            found = localized(model, views, true, examined=True)
         rms, pose = _rms_px(found), found.solution.pose
         self._before = (pose, max(rms, _EXACT)) if np.isfinite(rms) else (None, 0.0)
         return found

@@ -54,7 +54,7 @@ class StereoCalibrator(SolverNode):
             error = rig.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, right))
-        self.publish_result(stamp, found.metrics)
+        self.publish_result(stamp, found.metrics, found.reasons[0])
 
 
 def main(args: list[str] | None = None) -> int:

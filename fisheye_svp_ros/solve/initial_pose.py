@@ -31,13 +31,58 @@ class _Misfit(NamedTuple):
     pull: Array
 
 
-def initial_poses(points: Array, direction: Array, weight: Array) -> Pose:
+class _Problem(NamedTuple):
+    """S sets of landmarks in their own principal axes, over their size.
+
+    local, direction (S, N, 3), zero where not seen; axes (S, 3, 3), scale (S,), centre (S, 3).
+    """
+
+    local: Array
+    direction: Array
+    axes: Array
+    scale: Array
+    centre: Array
+
+    def camera(self, rotation: Array, translation: Array) -> Pose:
+        """Return cameras in the world from turns (S, ..., 3, 3) and translations (S, ..., 3)."""
+        more = (slice(None), *[None] * (rotation.ndim - 3))
+        place = Pose(rotation @ self.axes[more], translation * self.scale[more][..., None])
+        camera = place.inverse()
+        return Pose(camera.rotation, camera.position + self.centre[more])
+
+
+def initial_poses(points: Array, direction: Array, weight: Array, spread: bool = True) -> Pose:
     """Return poses (S,) of the camera in the world from landmarks and viewing directions.
 
     points (S, N, 3), m; direction (S, N, 3), unit, camera frame; weight (S, N), 0 = ignore.
-    Candidates for R come from the smallest eigenvectors of the misfit and, where those fail, from
-    evenly spread turns.
+    Candidates for R come from the smallest eigenvectors of the misfit, which need six points, or
+    four in a plane, and where those fail, if `spread`, from evenly spread turns.
     """
+    problem = _problem(points, direction, weight)
+    local, d = problem.local, problem.direction
+    misfit = _misfit(local, d, np.any(d, axis=-1))
+    rotation, translation, error = _best(
+        _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
+    rows = np.flatnonzero(error > _DOUBTFUL) if spread else np.empty(0, dtype=np.int64)
+    if rows.size:
+        turns = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
+        own = _Misfit(misfit.form[rows], misfit.pull[rows])
+        other = _best(turns, own, local[rows], d[rows], _MORE_STEPS)
+        better = other[2] < error[rows]
+        rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
+    return problem.camera(rotation, translation)
+
+
+def candidate_poses(points: Array, direction: Array, weight: Array) -> Pose:
+    """Return the poses (S, C) that evenly spread turns lead to, for sets with several minima."""
+    problem = _problem(points, direction, weight)
+    misfit = _misfit(problem.local, problem.direction, np.any(problem.direction, axis=-1))
+    turns = np.broadcast_to(_cube_turns(), (len(points), 24, 3, 3))
+    rotation = _polish(turns, misfit.form[:, None], _MORE_STEPS)
+    return problem.camera(rotation, _translation(misfit, rotation))
+
+
+def _problem(points: Array, direction: Array, weight: Array) -> _Problem:
     seen = (weight > 0) & np.isfinite(direction).all(axis=-1)
     count = np.maximum(seen.sum(1), 1)
     d = np.where(seen[..., None], direction, 0.0)
@@ -49,18 +94,7 @@ def initial_poses(points: Array, direction: Array, weight: Array) -> Pose:
     )
     scale = np.maximum(np.sqrt((local**2).sum((1, 2)) / count), 1e-12)
     local = local @ np.swapaxes(axes, -1, -2) / scale[:, None, None]
-    misfit = _misfit(local, d, seen)
-    rotation, translation, error = _best(
-        _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
-    rows = np.flatnonzero(error > _DOUBTFUL)
-    if rows.size:
-        spread = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
-        own = _Misfit(misfit.form[rows], misfit.pull[rows])
-        other = _best(spread, own, local[rows], d[rows], _MORE_STEPS)
-        better = other[2] < error[rows]
-        rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
-    camera = Pose(rotation @ axes, translation * scale[:, None]).inverse()
-    return Pose(camera.rotation, camera.position + centre)
+    return _Problem(local, d, axes, scale, centre)
 
 
 def _misfit(local: Array, d: Array, seen: Mask) -> _Misfit:
@@ -88,7 +122,7 @@ def _best(
     error (S,): mean squared sine between rays and landmarks; 1 for a landmark behind its ray.
     """
     rotation = _polish(candidates, misfit.form[:, None], steps)
-    translation = (misfit.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
+    translation = _translation(misfit, rotation)
     placed = local[:, None] @ np.swapaxes(rotation, -1, -2) + translation[:, :, None]
     along = (placed * d[:, None]).sum(-1)
     cos2 = np.where(along > 0, along**2 / np.maximum((placed**2).sum(-1), 1e-18), 0.0)
@@ -96,6 +130,12 @@ def _best(
     error = 1.0 - cos2.sum(-1) / np.maximum(seen, 1)
     best, rows = np.argmin(error, axis=1), np.arange(len(local))
     return rotation[rows, best], translation[rows, best], error[rows, best]
+
+
+def _translation(misfit: _Misfit, rotation: Array) -> Array:
+    """Return the best translations (S, C, 3) for turns (S, C, 3, 3)."""
+    translation: Array = (misfit.pull[:, None] @ _columns(rotation)[..., None])[..., 0]
+    return translation
 
 
 def _polish(rotation: Array, form: Array, steps: int) -> Array:
@@ -126,7 +166,9 @@ def _algebraic_rotations(local: Array, misfit: _Misfit) -> Array:
     form[:, range(6, 9), range(6, 9)] = 1e9
     vectors = np.linalg.eigh(np.where(flat, form, misfit.form))[1]
     columns = np.swapaxes(vectors[..., 0].reshape(-1, 3, 3), -1, -2)
-    columns = columns / np.linalg.norm(columns[..., 0], axis=-1)[:, None, None]
+    # A first column of zeros is no turn, but must not end the other views' search.
+    size = np.maximum(np.linalg.norm(columns[..., 0], axis=-1), 1e-9)
+    columns = columns / size[:, None, None]
     m = np.stack([columns, -columns], axis=1)
     third = np.cross(m[..., 0], m[..., 1])
     return nearest_rotation(

@@ -29,7 +29,8 @@ from fisheye_svp_ros.solve.lens_adjustment import (
 )
 from fisheye_svp_ros.solve.lens_start import focal_candidates, thinned
 from fisheye_svp_ros.solve.localization import Localization, localize
-from fisheye_svp_ros.solve.measured import noise_sigma, posable_views, rms_px, sigma_known
+from fisheye_svp_ros.solve.measured import posable_views, rms_px, sigma_known
+from fisheye_svp_ros.solve.reliability import noise_sigma
 
 OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known

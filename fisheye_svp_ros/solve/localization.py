@@ -12,7 +12,7 @@ from fisheye_svp_ros.optics.engines.results import FLAT
 from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.initial_pose import candidate_poses, initial_poses
 from fisheye_svp_ros.solve.least_squares import (
     Arrays,
     dense_step,
@@ -20,7 +20,7 @@ from fisheye_svp_ros.solve.least_squares import (
     with_unit_diagonal,
 )
 
-MIN_POINTS = 4
+MIN_POINTS, FEW_POINTS = 4, 6
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
 
 
@@ -30,23 +30,39 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     Kita, section 3: bundle adjustment of one camera against known landmarks.  A flat target seen
     small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
+    So are all minima of views with fewer than FEW_POINTS points.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
-    model = model.seeing(views)
+    model, anywhere = model.seeing(views), start is None
     if start is None:
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)
     found, some_flat = _localized(model, views, start)
-    if not some_flat:
-        return found
-    flat, centre, normal = _flat_targets(views)
-    if not flat.size:
-        return found
-    reflected = _reflected(found.pose.take(flat), centre, normal)
-    other, _ = _localized(model, views.take(flat), reflected)
-    better = other.cost < found.cost[flat]
-    found.put(flat[better], other.take(better))
+    if some_flat:
+        flat, centre, normal = _flat_targets(views)
+        if flat.size:
+            reflected = _reflected(found.pose.take(flat), centre, normal)
+            _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
+    if anywhere:
+        few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
+        if few.size:
+            some = views.take(few)
+            direction = model.back_project(some.uv).direction
+            _improve(model, views, found, few,
+                     candidate_poses(some.points, direction, some.weight))
     return found
+
+
+def _improve(
+    model: ForwardModel, views: Views, found: Localization, rows: Index, start: Pose
+) -> None:
+    """Write what fits better from further starts (R, C) of some views (R,), in place."""
+    repeated = np.repeat(rows, start.shape[1])
+    other, _ = _localized(model, views.take(repeated), start.reshape(-1))
+    cost = np.where(other.converged, other.cost, np.inf).reshape(start.shape)
+    best = np.argmin(cost, axis=1) + start.shape[1] * np.arange(len(rows))
+    better = other.cost[best] < found.cost[rows]
+    found.put(rows[better], other.take(best[better]))
 
 
 def _localized(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:

@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
+from fisheye_svp_ros.solve.reliability import examine
 
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
 
@@ -20,13 +21,21 @@ class MeasuredPoses(NamedTuple):
 
     result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
     the residuals, None where the observations bring their own; left_out: frames whose points do
-    not fix a pose.
+    not fix a pose; gross (V, N): observations left out as gross errors; reasons (V,): why a pose
+    should not be relied on, '' where nothing speaks against it.
     """
 
     views: Views
     result: Localization
     sigma: float | None
     left_out: tuple[int, ...]
+    gross: Mask
+    reasons: tuple[str, ...]
+
+    @property
+    def fitted(self) -> Array:
+        """Residuals (V, N, 2), px, without those of gross errors."""
+        return np.where(self.gross[..., None], np.nan, self.result.residual)
 
 
 def localize_measured(model: ForwardModel, observations: Observations) -> MeasuredPoses:
@@ -35,18 +44,16 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
     """
     views, left_out = posable_views(observations, model)
-    result = localize(model, views)
+    checked = examine(model, views, localize(model, views), sigma_known(observations))
+    result, gross, reasons = checked.result, checked.gross, checked.reasons
     fixed = result.converged
     if not fixed.all():
         left_out = tuple(sorted((*left_out, *views.frame[~fixed].tolist())))
-        views, result = views.take(fixed), result.take(fixed)
+        views, result, gross = views.take(fixed), result.take(fixed), gross[fixed]
+        reasons = tuple(np.array(reasons, dtype=object)[fixed])
     if not len(views.frame):
         raise GeometryError(f'{observations.source}: the points of no frame fix a pose')
-    sigma = None
-    if not sigma_known(observations):
-        sigma = noise_sigma(result.cost.sum(), 2 * int(views.used.sum()), 6 * len(views.frame))
-        result = result._replace(covariance=result.covariance * sigma**2)
-    return MeasuredPoses(views, result, sigma, left_out)
+    return MeasuredPoses(views, result, checked.sigma, left_out, gross, reasons)
 
 
 def posable_views(
@@ -84,11 +91,6 @@ def posable_views(
 def sigma_known(observations: Observations) -> bool:
     """Say whether every row brings the noise it was measured with."""
     return not np.isnan(observations.sigma).any()
-
-
-def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
-    """Return the noise of rows of unit weight, more than unknowns, from their sum of squares."""
-    return float(np.sqrt(cost / (rows - unknowns)))
 
 
 def rms_px(residual: Array) -> float:

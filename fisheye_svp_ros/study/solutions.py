@@ -15,6 +15,7 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import (
     epipolar_offset,
@@ -51,13 +52,15 @@ class Measurement(NamedTuple):
 class Solved(NamedTuple, Generic[T]):
     """The solution of S sets and its metrics, arrays (S,) by name.
 
-    solved (S,); unsolved: why the others have no solution.
+    solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
+    not be relied on, '' where nothing speaks against it, all of them where that was not examined.
     """
 
     solution: T
     metrics: Metrics
     solved: Mask
     unsolved: str
+    reasons: tuple[str, ...] = ('',)
 
     def checked(self) -> Solved[T]:
         """Return it as it is; raise GeometryError where a set has no solution."""
@@ -67,15 +70,23 @@ class Solved(NamedTuple, Generic[T]):
 
 
 def localized(
-    model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None
+    model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None,
+    examined: bool = False,
 ) -> Solved[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
+    examined: test the misfit against sigma and leave gross errors out, which simulated sets do
+    not have: for them it changes nothing.
     Raises GeometryError as `localize` does.
     """
     found = localize(model, views, start)
-    metrics = localization_metrics(found.pose, found.residual, true)
-    return Solved(found, metrics, found.converged, _NO_POSE)
+    residual, reasons = found.residual, ('',) * len(found.cost)
+    if examined:
+        checked = examine(model, views, found)
+        found, reasons = checked.result, checked.reasons
+        residual = np.where(checked.gross[..., None], np.nan, found.residual)
+    metrics = localization_metrics(found.pose, residual, true)
+    return Solved(found, metrics, found.converged, _NO_POSE, reasons)
 
 
 def calibrated(
@@ -89,7 +100,14 @@ def calibrated(
     metrics = stereo_calibration_metrics(
         found.rig, found.left_residual, found.right_residual, true
     )
-    return Solved(found, metrics, found.converged, _NO_RIG)
+    points = [(view.weight > 0).reshape(systems, -1).sum(axis=1) for view in (left, right)]
+    freedom = 2 * sum(points) - 6 * (found.pose.shape[1] + 1)
+    reasons = tuple(
+        misfit_reason(float(cost) / max(int(free), 1), int(free)) if fails else ''
+        for cost, free, fails in
+        zip(found.cost, freedom, misfit_fails(found.cost, freedom), strict=True)
+    )
+    return Solved(found, metrics, found.converged, _NO_RIG, reasons)
 
 
 def measured(

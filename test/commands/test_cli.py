@@ -118,6 +118,35 @@ class TestLocalize:
         assert cli.main(['localize', str(folder / 'given.csv'), '--lens', lens]) == 0
         assert 'the sigma that the observations bring' in capsys.readouterr().out
 
+    def test_the_standard_errors_are_those_of_the_worst_direction(self, output, scene, capsys):
+        folder, _, _ = scene
+        lens = str(folder / 'lens.yaml')
+        assert cli.main(['localize', str(folder / 'observations.csv'), '--lens', lens]) == 0
+        rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+        shown = np.array([row[-2:] for row in rows if row and row[0] in '012345'], dtype=float)
+        axes = ('x', 'y', 'z', 'rx', 'ry', 'rz')
+        table = CsvTable(output / 'covariance.csv', ['frame'])
+        covariance = table.numbers(*(f'{a}_{b}' for a in axes for b in axes)).reshape(-1, 6, 6)
+        worst = [np.sqrt(np.linalg.eigvalsh(covariance[:, p, p]).max(axis=1))
+                 for p in (slice(0, 3), slice(3, 6))]
+        np.testing.assert_allclose(shown[:, 0], 1000 * worst[0], atol=6e-4)
+        np.testing.assert_allclose(shown[:, 1], np.degrees(worst[1]), atol=6e-5)
+
+    def test_gross_errors_are_named_and_left_out(self, scene, capsys, tmp_path):
+        folder, _, table = scene
+        uv = table.uv.copy()
+        swapped = np.flatnonzero((table.frame == 4) & np.isin(table.landmark, [7, 40]))
+        uv[swapped] = uv[swapped[::-1]]
+        write_observations(tmp_path / 'swapped.csv', replace(table, uv=uv))
+        arguments = [tmp_path / 'swapped.csv', '--lens', folder / 'lens.yaml', '-o', tmp_path]
+        assert cli.main(['localize', *map(str, arguments)]) == 0
+        err = capsys.readouterr().err
+        assert 'note: frame 4: gross errors left out: landmarks' in err and err.count('note') == 1
+        figures = json.loads((tmp_path / 'localize.json').read_text())
+        assert {(g['frame'], g['landmark']) for g in figures['gross']} == {(4, 7), (4, 40)}
+        assert [frame['frame'] for frame in figures['doubtful']] == [4]
+        assert figures['rms_px'] == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
+
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys, tmp_path):
         folder, _, _ = scene
         arguments = [folder / 'poor.csv', '--lens', folder / 'lens.yaml', '-o', tmp_path]

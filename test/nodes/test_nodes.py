@@ -362,6 +362,26 @@ def test_a_camera_that_jumps_is_found_again(graph: Callable[..., Graph]) -> None
     np.testing.assert_allclose([[p.x, p.y, p.z] for p in found], want, atol=1e-9)
 
 
+def test_a_pose_that_is_not_to_be_relied_on_is_a_warning(graph: Callable[..., Graph]) -> None:
+    sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
+    sets.tell_landmarks(0, 2.0)
+    seen = simulate_scenario(Scenario(radius=2.0, noise_px=0.3)).observations
+    halved, swapped = 0.5 * seen.uv, seen.uv.copy()
+    swapped[[4, 20]] = swapped[[20, 4]]
+    for stamp, uv in enumerate((seen.uv, swapped, halved), start=1):
+        sets.points.publish(messages.image_points_message(seen.landmark, uv, stamp, 'camera'))
+        sets.result(stamp)
+    status = [message.status[0] for message in sets.results]
+    ok, warn = status[0].OK, status[0].WARN
+    assert [one.level for one in status] == [ok, warn, warn]
+    assert status[0].message == ''
+    named = {int(seen.landmark[i]) for i in (4, 20)}
+    assert 'gross errors left out: landmarks' in status[1].message
+    assert all(f' {landmark} (' in status[1].message for landmark in named)
+    assert 'times what sigma allows' in status[2].message
+    sets.graph.until(lambda: len(sets.poses) == 3)
+
+
 def test_points_without_landmarks_are_dropped(graph: Callable[..., Graph]) -> None:
     sets = Sets(graph('lens:=fish214', 'svp:=true', 'patience:=0.2'))
     sets.tell_points(3, 2.0)

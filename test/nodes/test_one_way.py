@@ -15,6 +15,7 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.io.csv_table import write_table
+from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.nodes import messages
@@ -83,7 +84,7 @@ def by_node(graph: Graph, observations: Observations, true: Pose) -> np.ndarray:
         points.publish(messages.image_points_message(
             views.landmark[i][used], views.uv[i][used], i + 1, 'camera'))
         graph.until(lambda count=i + 1: len(heard) == count)
-    return np.stack([messages.read_pose(message.pose).position for message in heard])
+    return np.stack([read_pose(message.pose).position for message in heard])
 
 
 def test_flat_boards_have_the_same_poses_by_every_way(

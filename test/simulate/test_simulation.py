@@ -136,3 +136,19 @@ def test_image_points_swapped_with_others_of_their_view():
     assert (wrong.sum(axis=1) % 2 == 0).all()
     for before, after in zip(clean, seen, strict=True):
         assert sorted(map(tuple, before)) == sorted(map(tuple, after))
+
+
+def test_the_image_ends_half_a_pixel_beyond_the_outer_pixel_centres():
+    """Pixel centres are at whole numbers: the image runs from -0.5 to width - 0.5."""
+    lens = replace(FISH214.svp(), max_incidence=np.pi / 2)
+    edges = np.array([-0.51, -0.49, lens.width - 0.51, lens.width - 0.49])
+    uv = np.stack([edges, np.full(4, lens.cy)], axis=-1)
+    wide = replace(lens, cx=lens.width / 2, fx=lens.width / 3)
+    points = 2.0 * back_project(wide, uv).direction
+    seen = simulate(ForwardModel(wide), Landmarks(np.arange(4), points), identity(1), 0.0, rng())
+    assert seen.landmark.tolist() == [1, 2]
+    tall = replace(lens, cy=lens.height / 2, fy=lens.height / 3)
+    edges = np.array([-0.51, -0.49, lens.height - 0.51, lens.height - 0.49])
+    points = 2.0 * back_project(tall, np.stack([np.full(4, lens.cx), edges], axis=-1)).direction
+    seen = simulate(ForwardModel(tall), Landmarks(np.arange(4), points), identity(1), 0.0, rng())
+    assert seen.landmark.tolist() == [1, 2]

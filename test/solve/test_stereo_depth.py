@@ -258,3 +258,22 @@ def test_what_cannot_be_seen_is_flagged():
     offset = epipolar_offset(model, model, rig('parallel'), uv_left, uv_right)
     assert np.isfinite(offset.distance).tolist() == expected
     assert np.isfinite(offset.vertical).tolist() == expected
+
+
+@pytest.mark.parametrize('behind', ['right', 'left'])
+def test_rays_that_meet_behind_one_camera_measure_nothing(behind):
+    """A lens of more than 180 degrees sees where the other camera's ray runs backwards."""
+    model, pair = ForwardModel(MODELS['fish214'].lens.svp()), rig('parallel')
+    angle = np.radians(85.0)
+    away = np.array([np.sin(angle), 0.0, np.cos(angle)])
+    if behind == 'right':
+        meeting, right = -0.5 * away, away
+        left = meeting - pair.position
+    else:
+        away = away * [-1, 1, 1]
+        meeting, left = pair.position - 0.5 * away, away
+        right = meeting
+    image = [project(model.lens, ray) for ray in (left, right)]
+    assert image[0].valid and image[1].valid
+    solved = triangulate(model, model, pair, image[0].uv, image[1].uv)
+    assert not solved.valid and np.isnan(solved.points).all() and np.isnan(solved.gap)

@@ -1,0 +1,249 @@
+"""Which solved poses can be believed: a test of every misfit, and gross errors found and named.
+
+A view passes when its misfit is what its sigma allows (chi-square) and no residual stands out of
+the others.  One that does not is searched for a pose that most of its points agree on: the points
+that do not are gross errors (Fischler and Bolles, CACM 1981; locally optimised after Chum, Matas,
+Kittler, DAGM 2003).  Views that pass pay for no search.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize, residuals
+
+_ALARM = 1e-4  # probability that a clean view fails the test of its misfit
+_STANDS_OUT = 3.8  # a residual beside the root mean square of all, which starts a search
+_GROSS = 5.0  # standard deviations
+_AGREE = 0.6  # of the points must agree on a pose
+_SPARE = 3  # points beyond a minimal set that must agree as well
+_SUBSETS, _SUBSET, _FEW_SUBSETS, _KEPT, _ROUNDS = 120, 6, 30, 6, 8
+_FADE = 2.0  # standard deviations at which a point's weight falls to about half
+_MEDIAN = 1.1774  # median length of a plane Gaussian vector of unit deviation
+_NOWHERE = 1e6  # standard deviations: what is more is as good as infinite
+_FARTHEST = 100.0  # m, a range at which landmarks are probably not in metres
+_NOISIEST = 2.0  # px, that a detector leaves
+# Where sigma is unknown: a view may misfit this many times as much as most do; how many views
+# can be held against each other; and px below which residuals are rounding.
+_TOLERANCE, _OTHERS, _EXACT = 2.0, 4, 1e-6
+_NAMED = 5
+
+
+class Examined(NamedTuple):
+    """Solved poses of S views, examined.
+
+    result: covariances for what the residuals show where that is more than sigma; gross (S, N):
+    observations left out as gross errors; reasons (S,): why a pose should not be relied on as it
+    is, '' where nothing speaks against it; sigma: noise of u and of v, px, estimated from the
+    views that pass, None where weights are known.
+    """
+
+    result: Localization
+    gross: Mask
+    reasons: tuple[str, ...]
+    sigma: float | None
+
+
+def examine(
+    model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True
+) -> Examined:
+    """Test the poses that `localize` found, and look for gross errors where they fail.
+
+    sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
+    single one against its own median residual, and covariances are scaled by the estimate.
+    """
+    model = model.seeing(views)
+    if sigma_known:
+        return _examined(model, views, found, 1.0, 1.0)
+    freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
+    usual = float(np.sqrt(np.median(found.cost / freedom)))
+    if len(freedom) < _OTHERS:
+        usual = min(usual, float(_spread_of(views, found).max()))
+    checked = _examined(model, views, found, max(usual, _EXACT), _TOLERANCE)
+    result, passed = checked.result, np.array([not reason for reason in checked.reasons])
+    passed &= result.converged
+    some = passed if passed.any() else result.converged
+    rows = 2 * (views.used & ~checked.gross)[some].sum()
+    sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
+    reasons = checked.reasons
+    if sigma > _NOISIEST:
+        reasons = tuple(_joined(_noisy_reason(sigma), reason) for reason in reasons)
+    return Examined(result._replace(covariance=result.covariance * sigma**2), checked.gross,
+                    reasons, sigma)
+
+
+def _examined(
+    model: ForwardModel, views: Views, found: Localization, sigma: float, tolerance: float
+) -> Examined:
+    """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
+    freedom = 2 * (views.weight > 0).sum(axis=1) - 6
+    allowed = (tolerance * sigma) ** 2
+    suspect = ~found.converged | _suspect(views, found, freedom, allowed)
+    result, reasons = found, _far_reasons(views, found)
+    gross = np.zeros(views.used.shape, dtype=bool)
+    if not suspect.any():
+        return Examined(result, gross, tuple(reasons), None)
+    result = Localization.concatenate([found])  # a copy
+    for i in np.flatnonzero(suspect):
+        view = views.take([i])
+        other = _agreed(model, view, found.take([i]), sigma, tolerance)
+        if other is not None:
+            result.put([i], other)
+            gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
+            result.residual[i] = residuals(model, other.pose, view)[0]
+            reasons[i] = _joined(_gross_reason(view, gross[i], result.residual[i]), reasons[i])
+        elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
+            excess = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
+            result.covariance[i] *= excess
+            reasons[i] = _joined(
+                f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
+                reasons[i])
+    return Examined(result, gross, tuple(reasons), None)
+
+
+def misfit_fails(cost: Array, freedom: Array) -> Mask:
+    """Say whether whitened sums of squares are more than degrees of freedom allow."""
+    return np.asarray(cost > chdtri(np.maximum(freedom, 1), _ALARM))
+
+
+def misfit_reason(excess: float, freedom: int) -> str:
+    """Say in words that the misfit is too large: excess over its expectation, as a variance."""
+    return (
+        f'the misfit is {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
+        'freedom) and no few points are to blame: lens, image size, landmarks or their unit may '
+        'be wrong'
+    )
+
+
+def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
+    """Return the noise of rows of unit weight, more than unknowns, from their sum of squares."""
+    return float(np.sqrt(cost / max(rows - unknowns, 1)))
+
+
+def _agreed(
+    model: ForwardModel, view: Views, found: Localization, sigma: float, tolerance: float
+) -> Localization | None:
+    """Return the pose that most points of one view (1,) agree on, residuals NaN for the others."""
+    used = view.weight > 0
+    enough = max(MIN_POINTS + _SPARE, _AGREE * used.sum())
+    if (used & model.back_project(view.uv).valid).sum() < enough:
+        return None
+    start = _consensus(model, view, found, sigma)
+    for _ in range(_ROUNDS):
+        inside = _lengths(model, start, view) < _GROSS * tolerance * sigma
+        if inside.sum() < enough:
+            return None
+        kept = view._replace(weight=np.where(inside, view.weight, 0.0))
+        solved = localize(model, kept, start)
+        if np.array_equal(_lengths(model, solved.pose, view) < _GROSS * tolerance * sigma, inside):
+            break
+        start = solved.pose
+    allowed = (tolerance * sigma) ** 2
+    if not solved.converged[0] or misfit_fails(solved.cost[0] / allowed, 2 * inside.sum() - 6):
+        return None
+    solved.residual[~inside] = np.nan
+    return solved
+
+
+def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) -> Mask:
+    """Return which views fail the test of their misfit, or hold a residual that stands out.
+
+    allowed: variance of a row.
+    """
+    with np.errstate(invalid='ignore'):
+        largest = np.nanmax(np.where(
+            views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0), axis=1)
+    mean = found.cost / np.maximum(freedom, 1)
+    stands_out = largest > 2 * _STANDS_OUT**2 * mean
+    return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
+
+
+def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: float) -> Pose:
+    """Return the pose (1,) that the points agree on best, from minimal subsets of them."""
+    rays = model.back_project(view.uv)
+    usable = np.flatnonzero((view.weight[0] > 0) & rays.valid[0])
+    if len(usable) < MIN_POINTS:
+        return found.pose
+    # Six points fix a pose without a search among turns, which four of few need.
+    enough = len(usable) >= _SUBSET + _SPARE
+    many, size = (_SUBSETS, _SUBSET) if enough else (_FEW_SUBSETS, MIN_POINTS)
+    draws = np.random.default_rng(len(usable)).uniform(size=(many, len(usable)))
+    subset = usable[np.argsort(draws, axis=1)[:, :size]]
+    pose = initial_poses(
+        view.points[0, subset], rays.direction[0, subset], np.ones(subset.shape), not enough)
+    pose = Pose.concatenate([pose, found.pose])
+    views = view.take(np.zeros(len(pose.position), dtype=int))
+    off = _median(_lengths(model, pose, views), views)
+    best = np.argsort(off, kind='stable')[:_KEPT]
+    pose, views = pose.take(best), views.take(best)
+    for _ in range(_ROUNDS):
+        off = np.minimum(_lengths(model, pose, views), _NOWHERE)
+        scale = np.maximum(sigma, _median(off, views) / _MEDIAN)[:, None]
+        fading = 1 / (1 + (off / (_FADE * scale)) ** 2)
+        pose = localize(model, views._replace(weight=views.weight * fading), pose).pose
+    score = _score(_lengths(model, pose, views), views, sigma)
+    return pose.take([int(np.argmin(score))])
+
+
+def _lengths(model: ForwardModel, pose: Pose, views: Views) -> Array:
+    """Return whitened residuals (S, N); infinite where there is no image or no weight."""
+    off = views.uv - model.predict(pose, views).uv
+    length = np.hypot(off[..., 0], off[..., 1]) * views.weight
+    return np.where((views.weight > 0) & np.isfinite(length), length, np.inf)
+
+
+def _score(length: Array, views: Views, sigma: float) -> Array:
+    """Return truncated squares, summed (S,)."""
+    worst = (3 * _GROSS * sigma) ** 2
+    return np.asarray(np.where(views.weight > 0, np.minimum(length**2, worst), 0.0).sum(axis=1))
+
+
+def _median(length: Array, views: Views) -> Array:
+    """Return medians (S,) of the points that have a weight; finite."""
+    middle = (views.weight > 0).sum(axis=1, keepdims=True) // 2
+    median = np.take_along_axis(np.sort(np.minimum(length, _NOWHERE), axis=1), middle, axis=1)
+    return np.asarray(median[:, 0])
+
+
+def _spread_of(views: Views, found: Localization) -> Array:
+    """Return the noise (S,) that the median residuals speak of; they hide some of it."""
+    length = np.where(views.weight > 0, np.linalg.norm(found.residual, axis=-1), np.inf)
+    count = (views.weight > 0).sum(axis=1)
+    hidden = np.sqrt(count / np.maximum(count - 3, 1))
+    return np.asarray(_median(length * views.weight, views) / _MEDIAN * hidden)
+
+
+def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
+    size = np.where(gross, np.nan_to_num(np.linalg.norm(residual, axis=-1), nan=np.inf), 0.0)
+    worst = np.argsort(-size, kind='stable')[:gross.sum()]
+    if not len(worst):
+        return ''
+    names = ', '.join(f'{view.landmark[0, i]} ({size[i]:.3g} px)' for i in worst[:_NAMED])
+    more = f' and {len(worst) - _NAMED} more' if len(worst) > _NAMED else ''
+    return f'gross errors left out: landmark{"s" if len(worst) > 1 else ""} {names}{more}'
+
+
+def _noisy_reason(sigma: float) -> str:
+    return (f'the noise would be {sigma:.3g} px, which no detector has: lens, image size, '
+            'landmarks or their unit may be wrong')
+
+
+def _far_reasons(views: Views, found: Localization) -> list[str]:
+    away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
+    farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
+    return [
+        f'landmarks lie up to {far:.0f} m away: are they in metres?' if far > _FARTHEST else ''
+        for far in farthest
+    ]
+
+
+def _joined(*reasons: str) -> str:
+    return '; '.join(filter(None, reasons))
