@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,18 +15,12 @@ from fisheye_svp_ros.optics.lens import Lens
 class AspectEffect(PlaneEffect):
     """A relative difference between fx and fy, their mean kept."""
 
-    name: ClassVar[str] = 'aspect'
-    signature: ClassVar[str] = (
-        'residuals outward along one image axis and inward along the other'
-    )
-    confused_with: ClassVar[str] = 'skew turned by 45 degrees, sensor_tilt in few views'
-    to_separate: ClassVar[str] = (
-        'views turned about the axis by 45 and 90 degrees'
-    )
+    name = 'aspect'
+    signature = 'residuals outward along one image axis and inward along the other'
+    confused_with = 'skew turned by 45 degrees, sensor_tilt in few views'
+    to_separate = 'views turned about the axis by 45 and 90 degrees'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('relative', '1', 0.01),)
+    parameters = (Parameter('relative', '1', 0.01),)
 
     def plane_columns(self, scene: Scene) -> Array:
         return np.asarray((scene.normalised() * [0.5, -0.5])[..., None])

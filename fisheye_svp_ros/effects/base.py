@@ -49,8 +49,8 @@ class Parameter(NamedTuple):
 class Scene:
     """All that an effect may look at: views, lens, the camera's poses (S,) and ideal images.
 
-    uv (S, N, 2), px: predicted without detector effects; incidence: where the rays meet the lens;
-    rig: pose (C,) of each camera in the rig's body.  Fields may be None before their stage.
+    uv (S, N, 2), px: predicted without detector effects; incidence: where the rays meet the lens,
+    None before the ray stage.
     """
 
     views: Views
@@ -58,7 +58,6 @@ class Scene:
     pose: Pose
     uv: Array
     incidence: Incidence | None = None
-    rig: Pose | None = None
 
     @cached_property
     def boards(self) -> list[Board]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -19,15 +19,13 @@ class BoardPoseEffect(Effect):
 
     boards: tuple[tuple[float, ...], ...] = field(default=(), metadata={'key': False})
 
-    name: ClassVar[str] = 'board_pose'
-    stage: ClassVar[str] = 'target'
-    signature: ClassVar[str] = (
+    name = 'board_pose'
+    stage = 'target'
+    signature = (
         'residuals of a whole board that point to the same small motion of it in every view'
     )
-    confused_with: ClassVar[str] = 'landmark_survey, target_shape of several boards'
-    to_separate: ClassVar[str] = (
-        'views that show the board together with the others, from several sides'
-    )
+    confused_with = 'landmark_survey, target_shape of several boards'
+    to_separate = 'views that show the board together with the others, from several sides'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,18 +14,14 @@ from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 class DecenteringEffect(PlaneEffect):
     """Brown and Conrady p1, p2, in image points over the focal length."""
 
-    name: ClassVar[str] = 'decentering'
-    signature: ClassVar[str] = (
+    name = 'decentering'
+    signature = (
         'residuals that grow with the square of the image height, strongest along one diameter'
     )
-    confused_with: ClassVar[str] = 'sensor_tilt, principal_point'
-    to_separate: ClassVar[str] = (
-        'landmarks over the whole field of view, to its edge, on all sides'
-    )
+    confused_with = 'sensor_tilt, principal_point'
+    to_separate = 'landmarks over the whole field of view, to its edge, on all sides'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))
+    parameters = (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))
 
     def plane_columns(self, scene: Scene) -> Array:
         x, y = np.moveaxis(scene.normalised(), -1, 0)

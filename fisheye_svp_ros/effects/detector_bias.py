@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -18,15 +17,11 @@ class DetectorBiasEffect(Effect):
 
     order: int = 1
 
-    name: ClassVar[str] = 'detector_bias'
-    stage: ClassVar[str] = 'detector'
-    signature: ClassVar[str] = (
-        'residuals that repeat with the fractional part of the image point'
-    )
-    confused_with: ClassVar[str] = 'quantisation'
-    to_separate: ClassVar[str] = (
-        'another detector, or the same images magnified'
-    )
+    name = 'detector_bias'
+    stage = 'detector'
+    signature = 'residuals that repeat with the fractional part of the image point'
+    confused_with = 'quantisation'
+    to_separate = 'another detector, or the same images magnified'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

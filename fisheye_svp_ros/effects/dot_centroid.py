@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -21,13 +20,11 @@ _PROBE = 0.02  # radius of the probing dot over its distance: small, yet far abo
 class DotCentroidEffect(Effect):
     """Bias of the centroid of a flat round dot, in proportion to its radius squared."""
 
-    name: ClassVar[str] = 'dot_centroid'
-    stage: ClassVar[str] = 'image'
-    signature: ClassVar[str] = (
-        'residuals across tilted boards that grow with the size of the dot in the image'
-    )
-    confused_with: ClassVar[str] = 'radial_profile, viewpoint_shift on near and tilted boards'
-    to_separate: ClassVar[str] = 'dots of half the size, or corners instead of dots'
+    name = 'dot_centroid'
+    stage = 'image'
+    signature = 'residuals across tilted boards that grow with the size of the dot in the image'
+    confused_with = 'radial_profile, viewpoint_shift on near and tilted boards'
+    to_separate = 'dots of half the size, or corners instead of dots'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
@@ -39,9 +36,7 @@ class DotCentroidEffect(Effect):
     def place(self) -> str:
         return 'target'  # it is the target's dots that are so large
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
+    parameters = (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 
     def columns(self, scene: Scene) -> Array:
         views = scene.views

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,16 +19,14 @@ class FlatPortEffect(Effect):
 
     refractive_index: float = 1.5
 
-    name: ClassVar[str] = 'flat_port'
-    stage: ClassVar[str] = 'ray'
-    signature: ClassVar[str] = (
-        'residuals along the radius that grow with the angle and with 1 / range, '
-        'bounded by the thickness'
+    name = 'flat_port'
+    stage = 'ray'
+    signature = (
+        'residuals along the radius that grow with the angle and with 1 / range, bounded by the '
+        'thickness'
     )
-    confused_with: ClassVar[str] = 'viewpoint_shift, radial_profile at one single range'
-    to_separate: ClassVar[str] = (
-        'views beyond 60 degrees at clearly different ranges; look at the housing'
-    )
+    confused_with = 'viewpoint_shift, radial_profile at one single range'
+    to_separate = 'views beyond 60 degrees at clearly different ranges; look at the housing'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
@@ -37,9 +34,7 @@ class FlatPortEffect(Effect):
             raise Untestable('rays beyond 90 degrees cannot have come through a plane window')
         return [cls()]
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('thickness', 'm', 0.005, positive=True),)
+    parameters = (Parameter('thickness', 'm', 0.005, positive=True),)
 
     def columns(self, scene: Scene) -> Array:
         shift = FlatPort(1.0, self.refractive_index).columns(scene.theta)[..., :1]

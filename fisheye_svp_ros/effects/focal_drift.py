@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,14 +19,10 @@ class FocalDriftEffect(PlaneEffect):
     start: float = field(default=0.0, metadata={'key': False})
     duration: float = field(default=1.0, metadata={'key': False})
 
-    name: ClassVar[str] = 'focal_drift'
-    signature: ClassVar[str] = (
-        'residuals in proportion to the image height that change smoothly with time'
-    )
-    confused_with: ClassVar[str] = 'session_step, focal_length'
-    to_separate: ClassVar[str] = (
-        'a longer recording with the temperature noted; frames well spread in time'
-    )
+    name = 'focal_drift'
+    signature = 'residuals in proportion to the image height that change smoothly with time'
+    confused_with = 'session_step, focal_length'
+    to_separate = 'a longer recording with the temperature noted; frames well spread in time'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
@@ -14,18 +13,12 @@ from fisheye_svp_ros.optics.lens import Lens
 class FocalLengthEffect(PlaneEffect):
     """A relative change of the focal length."""
 
-    name: ClassVar[str] = 'focal_length'
-    signature: ClassVar[str] = (
-        'residuals along the radius in proportion to the image height'
-    )
-    confused_with: ClassVar[str] = 'radial_profile, landmark_scale with known poses'
-    to_separate: ClassVar[str] = (
-        'landmarks over the whole field of view; a calibration of this very camera'
-    )
+    name = 'focal_length'
+    signature = 'residuals along the radius in proportion to the image height'
+    confused_with = 'radial_profile, landmark_scale with known poses'
+    to_separate = 'landmarks over the whole field of view; a calibration of this very camera'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('relative', '1', 0.02),)
+    parameters = (Parameter('relative', '1', 0.02),)
 
     def plane_columns(self, scene: Scene) -> Array:
         return scene.normalised()[..., None]

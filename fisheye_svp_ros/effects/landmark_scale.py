@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,17 +18,14 @@ class LandmarkScaleEffect(Effect):
     axes: int = 1
     centre: tuple[float, ...] = field(default=(0.0, 0.0, 0.0), metadata={'key': False})
 
-    name: ClassVar[str] = 'landmark_scale'
-    stage: ClassVar[str] = 'target'
-    signature: ClassVar[str] = (
-        'residuals as if all landmarks had moved away from the centre of the target'
+    name = 'landmark_scale'
+    stage = 'target'
+    signature = 'residuals as if all landmarks had moved away from the centre of the target'
+    confused_with = (
+        'focal_length with known poses; with unknown poses one camera cannot see a uniform '
+        'scale'
     )
-    confused_with: ClassVar[str] = (
-        'focal_length with known poses; with unknown poses one camera cannot see a uniform scale'
-    )
-    to_separate: ClassVar[str] = (
-        'measure one long distance on the target; a rig of known baseline; known poses'
-    )
+    to_separate = 'measure one long distance on the target; a rig of known baseline; known poses'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

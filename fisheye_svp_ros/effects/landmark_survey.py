@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -21,15 +21,11 @@ class LandmarkSurveyEffect(Effect):
     landmarks: tuple[int, ...] = ()
     everywhere: bool = False
 
-    name: ClassVar[str] = 'landmark_survey'
-    stage: ClassVar[str] = 'target'
-    signature: ClassVar[str] = (
-        'residuals of one landmark that point to the same place in space from every view'
-    )
-    confused_with: ClassVar[str] = 'target_shape, wrong_ids'
-    to_separate: ClassVar[str] = (
-        'measure the named landmarks again, by other means or from other sides'
-    )
+    name = 'landmark_survey'
+    stage = 'target'
+    signature = 'residuals of one landmark that point to the same place in space from every view'
+    confused_with = 'target_shape, wrong_ids'
+    to_separate = 'measure the named landmarks again, by other means or from other sides'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,14 +14,12 @@ from fisheye_svp_ros.effects.base import NoiseEffect, Parameter, Scene
 class NoiseVsAngleEffect(NoiseEffect):
     """sigma(theta) = sigma(0) exp(growth theta^2)."""
 
-    name: ClassVar[str] = 'noise_vs_angle'
-    signature: ClassVar[str] = 'residuals without a pattern whose scatter grows towards the edge'
-    confused_with: ClassVar[str] = 'any unmodelled pattern near the edge of the field'
-    to_separate: ClassVar[str] = 'repeat the same view without moving anything: the scatter stays'
+    name = 'noise_vs_angle'
+    signature = 'residuals without a pattern whose scatter grows towards the edge'
+    confused_with = 'any unmodelled pattern near the edge of the field'
+    to_separate = 'repeat the same view without moving anything: the scatter stays'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('growth', '1/rad^2', 0.5),)
+    parameters = (Parameter('growth', '1/rad^2', 0.5),)
 
     def noise_scale(self, scene: Scene, values: Array) -> Array:
         return np.asarray(np.exp(np.nan_to_num(values[0] * scene.theta**2)))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,21 +15,13 @@ from fisheye_svp_ros.optics.lens import Lens
 class PrincipalPointEffect(Effect):
     """A shift of the whole image."""
 
-    name: ClassVar[str] = 'principal_point'
-    stage: ClassVar[str] = 'image'
-    signature: ClassVar[str] = (
-        'residuals with a constant part over the image that no turn of the camera takes up'
-    )
-    confused_with: ClassVar[str] = (
-        'decentering, sensor_tilt; with a narrow field, a turn of the camera'
-    )
-    to_separate: ClassVar[str] = (
-        'landmarks over the whole field of view; views turned about the axis'
-    )
+    name = 'principal_point'
+    stage = 'image'
+    signature = 'residuals with a constant part over the image that no turn of the camera takes up'
+    confused_with = 'decentering, sensor_tilt; with a narrow field, a turn of the camera'
+    to_separate = 'landmarks over the whole field of view; views turned about the axis'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('cx', 'px', 10.0), Parameter('cy', 'px', 10.0))
+    parameters = (Parameter('cx', 'px', 10.0), Parameter('cy', 'px', 10.0))
 
     def columns(self, scene: Scene) -> Array:
         return np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,14 +14,12 @@ from fisheye_svp_ros.effects.base import NoiseEffect, Parameter
 class QuantisationEffect(NoiseEffect):
     """u and v are whole multiples of a step."""
 
-    name: ClassVar[str] = 'quantisation'
-    signature: ClassVar[str] = 'every image point is a multiple of one step'
-    confused_with: ClassVar[str] = 'detector_bias'
-    to_separate: ClassVar[str] = 'store the image points with more digits, or refine to sub-pixel'
+    name = 'quantisation'
+    signature = 'every image point is a multiple of one step'
+    confused_with = 'detector_bias'
+    to_separate = 'store the image points with more digits, or refine to sub-pixel'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('step', 'px', 1.0),)
+    parameters = (Parameter('step', 'px', 1.0),)
 
     def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         return np.asarray(np.round(uv / values[0]) * values[0])

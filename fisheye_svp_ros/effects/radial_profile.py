@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -21,15 +20,11 @@ class RadialProfileEffect(Effect):
     terms: int = 2
     theta_max: float = field(default=1.5707963, metadata={'key': False})
 
-    name: ClassVar[str] = 'radial_profile'
-    stage: ClassVar[str] = 'ray'
-    signature: ClassVar[str] = (
-        'residuals along the radius that depend on the angle alone, not on the range'
-    )
-    confused_with: ClassVar[str] = 'focal_length, viewpoint_shift at one single range'
-    to_separate: ClassVar[str] = (
-        'views of the same angles at clearly different ranges'
-    )
+    name = 'radial_profile'
+    stage = 'ray'
+    signature = 'residuals along the radius that depend on the angle alone, not on the range'
+    confused_with = 'focal_length, viewpoint_shift at one single range'
+    to_separate = 'views of the same angles at clearly different ranges'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,15 +18,11 @@ class RigFlexEffect(Effect):
     degree: int = 1
     frames: tuple[int, ...] = field(default=(), metadata={'key': False})
 
-    name: ClassVar[str] = 'rig_flex'
-    stage: ClassVar[str] = 'pose'
-    signature: ClassVar[str] = (
-        'residuals of one camera against the other that differ from frame to frame'
-    )
-    confused_with: ClassVar[str] = 'stereo_time_offset, session_step'
-    to_separate: ClassVar[str] = (
-        'a stiffer rig; frames with the rig unloaded and loaded'
-    )
+    name = 'rig_flex'
+    stage = 'pose'
+    signature = 'residuals of one camera against the other that differ from frame to frame'
+    confused_with = 'stereo_time_offset, session_step'
+    to_separate = 'a stiffer rig; frames with the rig unloaded and loaded'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

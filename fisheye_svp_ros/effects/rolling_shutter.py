@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,26 +15,20 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_motio
 class RollingShutterEffect(Effect):
     """The read-out time from the first row to the last; motion from the neighbouring frames."""
 
-    name: ClassVar[str] = 'rolling_shutter'
-    stage: ClassVar[str] = 'pose'
-    signature: ClassVar[str] = (
+    name = 'rolling_shutter'
+    stage = 'pose'
+    signature = (
         'residuals that grow with the distance from the middle row and with the camera speed'
     )
-    confused_with: ClassVar[str] = (
-        'aspect and skew where the motion is always the same, stereo_time_offset'
-    )
-    to_separate: ClassVar[str] = (
-        'the same scene from a tripod: the residuals vanish when nothing moves'
-    )
+    confused_with = 'aspect and skew where the motion is always the same, stereo_time_offset'
+    to_separate = 'the same scene from a tripod: the residuals vanish when nothing moves'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         require_motion(scene)
         return [cls()]
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('readout', 's', 0.05),)
+    parameters = (Parameter('readout', 's', 0.05),)
 
     def columns(self, scene: Scene) -> Array:
         fraction = scene.uv[..., 1] / scene.lens.height - 0.5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,18 +14,14 @@ from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 class SensorTiltEffect(PlaneEffect):
     """Tilts about the image axes; first order, with the focal length as the image distance."""
 
-    name: ClassVar[str] = 'sensor_tilt'
-    signature: ClassVar[str] = (
+    name = 'sensor_tilt'
+    signature = (
         'residuals along the radius, outward on one side of the image and inward on the other'
     )
-    confused_with: ClassVar[str] = 'decentering, principal_point'
-    to_separate: ClassVar[str] = (
-        'landmarks over the whole field of view, to its edge, on all sides'
-    )
+    confused_with = 'decentering, principal_point'
+    to_separate = 'landmarks over the whole field of view, to its edge, on all sides'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('about_x', 'rad', 0.01), Parameter('about_y', 'rad', 0.01))
+    parameters = (Parameter('about_x', 'rad', 0.01), Parameter('about_y', 'rad', 0.01))
 
     def plane_columns(self, scene: Scene) -> Array:
         m = scene.normalised()

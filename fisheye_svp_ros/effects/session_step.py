@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -24,15 +24,11 @@ class SessionStepEffect(Effect):
     starts: tuple[float, ...] = ()
     timed: bool = field(default=True, metadata={'key': False})
 
-    name: ClassVar[str] = 'session_step'
-    stage: ClassVar[str] = 'image'
-    signature: ClassVar[str] = (
-        'residuals that change at one frame and keep their new pattern'
-    )
-    confused_with: ClassVar[str] = 'focal_drift, landmark_survey of landmarks seen in one group'
-    to_separate: ClassVar[str] = (
-        'frames taken in turns before and after the suspected event, of the same scene'
-    )
+    name = 'session_step'
+    stage = 'image'
+    signature = 'residuals that change at one frame and keep their new pattern'
+    confused_with = 'focal_drift, landmark_survey of landmarks seen in one group'
+    to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

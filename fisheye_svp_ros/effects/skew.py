@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,18 +14,15 @@ from fisheye_svp_ros.effects.base import Parameter, PlaneEffect, Scene
 class SkewEffect(PlaneEffect):
     """A shear: u grows with v."""
 
-    name: ClassVar[str] = 'skew'
-    signature: ClassVar[str] = (
-        'residuals like a shear of the image: outward along one diagonal, inward along the other'
+    name = 'skew'
+    signature = (
+        'residuals like a shear of the image: outward along one diagonal, inward along the '
+        'other'
     )
-    confused_with: ClassVar[str] = 'aspect turned by 45 degrees'
-    to_separate: ClassVar[str] = (
-        'views turned about the axis by 45 and 90 degrees'
-    )
+    confused_with = 'aspect turned by 45 degrees'
+    to_separate = 'views turned about the axis by 45 and 90 degrees'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('shear', '1', 0.01),)
+    parameters = (Parameter('shear', '1', 0.01),)
 
     def plane_columns(self, scene: Scene) -> Array:
         column = np.zeros((*scene.uv.shape, 1))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,15 +15,11 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_camer
 class StereoTimeOffsetEffect(Effect):
     """A delay of every camera but the first; motion from the neighbouring frames."""
 
-    name: ClassVar[str] = 'stereo_time_offset'
-    stage: ClassVar[str] = 'pose'
-    signature: ClassVar[str] = (
-        'residuals of one camera against the other that grow with the speed of the rig'
-    )
-    confused_with: ClassVar[str] = 'rig_flex, rolling_shutter'
-    to_separate: ClassVar[str] = (
-        'the same scene with the rig at rest; a flash of light seen by both cameras'
-    )
+    name = 'stereo_time_offset'
+    stage = 'pose'
+    signature = 'residuals of one camera against the other that grow with the speed of the rig'
+    confused_with = 'rig_flex, rolling_shutter'
+    to_separate = 'the same scene with the rig at rest; a flash of light seen by both cameras'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
@@ -32,9 +27,7 @@ class StereoTimeOffsetEffect(Effect):
         require_motion(scene)
         return [cls()]
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('delay', 's', 0.05),)
+    parameters = (Parameter('delay', 's', 0.05),)
 
     def columns(self, scene: Scene) -> Array:
         later = scene.twist * (scene.views.camera > 0)[:, None]

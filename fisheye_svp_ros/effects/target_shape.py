@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,17 +23,18 @@ class TargetShapeEffect(Effect):
     degree: int = 2
     boards: tuple[BoardAxes, ...] = field(default=(), metadata={'key': False})
 
-    name: ClassVar[str] = 'target_shape'
-    stage: ClassVar[str] = 'target'
-    signature: ClassVar[str] = (
-        'residuals that keep to the board: the same place is off by the same height in every view'
+    name = 'target_shape'
+    stage = 'target'
+    signature = (
+        'residuals that keep to the board: the same place is off by the same height in every '
+        'view'
     )
-    confused_with: ClassVar[str] = (
+    confused_with = (
         'viewpoint_shift when the board is always met from near and squarely, landmark_survey'
     )
-    to_separate: ClassVar[str] = (
-        'turn the board about its normal and tilt it between views; '
-        'measure its flatness with a ruler'
+    to_separate = (
+        'turn the board about its normal and tilt it between views; measure its flatness with a '
+        'ruler'
     )
 
     @classmethod

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -20,15 +19,11 @@ class ViewpointShiftEffect(Effect):
 
     order: int = 1
 
-    name: ClassVar[str] = 'viewpoint_shift'
-    stage: ClassVar[str] = 'ray'
-    signature: ClassVar[str] = (
-        'residuals along the radius that grow with the angle and with 1 / range'
-    )
-    confused_with: ClassVar[str] = (
-        'radial_profile at one single range, flat_port, target_shape of a warped board'
-    )
-    to_separate: ClassVar[str] = (
+    name = 'viewpoint_shift'
+    stage = 'ray'
+    signature = 'residuals along the radius that grow with the angle and with 1 / range'
+    confused_with = 'radial_profile at one single range, flat_port, target_shape of a warped board'
+    to_separate = (
         'views of the same angles at clearly different ranges, the nearest as near as possible; '
         'a target of known flatness'
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -15,14 +14,12 @@ from fisheye_svp_ros.effects.base import NoiseEffect, Parameter
 class WrongIdsEffect(NoiseEffect):
     """A part of the observations is swapped with others of the same view."""
 
-    name: ClassVar[str] = 'wrong_ids'
-    signature: ClassVar[str] = 'a few huge residuals that end where another landmark is predicted'
-    confused_with: ClassVar[str] = 'landmark_survey where one landmark is always mistaken'
-    to_separate: ClassVar[str] = 'look at the named image points; match the ids again'
+    name = 'wrong_ids'
+    signature = 'a few huge residuals that end where another landmark is predicted'
+    confused_with = 'landmark_survey where one landmark is always mistaken'
+    to_separate = 'look at the named image points; match the ids again'
 
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter('fraction', '1', 0.02),)
+    parameters = (Parameter('fraction', '1', 0.02),)
 
     def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         swapped = uv.copy()

@@ -16,7 +16,7 @@ from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import read_yaml, write_text
-from fisheye_svp_ros.optics.curve_base import Curve, SumOfShifts, ViewpointShift
+from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens, field_of_view
 from fisheye_svp_ros.registry import Registry
@@ -113,8 +113,7 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
 
 
 def _shift_to_dict(shift: ViewpointShift) -> Any:
-    parts = shift.parts if isinstance(shift, SumOfShifts) else (shift,)
-    entries = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in parts]
+    entries = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in shift.pieces()]
     return entries if len(entries) > 1 else entries[0]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import ClassVar, Protocol, Self
 
 import numpy as np
@@ -177,7 +177,11 @@ class ViewpointShift(Curve):
 
     def plus(self, other: ViewpointShift) -> ViewpointShift:
         """Return the sum, as one curve where both are of one kind."""
-        return self.merged(other) or SumOfShifts((self, other))
+        return reduce(SumOfShifts.joined, other.pieces(), SumOfShifts(self.pieces())).simplest()
+
+    def pieces(self) -> tuple[ViewpointShift, ...]:
+        """Return the curves whose sum this is."""
+        return (self,)
 
     def _lengths(self) -> dict[str, float]:
         names = self.coefficient_names if self.lengths is None else self.lengths
@@ -185,8 +189,10 @@ class ViewpointShift(Curve):
 
     def merged(self, other: ViewpointShift) -> ViewpointShift | None:
         """Return the sum with a curve of the same kind; None for another kind."""
+        if type(self) is not type(other):
+            return None
         mine, more = self._lengths(), other._lengths()
-        if type(self) is not type(other) or self.changed(**more) != other:
+        if self.changed(**more) != other:
             return None
         return self.changed(**{name: value + more[name] for name, value in mine.items()})
 
@@ -237,7 +243,15 @@ class SumOfShifts(ViewpointShift):
     def scaled(self, factor: float) -> SumOfShifts:
         return SumOfShifts(tuple(part.scaled(factor) for part in self.parts))
 
-    def plus(self, other: ViewpointShift) -> SumOfShifts:
+    def pieces(self) -> tuple[ViewpointShift, ...]:
+        return self.parts
+
+    def simplest(self) -> ViewpointShift:
+        """Return the only part itself where there is one."""
+        return self if len(self.parts) > 1 else self.parts[0]
+
+    def joined(self, other: ViewpointShift) -> SumOfShifts:
+        """Return the sum with one more curve, within the part of its kind if there is one."""
         for number, part in enumerate(self.parts):
             merged = part.merged(other)
             if merged is not None:

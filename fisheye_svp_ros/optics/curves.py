@@ -7,7 +7,6 @@ A distribution of the user's own adds curves by entry points in the groups
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from fisheye_svp_ros.registry import Registry
 class Orthographic(Trigonometric):
     """h = f sin(theta)."""
 
-    limit: ClassVar[float] = np.pi / 2
+    limit = np.pi / 2
     formula = staticmethod(formulas.orthographic)
 
     def angle(self, height: Array) -> Array:
@@ -72,7 +71,7 @@ class KannalaBrandt(ImageHeight):
     k2: float = 0.0
     k3: float = 0.0
     k4: float = 0.0
-    coefficient_names: ClassVar[tuple[str, ...]] = ('k1', 'k2', 'k3', 'k4')
+    coefficient_names = ('k1', 'k2', 'k3', 'k4')
     formula = staticmethod(formulas.kannala_brandt)
 
     @property
@@ -104,7 +103,7 @@ class Gennery(ViewpointShift):
     e0: float = 0.0
     e1: float = 0.0
     e2: float = 0.0
-    coefficient_names: ClassVar[tuple[str, ...]] = ('s0', 'e0', 'e1', 'e2')
+    coefficient_names = ('s0', 'e0', 'e1', 'e2')
     formula = staticmethod(formulas.gennery)
 
     def columns(self, theta: Array) -> Array:
@@ -123,9 +122,9 @@ class FlatPort(ViewpointShift):
 
     thickness: float
     refractive_index: float
-    coefficient_names: ClassVar[tuple[str, ...]] = ('thickness', 'refractive_index')
-    lengths: ClassVar[tuple[str, ...]] = ('thickness',)
-    limit: ClassVar[float] = np.pi / 2
+    coefficient_names = ('thickness', 'refractive_index')
+    lengths = ('thickness',)
+    limit = np.pi / 2
     formula = staticmethod(formulas.flat_port)
 
     def columns(self, theta: Array) -> Array:

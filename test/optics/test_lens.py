@@ -129,6 +129,8 @@ def test_a_shift_of_several_kinds_is_a_list():
     assert two.coefficient_names == ('thickness', 'refractive_index', 'thickness_2',
                                      'refractive_index_2')
     assert two.plus(FlatPort(0.01, 1.3)).coefficients == (0.01, 1.5, 0.03, 1.3)
+    assert Gennery(0.1).plus(two).parts == (Gennery(0.1), *two.parts)
+    assert two.plus(two).coefficients == (0.02, 1.5, 0.04, 1.3)
     assert 'above 1' in two.changed(refractive_index_2=0.9).check()
 
 
