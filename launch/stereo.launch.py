@@ -1,52 +1,30 @@
 """A synthetic rig, its calibration and its depth."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
+from launch.actions import OpaqueFunction
 
-PACKAGE = 'fisheye_svp_ros'
-STYLES = ['parallel', 'vergent', 'divergent']
-NODES = ['synthetic_camera', 'stereo_calibrator', 'stereo_depth']
-ARGUMENTS = {
-    'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
-    'svp': 'auto, true or false: solve with the SVP model; empty: as the parameter files have it',
-    'namespace': 'namespace of the nodes',
-}
+from fisheye_svp_ros.nodes.launching import (
+    arguments,
+    file_arguments,
+    node,
+    style_argument,
+    value,
+)
+
+SOLVERS = ['stereo_calibrator', 'stereo_depth']
+RIG = [('rig', 'stereo_calibrator/rig')]
 
 
 def nodes(context):
     """Return the nodes; what the arguments leave empty is left to the parameter files."""
-    def value(name):
-        return LaunchConfiguration(name).perform(context)
-
-    lens = {'lens': value('lens')} if value('lens') else {}
-    svp = {'svp': value('svp')} if value('svp') else {}
-    rig = {'style': value('style'), 'poses_file': 'calibration'}
-    given = {'synthetic_camera': {**lens, **rig}}
-    return [
-        Node(package=PACKAGE, executable=name, namespace=value('namespace'), output='screen',
-             parameters=[value(f'{name}_params'), given.get(name, {**lens, **svp})],
-             remappings=[('rig', 'stereo_calibrator/rig')])
-        for name in NODES
-    ]
+    rig = {'style': value(context, 'style'), 'poses_file': 'calibration'}
+    return [node(context, 'synthetic_camera', rig),
+            *(node(context, name, {}, RIG) for name in SOLVERS)]
 
 
 def generate_launch_description():
     """Return arguments and nodes."""
-    config = PathJoinSubstitution([FindPackageShare(PACKAGE), 'config'])
     return LaunchDescription([
-        *(
-            DeclareLaunchArgument(name, default_value='', description=text)
-            for name, text in ARGUMENTS.items()
-        ),
-        DeclareLaunchArgument('style', default_value=STYLES[0], choices=STYLES,
-                              description='how the cameras of the rig stand'),
-        *(
-            DeclareLaunchArgument(f'{name}_params', description=f'parameter file of {name}',
-                                  default_value=PathJoinSubstitution([config, f'{name}.yaml']))
-            for name in NODES
-        ),
+        *arguments(), style_argument(), *file_arguments(['synthetic_camera', *SOLVERS]),
         OpaqueFunction(function=nodes),
     ])

@@ -5,33 +5,41 @@ The same rows as `fisheye-svp sweep FILE` computes offline: `fisheye-svp table B
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
-from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from fisheye_svp_ros.commands.sweep_file import read_sweep
+from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
 from fisheye_svp_ros.io.share import sweep_path
+from fisheye_svp_ros.nodes.launching import PACKAGE, fail, value
 
-PACKAGE = 'fisheye_svp_ros'
 PATIENCE = 3600.0  # s: in lock-step nothing is lost, only late
+
+
+def ended(event, context):
+    """End with the camera: well after the last set, otherwise with the reason."""
+    fail(event, context)
+    return [Shutdown(reason='the sweep is done')]
 
 
 def nodes(context):
     """Return recorder, solvers and camera; a bad sweep file ends the launch before any starts."""
-    path = sweep_path(LaunchConfiguration('sweep').perform(context))
-    solvers = list(read_sweep(path).solvers)
+    path = sweep_path(value(context, 'sweep'))
+    plan = read_sweep(path)
+    solvers = list(plan.solvers)
     return [
-        Node(package=PACKAGE, executable='fisheye-svp', output='screen',
-             arguments=['record', '-o', LaunchConfiguration('bag').perform(context)]),
+        Node(package=PACKAGE, executable='fisheye-svp', output='screen', on_exit=fail,
+             arguments=['record', '-o', value(context, 'bag')]),
         *(
-            Node(package=PACKAGE, executable=name, output='screen', parameters=[
-                str(path), {'wait_for_subscribers': 2, 'patience': PATIENCE}])
+            Node(package=PACKAGE, executable=name, output='screen', on_exit=fail, parameters=[
+                str(path), {'wait_for_subscribers': 2, 'patience': PATIENCE,
+                            'folder': lens_folder(plan)}])
             for name in solvers
         ),
-        Node(package=PACKAGE, executable='synthetic_camera', output='screen', parameters=[
-            str(path),
-            {'wait_for_subscribers': len(solvers) + 1, 'repeat': False,
-             'lock_step': ' '.join(f'{name}/result' for name in solvers)},
-        ], on_exit=Shutdown(reason='the sweep is done')),
+        Node(package=PACKAGE, executable='synthetic_camera', output='screen', on_exit=ended,
+             parameters=[
+                 str(path),
+                 {'wait_for_subscribers': len(solvers) + 1, 'repeat': False,
+                  'lock_step': ' '.join(f'{name}/result' for name in solvers)},
+             ]),
     ]
 
 

@@ -1,34 +1,25 @@
 """Everything: one camera below mono/, a rig below stereo/."""
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction, IncludeLaunchDescription
+from launch.actions import GroupAction, IncludeLaunchDescription
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.substitutions import FindPackageShare
 
-SHARED = {
-    'lens': 'lens file, or name in config/lenses; empty: as the parameter files have it',
-    'svp': 'auto, true or false: solve with the SVP model; empty: as the parameter files have it',
-}
-STYLES = ['parallel', 'vergent', 'divergent']
+from fisheye_svp_ros.nodes.launching import COMMON, PACKAGE, arguments, style_argument
 
 
-def include(name, arguments, namespace):
+def include(name, shared, part):
     """Return a launch file in a scope of its own: both declare arguments of the same names."""
-    path = PathJoinSubstitution([FindPackageShare('fisheye_svp_ros'), 'launch', name])
-    given = {argument: LaunchConfiguration(argument) for argument in arguments}
-    given['namespace'] = namespace
+    path = PathJoinSubstitution([FindPackageShare(PACKAGE), 'launch', name])
+    given = {argument: LaunchConfiguration(argument) for argument in shared}
+    given['namespace'] = [LaunchConfiguration('namespace'), f'/{part}']
     return GroupAction([IncludeLaunchDescription(path, launch_arguments=given.items())])
 
 
 def generate_launch_description():
     """Return arguments and both graphs."""
     return LaunchDescription([
-        *(
-            DeclareLaunchArgument(name, default_value='', description=text)
-            for name, text in SHARED.items()
-        ),
-        DeclareLaunchArgument('style', default_value=STYLES[0], choices=STYLES,
-                              description='how the cameras of the rig stand'),
-        include('mono.launch.py', SHARED, 'mono'),
-        include('stereo.launch.py', [*SHARED, 'style'], 'stereo'),
+        *arguments(), style_argument(),
+        include('mono.launch.py', COMMON, 'mono'),
+        include('stereo.launch.py', [*COMMON, 'style'], 'stereo'),
     ])

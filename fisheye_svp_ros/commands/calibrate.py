@@ -46,6 +46,10 @@ def run(args: argparse.Namespace) -> None:
     name = args.output.stem if args.output else args.model
     with progress('calibrating'):
         result = calibrate(observations, args.model, args.image_size, args.free, name)
+    # Written before a word is printed: nobody may be reading.
+    if args.output:
+        save_lens(result.adjusted.lens, args.output)
+        write_json(args.output.with_suffix('.calibrate.json'), _document(result))
     _print(result)
     note_left_out(result.left_out)
     if not result.adjusted.converged:
@@ -53,9 +57,6 @@ def run(args: argparse.Namespace) -> None:
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
-    if args.output:
-        save_lens(result.adjusted.lens, args.output)
-        write_json(args.output.with_suffix('.calibrate.json'), _document(result))
 
 
 def _print(result: Calibration) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from fisheye_svp_ros.paper.demonstration import DemoRow
 
+_MARK = '.demo'
 _PATIENCE = 900.0  # s; only a hang takes this long
 
 
@@ -58,10 +59,15 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     """Run the node graph through its scenarios, in lock-step, into a recording."""
     from fisheye_svp_ros.commands.lock_step import start_in_step, values
     from fisheye_svp_ros.commands.processes import Processes
+    from fisheye_svp_ros.errors import OutputError
+    from fisheye_svp_ros.io.files import write_text
     from fisheye_svp_ros.paper.demonstration import TASKS
 
-    if bag.is_dir():
-        shutil.rmtree(bag)
+    mark = logs.parent / _MARK
+    if bag.exists() and not mark.exists():
+        raise OutputError(f'{bag}: it is there, and no demo has made it; choose another -o')
+    write_text(mark, 'fisheye-svp demo made `recording`, and replaces it.\n')
+    shutil.rmtree(bag, ignore_errors=True)
     cameras = []
     with Processes(logs) as processes:
         processes.start('recorder', ['record', '-o', str(bag)])

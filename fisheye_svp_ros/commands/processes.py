@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 import random
 import signal
@@ -16,6 +18,7 @@ from types import TracebackType
 from fisheye_svp_ros.errors import StandaloneError
 
 _POLL = 0.05  # s
+_PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
 _END = 4000  # bytes
 _GRACE = 10.0  # s to end after a signal
 
@@ -51,7 +54,8 @@ class Processes:
         command = [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments]
         with self._log(name).open('wb') as log:
             self._running[name] = subprocess.Popen(
-                command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log
+                command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                preexec_fn=_end_with_parent,
             )
 
     def wait(
@@ -95,6 +99,12 @@ class Processes:
     def _last(self, name: str) -> str:
         lines = self.latest(name).splitlines()
         return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
+
+
+def _end_with_parent() -> None:
+    """Have the kernel end this new process when its parent dies, however that happens."""
+    with contextlib.suppress(OSError, AttributeError):  # of Linux
+        ctypes.CDLL(None).prctl(_PARENT_DEATH_SIGNAL, signal.SIGTERM)
 
 
 def domain() -> str:

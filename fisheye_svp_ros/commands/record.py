@@ -50,7 +50,7 @@ def _sweep(name: str, bag: Path) -> None:
         raise BagError(f'{bag}: it exists; a recording needs a new folder')
     logs = bag.with_name(f'{bag.name}_logs')
     with progress('sweeping', len(plan.sweep)) as advance:
-        record_sweep(path, tuple(plan.solvers), bag, logs, advance)
+        record_sweep(path, plan, bag, logs, advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
     say(f'{count} sets of {len(plan.sweep)} scenarios are in {bag}')
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,14 @@ def read_sweep(path: Path) -> Plan:
     except FisheyeSvpError as error:
         text = ' '.join(str(error).split())
         raise ParameterError(text if str(path) in text else f'{path}: {text}') from error
+
+
+def lens_folder(plan: Plan) -> str:
+    """Return the folder that the lens files of a sweep lie below; empty where it names none."""
+    names = [plan.base.lens, *plan.sweep.lists.get('lens', ())]
+    folders = [str(Path(name).resolve().parent) for name in names
+               if Path(name).suffix in ('.yaml', '.yml')]
+    return os.path.commonpath(folders) if folders else ''
 
 
 def _check_names(pattern: str, values: Mapping[str, Any]) -> None:

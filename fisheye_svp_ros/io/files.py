@@ -50,6 +50,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Raises OutputError, naming the path, where it cannot be written.
     """
     target = Path(path)
+    if target.exists() and not target.is_file():
+        raise OutputError(f'{path}: it is there and not a regular file; choose another name')
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
@@ -62,6 +64,8 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         yield temporary
         temporary.chmod(0o666 & ~_umask())
+        with temporary.open('rb') as written:
+            os.fsync(written)  # else a power cut leaves the new name with no content
         temporary.replace(target)
     except OSError as cause:
         raise OutputError(f'{path}: cannot be written ({cause.strerror or cause})') from cause

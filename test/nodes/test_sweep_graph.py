@@ -81,7 +81,7 @@ def test_every_scenario_once_and_with_the_offline_numbers(
             assert offline[name] == recorded[name]
     for name in notes:
         unsolved = [note is not None for note in recorded.get(name, [None] * len(places))]
-        assert [note is not None for note in offline[name]] == unsolved
+        assert [bool(note) for note in offline[name]] == unsolved
 
 
 def test_a_bad_sweep_starts_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
