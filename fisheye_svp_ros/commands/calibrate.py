@@ -130,8 +130,8 @@ def _rig(
     both = observations.take(np.isin(observations.frame, sorted(seen[0] & seen[1])))
     fitted = calibrate_stereo(left, right, *stereo_views(both))
     place = 1000 * fitted.rig.position[0]
-    print(f'rig: left camera in the right one at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} mm,'
-          f' from {len(both.frames)} frames')
+    print(f'rig: left camera in the right one at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} '
+          f'mm, from {len(both.frames)} frames')
     if folder:
         save_rig(fitted.rig.take(0), folder / 'rig.yaml')
 
