@@ -32,6 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
     assert cli.main([str(argument) for argument in arguments]) == 2
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
@@ -102,7 +103,7 @@ def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     image = project(LENS, where.into_body(PRINTED.corners))
     frame, corner = np.nonzero(image.valid)
     table = tmp_path / 'mm.csv'
-    uv = image.uv[frame, corner] + 9 * np.random.default_rng(0).standard_normal((len(frame), 2))
+    uv = image.uv[frame, corner] + 5 * np.random.default_rng(0).standard_normal((len(frame), 2))
     write_observations(table, make_observations(frame, corner, uv, 1000 * PRINTED.corners[corner]))
     assert 'the size of the images' in refused(capsys, 'calibrate', table)
     cli.main(['calibrate', str(table), '--image-size', '424x400'])
