@@ -1,12 +1,13 @@
-"""How accurate detected corners are, by incidence angle: on rendered photographs, whose corners are
-known, and as what a lens fit leaves on real ones.  Writes docs/detectors.md.
+"""How accurate detected corners are, by incidence angle.
 
-Run: python -m benchmark.detectors [--count 60] [--photographs FOLDER --board SPEC]
+On rendered photographs, whose corners are known, and as what a lens fit leaves on real ones.
+Writes docs/detectors.md.  Run: python -m benchmark.detectors [--count 60] [--photographs FOLDER]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,14 +85,14 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
     for condition in CONDITIONS:
         lines += ['', f'### {condition[0].upper()}{condition[1:]}', '',
                   '| detector | found | s | ' + ' | '.join(
-                      f'{a} to {b}°' for a, b in zip(ANGLES, ANGLES[1:], strict=False)) + ' |',
+                      f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)) + ' |',
                   '|---' * (len(ANGLES) + 2) + '|']
         for name in DETECTORS:
             seen = results[condition, name]
             error, theta = np.concatenate(seen.error), np.concatenate(seen.theta)
             sigma = np.concatenate(seen.sigma)
             cells = []
-            for low, high in zip(ANGLES, ANGLES[1:], strict=False):
+            for low, high in itertools.pairwise(ANGLES):
                 own = (theta >= low) & (theta < high)
                 bias = np.linalg.norm(error[own].mean(axis=0))
                 scatter = np.sqrt((error[own] ** 2).mean())
