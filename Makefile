@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent bench mutation poses test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench mutation poses test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -31,6 +31,14 @@ paper-search: $(VENV)/ready
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind --trials 200
+
+# The same through rendered photographs: only the pictures are handed over; takes long, too.
+blind-images: $(VENV)/ready
+	$(BIN)/python -m benchmark.blind_images --trials 20
+
+# How accurate detected corners are, into docs/detectors.md.
+detectors: $(VENV)/ready
+	$(BIN)/python -m benchmark.detectors --count 60
 
 # The same with data of a generator that shares no code with the package; takes long, too, and
 # goes on where it was interrupted.

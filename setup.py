@@ -9,6 +9,7 @@ share = f'share/{package_name}'
 nodes = (
     'synthetic_camera',
     'measured_camera',
+    'detector',
     'localizer',
     'stereo_calibrator',
     'stereo_depth',

@@ -22,6 +22,7 @@ COMMANDS = {
     'detect': 'photographs, video or recordings of a board to observations',
     'diagnose': 'what a simulation gets wrong about measured observations, and why',
     'example': 'photographs of a bent board through a shifting lens, to try everything on',
+    'lens': 'a lens shown, checked, converted; also those of other tools',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'paper': "Kita's tables and figures beside the published ones, and past them",
     'plot': 'pictures of a recording, a table or a sweep',

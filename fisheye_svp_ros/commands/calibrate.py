@@ -6,57 +6,145 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fisheye_svp_ros.errors import ParameterError
+
 if TYPE_CHECKING:
+    from fisheye_svp_ros.arrays import Array
+    from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _UNITS = {
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
     **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
 }
+_HUGE = 20.0  # m; a target larger than this was measured in other units
+_POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
+    from fisheye_svp_ros.commands.photographs import add_board_arguments
     from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file or a folder of ORPC files')
-    parser.add_argument('--model', required=True, choices=IMAGE_HEIGHTS, metavar='MODEL',
-                        help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS))
-    parser.add_argument('--image-size', required=True, type=_image_size, metavar='WxH',
-                        help='width and height of the image, px')
+                        help='observations: a CSV file or a folder of ORPC files; or photographs, '
+                        'with --board')
+    add_board_arguments(parser)
+    parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
+                        metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
+                        + '; kannala_brandt by default')
+    parser.add_argument('--image-size', type=_image_size, metavar='WxH',
+                        help='width and height of the image, px; photographs bring their own, and '
+                        'so do observations from `detect`')
     parser.add_argument('--free', type=_names, metavar='NAME,...',
                         help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
                         'model, those of a viewpoint shift (e0,e1,e2 or '
                         'thickness,refractive_index); all but the shift by default')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
-                        help='lens file to write; covariances go beside it as .calibrate.json')
+                        help='lens file to write; covariances go beside it as .calibrate.json; '
+                        'for the cameras left and right a folder, for a lens of each and rig.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
-    """Calibrate, print the parameters, write the lens."""
-    from fisheye_svp_ros.commands.notes import note_left_out, say
-    from fisheye_svp_ros.io.lens_files import save_lens
-    from fisheye_svp_ros.io.readers import read_observations
-    from fisheye_svp_ros.io.results import write_json
+    """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
+    from fisheye_svp_ros.commands.photographs import measured
+
+    observations, size = measured(args.observations, args)
+    size = args.image_size or size or _size_beside(Path(args.observations))
+    if size is None:
+        raise ParameterError(f'{args.observations}: the size of the images is not known; add '
+                             '--image-size 1280x800')
+    results: dict[str, Calibration] = {}
+    for number, camera in enumerate(observations.cameras):
+        table = observations.take(observations.camera == number)
+        name = camera or (args.output.stem if args.output else args.model)
+        results[camera] = _calibrated(table, args, size, name)
+    # Written before a word is printed: nobody may be reading.
+    if args.output:
+        for camera, result in results.items():
+            _write(result, args.output / f'{camera}.yaml' if camera else args.output)
+    for number, result in enumerate(results.values()):
+        _report(result, args.model, observations.sigma[observations.camera == number])
+    if set(results) == {'left', 'right'}:
+        _rig(observations, results, args.output)
+
+
+def _calibrated(
+    table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
+) -> Calibration:
+    import numpy as np
+
+    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-    observations = read_observations(args.observations)
-    name = args.output.stem if args.output else args.model
+    across = float(np.ptp(table.xyz, axis=0).max())
+    if across > _HUGE:
+        say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
     with progress('calibrating'):
-        result = calibrate(observations, args.model, args.image_size, args.free, name)
-    # Written before a word is printed: nobody may be reading.
-    if args.output:
-        save_lens(result.adjusted.lens, args.output)
-        write_json(args.output.with_suffix('.calibrate.json'), _document(result))
+        return calibrate(table, args.model, size, args.free, name)
+
+
+def _report(result: Calibration, model: str, sigmas: Array) -> None:
+    """Print the lens, and what there is to say against it; sigmas (N,), px, NaN = unknown."""
+    import numpy as np
+
+    from fisheye_svp_ros.commands.notes import note_left_out, say
+
     _print(result)
     note_left_out(result.left_out)
     if not result.adjusted.converged:
         say('the adjustment has not converged; take the lens for a rough one')
+    rms, sigma = (result.adjusted.lens.calibration or {})['rms_px'], float(np.median(sigmas))
+    if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
+        say(f'{model} leaves {rms:.1f} px: it does not fit this lens, or image points and '
+            'landmarks do not belong together (order, units, image size)')
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
+
+
+def _size_beside(path: Path) -> tuple[int, int] | None:
+    """Return the image size that `detect` wrote beside its observations."""
+    import json
+
+    try:
+        width, height = json.loads(path.with_suffix('.detect.json').read_text())['image_size']
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return int(width), int(height)
+
+
+def _write(result: Calibration, path: Path) -> None:
+    from fisheye_svp_ros.io.lens_files import save_lens
+    from fisheye_svp_ros.io.results import write_json
+
+    save_lens(result.adjusted.lens, path)
+    write_json(path.with_suffix('.calibrate.json'), _document(result))
+
+
+def _rig(
+    observations: Observations, results: dict[str, Calibration], folder: Path | None
+) -> None:
+    """Calibrate, print and write the rig between two calibrated cameras."""
+    import numpy as np
+
+    from fisheye_svp_ros.effects.forward import ForwardModel
+    from fisheye_svp_ros.io.rig_files import save_rig
+    from fisheye_svp_ros.scene.observations import stereo_views
+    from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
+
+    left, right = (ForwardModel(results[name].adjusted.lens) for name in ('left', 'right'))
+    seen = [set(table.frame.tolist()) for table in (
+        observations.take(observations.camera == observations.cameras.index(name))
+        for name in ('left', 'right'))]
+    both = observations.take(np.isin(observations.frame, sorted(seen[0] & seen[1])))
+    fitted = calibrate_stereo(left, right, *stereo_views(both))
+    place = 1000 * fitted.rig.position[0]
+    print(f'rig: left camera in the right one at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} '
+          f'mm, from {len(both.frames)} frames')
+    if folder:
+        save_rig(fitted.rig.take(0), folder / 'rig.yaml')
 
 
 def _print(result: Calibration) -> None:

@@ -17,8 +17,12 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
+    from fisheye_svp_ros.commands.photographs import add_board_arguments
+
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file, a folder of ORPC files, a recording')
+                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
+                        'photographs, with --board')
+    add_board_arguments(parser)
     parser.add_argument('--lens', required=True, metavar='LENS',
                         help='the simulation: a lens file, or the name of one that comes with '
                         'the package')
@@ -54,8 +58,8 @@ def run(args: argparse.Namespace) -> None:
 
     lens = load_lens(lens_path(args.lens))
     free = args.free == 'intrinsics' or lens.calibration is not None
-    observations = _read(args.observations, lens)
-    held_out = _read(args.held_out, lens) if args.held_out else None
+    observations = _read(args.observations, args, lens)
+    held_out = _read(args.held_out, args, lens) if args.held_out else None
     poses = None
     if args.poses:
         poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
@@ -74,12 +78,12 @@ def run(args: argparse.Namespace) -> None:
     _print(diagnosis, known, args.output)
 
 
-def _read(path: str, lens: Lens) -> Observations:
+def _read(path: str, args: argparse.Namespace, lens: Lens) -> Observations:
     from fisheye_svp_ros.commands.notes import note_left_out
+    from fisheye_svp_ros.commands.photographs import measured
     from fisheye_svp_ros.diagnosis.inputs import posable
-    from fisheye_svp_ros.io.readers import read_observations
 
-    observations, left_out = posable(read_observations(path), lens)
+    observations, left_out = posable(measured(path, args)[0], lens)
     note_left_out(left_out)
     return observations
 

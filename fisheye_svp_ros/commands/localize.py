@@ -16,33 +16,40 @@ _AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
+    from fisheye_svp_ros.commands.lenses import add_lens_argument
+    from fisheye_svp_ros.commands.photographs import add_board_arguments
+
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file or a folder of ORPC files')
-    parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='a lens file, or the name of one that comes with the package')
+                        help='observations: a CSV file or a folder of ORPC files; or photographs, '
+                        'with --board')
+    add_board_arguments(parser)
+    add_lens_argument(parser)
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for localize.json, poses.csv, residuals.csv, covariance.csv')
+                        help='folder for localize.json, poses.csv, residuals.csv, covariance.csv; '
+                        'of a rig, a folder in it for each camera')
 
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
+    from fisheye_svp_ros.commands.lenses import load_lenses
     from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
+    from fisheye_svp_ros.commands.photographs import measured as read
     from fisheye_svp_ros.effects.forward import ForwardModel
-    from fisheye_svp_ros.io.lens_files import load_lens
-    from fisheye_svp_ros.io.readers import read_observations
-    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.measured import localize_measured
 
-    model = ForwardModel(load_lens(lens_path(args.lens)))
-    observations = read_observations(args.observations)
-    with progress('localizing'):
-        measured = localize_measured(model, observations)
-    _print(measured, args.observations)
-    note_left_out(measured.left_out)
-    note_doubtful(measured.views.frame.tolist(), measured.reasons)
-    if args.output:
-        _write(args.output, model, measured)
+    observations, _ = read(args.observations, args)
+    lenses = load_lenses(args.lens, observations.cameras)
+    for camera, (name, lens) in enumerate(lenses.items()):
+        model = ForwardModel(lens)
+        with progress('localizing'):
+            measured = localize_measured(
+                model, observations.take(observations.camera == camera))
+        _print(measured, ' '.join(filter(None, (args.observations, name))))
+        note_left_out(measured.left_out)
+        note_doubtful(measured.views.frame.tolist(), measured.reasons)
+        if args.output:
+            _write(args.output / name, model, measured)
 
 
 def _print(measured: MeasuredPoses, source: str) -> None:

@@ -58,6 +58,8 @@ def fit_corners(
     height, width = pixels.shape
     place = np.round(start).astype(np.int64)
     v, u = np.mgrid[-half:half + 1, -half:half + 1].reshape(2, -1)
+    round_ = np.flatnonzero(np.hypot(u, v) <= half + 0.5)  # no corners of the square
+    u, v = u[round_], v[round_]
     columns, rows = place[:, :1] + u, place[:, 1:] + v
     inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), _SMOOTHING)
@@ -69,22 +71,26 @@ def fit_corners(
     solved = levenberg_marquardt(problem, (values,), _ITERATIONS)
     values = solved.state[0]
     residual, jacobian, weight = problem.parts(values, np.arange(len(values)))
-    return _judged(values, residual, jacobian, weight, place, start, radius, square)
+    shape = (2 * half + 1, round_)
+    return _judged(values, residual, jacobian, weight, place, start, radius, square, shape)
 
 
 def _judged(
     values: Array, residual: Array, jacobian: Array, weight: Array, place: Index, start: Array,
-    radius: Array, square: bool,
+    radius: Array, square: bool, shape: tuple[int, Index],
 ) -> Corners:
-    hessian = np.einsum('npi,np,npj->nij', jacobian, weight, jacobian)
-    pull = np.einsum('npi,np,np->ni', jacobian, weight, residual)
-    side = int(np.sqrt(weight.shape[1]))
-    noise2 = _noise(residual, weight, values[:, :2], side, square)
+    side, round_ = shape
+    windows = np.zeros((2, len(values), side * side))
+    windows[:, :, round_] = residual, weight
+    noise2 = _noise(windows[0], windows[1], values[:, :2], side, square)
+    weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
+    hessian, pull = weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
     scale = np.sqrt(np.maximum(np.einsum('nii->ni', hessian), 1e-30))
     unit = hessian / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(_UNKNOWNS)
     covariance = np.linalg.inv(unit) / (scale[:, :, None] * scale[:, None, :])
     # Smoothed noise is correlated: what each raw pixel moves the corner by, squared and summed.
-    gain = covariance[:, :2] @ np.swapaxes(jacobian * weight[..., None], -1, -2)
+    gain = np.zeros((len(values), 2, side * side))
+    gain[:, :, round_] = covariance[:, :2] @ weighted
     gain = gaussian_filter(gain.reshape(-1, 2, side, side), (0, 0, _SMOOTHING, _SMOOTHING))
     sigma = np.sqrt(noise2 / _KEPT * (gain**2).sum(axis=(1, 2, 3)) / 2)
     # What the fit would still move the corner by; a blur may take longer to settle.
@@ -142,8 +148,9 @@ class _Problem:
         self._first = start
         distance = np.hypot(offset[0] - start[:, :1], offset[1] - start[:, 1:])
         self._weight = np.clip(radius[:, None] + 0.5 - distance, 0.0, 1.0) * inside
-        # The scale of whitened residuals only says when to stop: a fiftieth of the contrast.
-        self._noise = np.maximum(data.std(axis=1) / 50, 1e-6)
+        # The scale of whitened residuals only says when to stop: at steps that change the window
+        # by less than a thousandth of its contrast in all.
+        self._noise = np.maximum(5e5 * data.std(axis=1), 1e-6)
 
     def start(self, axes: Array) -> Array:
         """Return a start (N, 12): the edges along the axes, brightness and contrast by a sum."""

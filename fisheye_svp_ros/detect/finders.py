@@ -139,6 +139,7 @@ def squares(image: Grey, pattern: Pattern) -> Found | None:
 
 DETECTORS: dict[str, tuple[tuple[str, ...], Finder]] = {
     'saddle': (('chessboard',), _smaller(chessboard)),
+    'quick': (('chessboard',), _smaller(classic)),
     'sb': (('chessboard',), sector_based),
     'classic': (('chessboard',), classic_subpixel),
     'charuco': (('charuco',), charuco),

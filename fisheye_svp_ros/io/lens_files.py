@@ -16,6 +16,7 @@ from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.files import read_yaml, write_text
+from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens, field_of_view
@@ -29,8 +30,26 @@ _OLD = 'effects'  # what older files call corrections, of the lens and of the ta
 
 
 def load_lens(path: str | Path) -> Lens:
-    """Read a lens YAML.  Raises LensError, naming file and field, for anything impossible."""
-    return lens_from_dict(read_yaml(path, LensError), str(path))
+    """Read a lens YAML, or what another tool wrote; FILE#cam1: another camera than its first.
+
+    Raises LensError, naming file and field, for anything impossible.
+    """
+    foreign = read_lens_file(path)
+    if foreign is None:
+        return lens_from_dict(read_yaml(path, LensError), str(path))
+    camera = str(path).partition('#')[2] or next(iter(foreign.lenses), '')
+    if camera not in foreign.lenses:
+        raise LensError(f'{path}: no camera {camera!r} in it; it has {", ".join(foreign.lenses)}')
+    return foreign.lenses[camera]
+
+
+def read_lens_file(path: str | Path) -> Foreign | None:
+    """Return the lenses of a file that another tool wrote; None for any other file."""
+    try:
+        text = Path(str(path).partition('#')[0]).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError):
+        return None
+    return read_foreign(path, text)
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:

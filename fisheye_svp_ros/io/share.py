@@ -41,7 +41,8 @@ def sweep_path(name: str) -> Path:
 
 def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
     given, named = Path(name), config_path(f'{folder}/{name}.yaml')
-    if given.suffix in ('.yaml', '.yml') or given.is_file():
+    # FILE#cam1 names one of the lenses of a file.
+    if given.suffix in ('.yaml', '.yml') or Path(name.partition('#')[0]).is_file():
         return given
     if not named.is_file():
         known = ', '.join(sorted(path.stem for path in named.parent.glob('*.yaml')))

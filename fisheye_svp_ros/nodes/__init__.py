@@ -3,6 +3,7 @@
 NODES = (
     'synthetic_camera',
     'measured_camera',
+    'detector',
     'localizer',
     'stereo_calibrator',
     'stereo_depth',

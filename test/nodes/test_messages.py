@@ -17,7 +17,6 @@ standalone.install()
 
 from sensor_msgs.msg import PointCloud2, PointField  # noqa: E402
 
-from fisheye_svp_ros.nodes import messages  # noqa: E402
 from fisheye_svp_ros.errors import ObservationError  # noqa: E402
 from fisheye_svp_ros.io import decoding  # noqa: E402
 from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack  # noqa: E402
@@ -25,6 +24,7 @@ from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
 from fisheye_svp_ros.io.landmark_files import environment  # noqa: E402
 from fisheye_svp_ros.io.lens_files import load_lens  # noqa: E402
 from fisheye_svp_ros.io.share import lens_path  # noqa: E402
+from fisheye_svp_ros.nodes import messages  # noqa: E402
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent  # noqa: E402
 from fisheye_svp_ros.pose import Pose, rotation_from_vector  # noqa: E402
 

@@ -1,0 +1,79 @@
+"""`fisheye-svp lens`: a lens shown, checked, converted."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.optics.lens import Lens
+
+_ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    from fisheye_svp_ros.io.lens_formats import WRITABLE
+
+    parser.add_argument('lens', metavar='LENS',
+                        help='a lens file of this package or of another tool (FILE#cam1 for '
+                        'another camera than the first), or the name of one that comes with it')
+    parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
+    parser.add_argument('--format', choices=WRITABLE,
+                        help='form of the file; by default a lens file of this package')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Show the lens, write it, say what the form cannot hold."""
+    import numpy as np
+
+    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
+    from fisheye_svp_ros.io.lens_formats import read_foreign, write_foreign
+    from fisheye_svp_ros.io.share import lens_path
+
+    path = lens_path(args.lens)
+    lens = load_lens(path)
+    print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
+          ' deg')
+    for name, value in lens.parameters.items():
+        print(f'  {name:<18}{value:.10g}')
+    foreign = read_lens_file(path)
+    if foreign is not None:
+        for camera, worst in foreign.worst_px.items():
+            if worst > 0:
+                print(f'  {camera}: a fit of kannala_brandt, {worst:.2g} px off at worst')
+        for number, rig in enumerate(foreign.rigs):
+            print(f'  camera {number} in camera {number + 1} at '
+                  + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
+    if args.output and args.format:
+        text = write_foreign(lens, args.format)
+        write_text(args.output, text)
+        written = read_foreign(args.output, text)
+        if written is not None:
+            _lost(lens, next(iter(written.lenses.values())))
+    elif args.output:
+        save_lens(lens, args.output)
+
+
+def _lost(lens: Lens, written: Lens) -> None:
+    """Say what the form does not hold, px, by angle and range."""
+    import numpy as np
+
+    from fisheye_svp_ros.optics.camera import project
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    if lens.corrections or lens.target:
+        print(f'left out: {", ".join((*lens.corrections, *lens.target))}')
+    if lens.viewpoint_shift is None or written.viewpoint_shift == lens.viewpoint_shift:
+        return
+    angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]
+    rows = []
+    for angle in angles:
+        theta = np.radians(angle)
+        points = np.array(_RANGES)[:, None] * [np.sin(theta), 0.0, np.cos(theta)]
+        off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
+        rows.append((str(angle), *(f'{value:.3f}' for value in off)))
+    print_table('the viewpoint shift is left out; without it image points are off by, px',
+                ('deg', *(f'{distance:g} m' for distance in _RANGES)), rows)

@@ -1,0 +1,101 @@
+"""mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, and LENSMODEL_STEREOGRAPHIC.
+
+mrcal has no model of Kannala and Brandt.  Its CAHVORE (Gennery, IJCV 2006) solves the equation of
+this package; its image height is f (1 + r0 + r1 c^2 + r2 c^4) c, where c is theta for a
+linearity of 0, tan(l theta) / l above and sin(l theta) / l below.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from dataclasses import replace
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.optics.curves import Gennery, Stereographic
+from fisheye_svp_ros.optics.lens import Lens
+
+_LINEARITY = re.compile(r'LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)$')
+_AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
+_TERMS, _GRID, _TOLERANCE = 3, 400, 0.01
+
+
+def recognises(text: str) -> bool:
+    """Say whether a text is such a file."""
+    return "'LENSMODEL_" in text or '"LENSMODEL_' in text
+
+
+def read(text: str, where: str) -> Foreign:
+    """Read the lens; raises LensError for a model that is no fisheye's, or is incomplete."""
+    try:
+        document = ast.literal_eval(text.strip())
+        model = str(document.get('lensmodel', document.get('lens_model')))
+        values = [float(value) for value in document['intrinsics']]
+        size = [int(value) for value in document['imagersize']]
+    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError) as cause:
+        raise LensError(f'{where}: not a whole .cameramodel ({cause})'.splitlines()[0]) from cause
+    if model == 'LENSMODEL_STEREOGRAPHIC' and len(values) == 4:
+        return _read_stereographic(size, values, where)
+    match = _LINEARITY.match(model)
+    if match is None or len(values) != 12:
+        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE and STEREOGRAPHIC '
+                        'can be read')
+    if max(map(abs, values[4:6])) > _AXIS:
+        raise LensError(f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
+                        'beta); that is not supported')
+    linearity, r = float(match[1]), values[6:9]
+
+    def curve(theta: Array) -> Array:
+        c = _chi(theta, linearity)
+        return np.asarray(c * (1 + r[0] + r[1] * c**2 + r[2] * c**4))
+
+    shift = Gennery(0.0, *values[9:12]) if any(values[9:12]) else None
+    limit = np.pi / 2 / abs(linearity) * (1 - 1e-3) if abs(linearity) > 0.5 else np.pi * 0.999
+    lens, worst = radial.fitted('camera', size, values[:4], curve, limit, where, shift)
+    return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
+
+
+def _chi(theta: Array, linearity: float) -> Array:
+    if abs(linearity) < 1e-12:
+        return theta
+    form = np.tan if linearity > 0 else np.sin
+    return np.asarray(form(linearity * theta) / linearity)
+
+
+def _read_stereographic(size: list[int], values: list[float], where: str) -> Foreign:
+    value = Stereographic().value_and_slope
+    lens, _ = radial.fitted(
+        'camera', size, values, lambda theta: value(theta)[0], np.pi * 0.9, where)
+    lens = replace(lens, fx=values[0], fy=values[1], image_height=Stereographic())
+    return Foreign('mrcal', {'camera': lens}, (), {})
+
+
+def write(lens: Lens) -> str:
+    """Return the lens as CAHVORE of linearity 0, its shift included.
+
+    Raises LensError where three radial terms do not say its curve to a hundredth of a pixel.
+    """
+    theta = np.linspace(0.0, lens.max_incidence, _GRID)[1:]
+    heights = lens.image_height.value_and_slope(theta)[0]
+    powers = theta[:, None] ** np.arange(1, 2 * _TERMS, 2)
+    terms = np.linalg.lstsq(powers, heights, rcond=None)[0]
+    worst = float(np.abs(powers @ terms - heights).max() * max(lens.fx, lens.fy))
+    if worst > _TOLERANCE:
+        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE; '
+                        'mrcal has no other fisheye model with a moving viewpoint')
+    shift = lens.viewpoint_shift
+    if shift is not None and not isinstance(shift, Gennery):
+        raise LensError(f'lens {lens.name!r}: CAHVORE has no viewpoint shift but gennery')
+    e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
+    intrinsics = [lens.fx, lens.fy, lens.cx, lens.cy, 0.0, 0.0,
+                  float(terms[0]) - 1, *map(float, terms[1:]), *e]
+    # A constant part of the shift is where the camera stands.
+    place = [0.0, 0.0, -shift.s0 if shift is not None else 0.0]
+    return ('{\n' + ''.join(f'    {key!r}: {value!r},\n' for key, value in (
+        ('lensmodel', 'LENSMODEL_CAHVORE_linearity=0'), ('intrinsics', intrinsics),
+        ('extrinsics', [0.0, 0.0, 0.0, *place]), ('imagersize', [lens.width, lens.height]),
+    )) + '}\n')

@@ -1,0 +1,128 @@
+"""Radial curves of other tools, and the Kannala-Brandt lens nearest to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.optics.curve_base import ViewpointShift
+from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
+
+Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
+
+_GRID = 600
+_TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
+
+
+def kannala_brandt(
+    name: str, size: Sequence[float], intrinsics: Sequence[float], k: Sequence[float],
+    where: str, shift: ViewpointShift | None = None,
+) -> Lens:
+    """Build a Kannala-Brandt lens: size (width, height); intrinsics fx, fy, cx, cy.
+
+    Raises LensError, naming `where`, where it is impossible.
+    """
+    try:
+        width, height = (int(value) for value in size)
+        fx, fy, cx, cy = (float(value) for value in intrinsics)
+        coefficients = [float(value) for value in k]
+        curve = KannalaBrandt(*coefficients)
+    except (TypeError, ValueError) as cause:
+        raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
+    lens = Lens(name, width, height, fx, fy, cx, cy, curve, np.nan, shift,
+                calibration={'source': where})
+    wrong = lens.check()
+    if wrong:
+        raise LensError(f'{where}: {wrong}')
+    return replace(lens, max_incidence=field_of_view(lens))
+
+
+def fitted(
+    name: str, size: Sequence[float], intrinsics: Sequence[float], curve: Curve, limit: float,
+    where: str, shift: ViewpointShift | None = None,
+) -> tuple[Lens, float]:
+    """Return the Kannala-Brandt lens nearest to a radial curve, and its worst deviation, px.
+
+    limit: angle, rad, up to which the curve grows; no further than the image's corner is fitted.
+    """
+    width, height = size
+    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
+    theta = np.linspace(0.0, limit, _GRID)[1:]
+    heights = curve(theta)
+    grows = np.concatenate([[True], np.diff(heights) > 0]) & np.isfinite(heights)
+    inside = np.logical_and.accumulate(grows) & (heights <= corner)
+    if inside.sum() < 20:
+        raise LensError(f'{where}: the projection does not grow with the incidence angle')
+    theta = np.linspace(0.0, theta[inside][-1], _GRID)[1:]
+    heights = curve(theta)
+    powers = theta[:, None] ** np.arange(1, 10, 2)
+    scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
+    worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
+    lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
+                          [value / scale for value in rest], where, shift)
+    return replace(lens, max_incidence=min(lens.max_incidence, float(theta[-1]))), worst
+
+
+def omnidirectional(xi: float, radial: Sequence[float]) -> tuple[Curve, float]:
+    """Return Mei's curve (Mei and Rives, ICRA 2007) and its limit; xi 0 is a pinhole."""
+    def curve(theta: Array) -> Array:
+        height = np.sin(theta) / (np.cos(theta) + xi)
+        z = height * height
+        return np.asarray(height * (1 + sum(k * z ** (i + 1) for i, k in enumerate(radial))))
+
+    edge = -xi if xi <= 1 else -1 / xi
+    return curve, float(np.arccos(edge)) * (1 - 1e-3)
+
+
+def double_sphere(xi: float, alpha: float) -> tuple[Curve, float]:
+    """Return the double sphere's curve (Usenko, Demmel, Cremers, 3DV 2018) and its limit."""
+    def curve(theta: Array) -> Array:
+        z = np.cos(theta) + xi
+        return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
+
+    return curve, np.pi * (1 - 1e-3)
+
+
+def nearest(lens: Lens) -> Lens:
+    """Return a lens as Kannala-Brandt; raise LensError where that is off by a hundredth px."""
+    if isinstance(lens.image_height, KannalaBrandt):
+        return lens
+    value = lens.image_height.value_and_slope
+    found, worst = fitted(
+        lens.name, (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy),
+        lambda theta: value(theta)[0], lens.max_incidence, lens.name, lens.viewpoint_shift)
+    if worst > _TOLERANCE:
+        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any that this form '
+                        'knows; calibrate it as kannala_brandt')
+    return found
+
+
+def coefficients(lens: Lens) -> list[float]:
+    """Return k1 to k4 of a Kannala-Brandt lens."""
+    return list(lens.image_height.coefficients)
+
+
+def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
+    """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
+    values = mapping.get(name)
+    if not isinstance(values, list) or len(values) != count or not all(
+        isinstance(value, int | float) for value in values
+    ):
+        raise LensError(f'{where}: {name} must be a list of {count} numbers, is {values!r}')
+    return [float(value) for value in values]
+
+
+def unified(alpha: float, beta: float) -> tuple[Curve, float]:
+    """Return the curve of the extended unified model (Khomutenko et al., RA-L 2016)."""
+    def curve(theta: Array) -> Array:
+        sin, cos = np.sin(theta), np.cos(theta)
+        return np.asarray(sin / (alpha * np.sqrt(beta * sin**2 + cos**2) + (1 - alpha) * cos))
+
+    return curve, np.pi * (1 - 1e-3)

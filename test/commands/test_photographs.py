@@ -1,0 +1,131 @@
+"""Photographs straight into the commands; a rig; what is said about what does not fit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from helpers.nodes import SHARED
+from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
+
+from fisheye_svp_ros import cli
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.readers import read_observations, write_observations
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.scene.rigs import rig
+
+PHOTOS = SHARED / 'photos' / 'chessboard'
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten photographs and one without a board."""
+    folder = tmp_path_factory.mktemp('photographs')
+    where = poses(10, 8)
+    images = [photograph(where.take(i), seed=i) for i in range(10)]
+    write(folder, [*images, np.full_like(images[0], 90)])
+    return folder
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    capsys.readouterr()
+    assert cli.main([str(argument) for argument in arguments]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    return said[0]
+
+
+def test_detect_then_calibrate(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / 'observations.csv'
+    assert cli.main(['detect', str(folder), '--board', BOARD, '-o', str(out),
+                     '--overlays', str(tmp_path / 'overlays')]) == 0
+    said = capsys.readouterr()
+    assert 'found in 10 of 11 photographs, 299 points' in said.out
+    assert '10.png: no board found' in said.err
+    document = json.loads((tmp_path / 'observations.detect.json').read_text())
+    assert document['image_size'] == [424, 400]
+    assert [one['frame'] for one in document['photographs']] == [*range(10), -1]
+    assert len(list((tmp_path / 'overlays').glob('*.png'))) == 12
+    assert cv2.imread(str(tmp_path / 'overlays' / '00.png')).shape[2] == 3
+    assert np.isfinite(read_observations(out).sigma).all()
+    assert cli.main(['calibrate', str(out), '--free', 'fx,fy,cx,cy,k1,k2,k3,e0',
+                     '-o', str(tmp_path / 'lens.yaml')]) == 0
+    lens = load_lens(tmp_path / 'lens.yaml')
+    assert (lens.width, lens.calibration['frames']) == (424, 10)
+    assert lens.calibration['rms_px'] < 0.1
+    assert lens.parameters['e0'] == pytest.approx(0.003, abs=5e-4)
+
+
+def test_localize_photographs(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(LENS, tmp_path / 'lens.yaml')
+    assert cli.main(['localize', str(folder), '--board', BOARD, '--lens',
+                     str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'out')]) == 0
+    assert json.loads((tmp_path / 'out' / 'localize.json').read_text())['rms_px'] < 0.1
+    said = refused(capsys, 'localize', folder, '--lens', tmp_path / 'lens.yaml')
+    assert '--board chessboard' in said
+
+
+def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where, left_in_right = poses(10, 3), rig('vergent', 0.05)
+    columns: list[tuple[np.ndarray, ...]] = []
+    for camera, pose in enumerate((where.compose(left_in_right), where)):
+        image = project(LENS, pose.into_body(PRINTED.corners))
+        frame, corner = np.nonzero(image.valid)
+        columns.append((frame, corner, image.uv[frame, corner], PRINTED.corners[corner],
+                        np.full(len(frame), camera)))
+    frame, corner, uv, xyz, camera = (np.concatenate(part) for part in zip(*columns, strict=True))
+    table = tmp_path / 'rig.csv'
+    write_observations(table, make_observations(
+        frame, corner, uv, xyz, camera=camera, cameras=('left', 'right')))
+    out = tmp_path / 'rig'
+    assert cli.main(['calibrate', str(table), '--image-size', '424x400', '--free',
+                     'fx,fy,cx,cy,k1,k2,k3,e0', '-o', str(out)]) == 0
+    assert '-50.0' in capsys.readouterr().out
+    assert {path.name for path in out.glob('*.yaml')} == {'left.yaml', 'right.yaml', 'rig.yaml'}
+    lenses = [f'--lens={name}={out / name}.yaml' for name in ('left', 'right')]
+    assert cli.main(['localize', str(table), *lenses, '-o', str(tmp_path / 'poses')]) == 0
+    assert json.loads((tmp_path / 'poses' / 'right' / 'localize.json').read_text())['frames'] == 10
+    assert 'camera right has no lens' in refused(capsys, 'localize', table, lenses[0])
+    assert 'the observations hold left, right' in refused(
+        capsys, 'localize', table, f'--lens=up={out}/left.yaml')
+
+
+def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = poses(8, 3)
+    image = project(LENS, where.into_body(PRINTED.corners))
+    frame, corner = np.nonzero(image.valid)
+    table = tmp_path / 'mm.csv'
+    uv = image.uv[frame, corner] + 5 * np.random.default_rng(0).standard_normal((len(frame), 2))
+    write_observations(table, make_observations(frame, corner, uv, 1000 * PRINTED.corners[corner]))
+    assert 'the size of the images' in refused(capsys, 'calibrate', table)
+    cli.main(['calibrate', str(table), '--image-size', '424x400'])
+    said = capsys.readouterr().err
+    assert 'are these mm?' in said
+    assert 'does not fit this lens' in said
+
+
+@pytest.mark.skipif(not PHOTOS.exists(), reason='the photographs are not here')
+def test_real_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / 'lens.yaml'
+    assert cli.main(['calibrate', str(PHOTOS), '--board', 'chessboard:4x6:30mm',
+                     '-o', str(out)]) == 0
+    figures = load_lens(out).calibration
+    assert figures['frames'] >= 24
+    assert figures['rms_px'] < 0.25
+
+
+def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
+    save_lens(LENS, tmp_path / 'lens.yaml')
+    for name in ('one', 'two'):
+        assert cli.main(['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD,
+                         '--count', '2', '--bow', '1', '-o', str(tmp_path / name)]) == 0
+    assert (tmp_path / 'one/001.png').read_bytes() == (tmp_path / 'two/001.png').read_bytes()
+    assert len(read_observations(tmp_path / 'one/observations.csv').frames) == 2

@@ -1,0 +1,208 @@
+"""Lenses of other tools: their documented files are read, ours come back from each form."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from helpers.nodes import SHARED
+
+from fisheye_svp_ros import cli
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file
+from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.curves import Equidistant, Gennery, KannalaBrandt, Stereographic
+from fisheye_svp_ros.optics.lens import Lens
+
+LENS = Lens('front', 848, 800, 285.2, 284.9, 424.3, 398.7,
+            KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0))
+SHORT = replace(LENS, image_height=KannalaBrandt(-0.011, 0.0041), viewpoint_shift=Gennery(
+    0.0, 0.004, 0.001, -0.0002))
+
+# The example of Kalibr's wiki (yaml-formats), its second camera made one with fisheye lenses
+CAMCHAIN = """
+cam0:
+  camera_model: pinhole
+  intrinsics: [190.978477, 190.973307, 254.931706, 256.897442]
+  distortion_model: equidistant
+  distortion_coeffs: [0.0034823894, 0.0007150348, -0.0020532361, 0.00020293673]
+  resolution: [512, 512]
+  rostopic: /cam0/image_raw
+cam1:
+  camera_model: omni
+  intrinsics: [0.80065662, 833.006, 830.345, 373.850, 253.749]
+  distortion_model: radtan
+  distortion_coeffs: [-0.33518750, 0.13211436, 0.0, 0.0]
+  T_cn_cnm1:
+  - [ 0.99998854, 0.00216014, 0.00427195,-0.11003785]
+  - [-0.00221074, 0.99992702, 0.01187697, 0.00045792]
+  - [-0.00424598,-0.01188627, 0.99992034,-0.00064487]
+  - [0.0, 0.0, 0.0, 1.0]
+  resolution: [752, 480]
+  rostopic: /cam1/image_raw
+cam2:
+  camera_model: ds
+  intrinsics: [-0.2, 0.59, 158.0, 158.0, 255.0, 257.0]
+  distortion_model: none
+  distortion_coeffs: []
+  resolution: [512, 512]
+"""
+
+
+def directions(lens: Lens, distance: float = 3.0) -> np.ndarray:
+    theta = np.linspace(0.01, 0.97 * lens.max_incidence, 40)
+    azimuth = np.linspace(0, 6, 40)
+    sin = np.sin(theta)
+    return distance * np.stack(
+        [sin * np.cos(azimuth), sin * np.sin(azimuth), np.cos(theta)], axis=-1)
+
+
+@pytest.mark.parametrize('form', [form for form in WRITABLE if form != 'mrcal'])
+@pytest.mark.parametrize('shift', [None, SHORT.viewpoint_shift])
+def test_round_trip(form: str, shift: Gennery | None, tmp_path: Path) -> None:
+    path = tmp_path / 'lens.txt'
+    path.write_text(write_foreign(replace(LENS, viewpoint_shift=shift), form))
+    back = load_lens(path)
+    points = directions(LENS)
+    assert np.abs(project(back, points).uv - project(LENS, points).uv).max() < 1e-6
+    assert (back.width, back.height) == (848, 800)
+
+
+def test_round_trip_of_cahvore_keeps_the_shift(tmp_path: Path) -> None:
+    path = tmp_path / 'lens.cameramodel'
+    path.write_text(write_foreign(SHORT, 'mrcal'))
+    back = load_lens(path)
+    assert back.viewpoint_shift == SHORT.viewpoint_shift
+    points = directions(SHORT, 0.2)
+    assert np.abs(project(back, points).uv - project(SHORT, points).uv).max() < 1e-6
+    with pytest.raises(LensError, match='px from any CAHVORE'):
+        write_foreign(replace(LENS, image_height=KannalaBrandt(-0.01, 0.0, 0.0, -0.002)), 'mrcal')
+
+
+@pytest.mark.parametrize('linearity', ['0.37', '-0.5', '0'])
+def test_cahvore_of_any_linearity(linearity: str, tmp_path: Path) -> None:
+    """Against the projection as Gennery writes it, solved by bisection."""
+    path = tmp_path / 'x.cameramodel'
+    r, e = [0.01, -0.02, 0.003], [0.004, 0.001, 0.0]
+    path.write_text(repr({
+        'lensmodel': f'LENSMODEL_CAHVORE_linearity={linearity}', 'imagersize': [800, 800],
+        'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, *r, *e], 'extrinsics': [0] * 6}))
+    lens, value = load_lens(path), float(linearity)
+    worst = next(iter(read_lens_file(path).worst_px.values()))
+    for z, radius in ((0.3, 0.1), (0.2, 0.2), (0.1, 0.3)):
+        low, high = 0.0, 2.0
+        for _ in range(80):
+            t = (low + high) / 2
+            growth = (t - np.sin(t)) * (e[0] + e[1] * t**2 + e[2] * t**4)
+            low, high = (t, high) if z * np.sin(t) - radius * np.cos(t) - growth < 0 else (low, t)
+        c = np.tan(value * t) / value if value > 0 else np.sin(value * t) / value if value else t
+        u = 400 + 300 * c * (1 + r[0] + r[1] * c**2 + r[2] * c**4)
+        found = project(lens, np.array([radius, 0.0, z])).uv[0]
+        assert found == pytest.approx(u, abs=worst + 1e-6)
+
+
+def test_kalibr(tmp_path: Path) -> None:
+    path = tmp_path / 'camchain.yaml'
+    path.write_text(CAMCHAIN)
+    lens = load_lens(path)
+    assert lens.parameters['k3'] == -0.0020532361
+    foreign = read_lens_file(path)
+    assert foreign.rigs[0].position == pytest.approx([-0.11003785, 0.00045792, -0.00064487])
+    assert foreign.worst_px['cam0'] == 0
+    omni = load_lens(f'{path}#cam1')
+    points = directions(omni)
+    unit = points / 3.0
+    m = unit[:, :2] / (unit[:, 2:] + 0.80065662)
+    z = (m**2).sum(axis=1, keepdims=True)
+    uv = [833.006, 830.345] * m * (1 - 0.33518750 * z + 0.13211436 * z**2) + [373.850, 253.749]
+    assert np.abs(project(omni, points).uv - uv).max() < foreign.worst_px['cam1'] + 1e-6 < 0.1
+    sphere = load_lens(f'{path}#cam2')
+    unit = directions(sphere) / 3.0
+    z = unit[:, 2:] - 0.2
+    depth = 0.59 * np.sqrt((unit[:, :2]**2).sum(1, keepdims=True) + z**2) + 0.41 * z
+    uv = 158.0 * unit[:, :2] / depth + [255.0, 257.0]
+    assert np.abs(project(sphere, unit).uv - uv).max() < foreign.worst_px['cam2'] + 1e-6 < 0.1
+    with pytest.raises(LensError, match='no camera'):
+        load_lens(f'{path}#cam7')
+
+
+def test_opencv_xml_and_basalt(tmp_path: Path) -> None:
+    import cv2
+
+    path = tmp_path / 'fisheye.xml'
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write('K', np.array([[300.0, 0, 320], [0, 301.0, 240], [0, 0, 1]]))
+    storage.write('D', np.array([[0.01], [0.002], [0.0], [-0.001]]))
+    storage.write('image_width', 640)
+    storage.write('image_height', 480)
+    storage.release()
+    lens = load_lens(path)
+    assert (lens.fy, lens.cx, lens.parameters['k4']) == (301.0, 320.0, -0.001)
+    json_path = tmp_path / 'calibration.json'
+    pose = {'px': 0.1, 'py': 0, 'pz': 0, 'qx': 0, 'qy': 0, 'qz': 0, 'qw': 1}
+    camera = {'camera_type': 'ds', 'intrinsics': {
+        'fx': 158.0, 'fy': 158.0, 'cx': 255.0, 'cy': 257.0, 'xi': -0.2, 'alpha': 0.59}}
+    json_path.write_text(json.dumps({'value0': {
+        'T_imu_cam': [pose, {**pose, 'px': 0.3}], 'intrinsics': [camera, camera],
+        'resolution': [[512, 512], [512, 512]]}}))
+    foreign = read_lens_file(json_path)
+    assert list(foreign.lenses) == ['cam0', 'cam1']
+    assert foreign.rigs[0].position == pytest.approx([-0.2, 0, 0])
+
+
+def test_boofcv() -> None:
+    path = SHARED / 'photos' / 'chessboard' / 'fisheye.yaml'
+    if not path.exists():
+        pytest.skip('the photographs are not here')
+    lens = load_lens(path)
+    assert (lens.width, lens.height) == (640, 720)
+    assert 80 < np.degrees(lens.max_incidence) < 120
+    assert next(iter(read_lens_file(path).worst_px.values())) < 0.5
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    (CAMCHAIN.replace('equidistant', 'fov'), 'cam0: pinhole with fov'),
+    (CAMCHAIN.replace('resolution: [512, 512]', 'resolution: 512', 1), 'cam0: resolution'),
+    (CAMCHAIN.replace('omni', 'omega'), "cam1: camera_model is 'omega'"),
+    ('%YAML:1.0\n---\nimage_width: 3\nimage_height: 3\n', 'it has none of'),
+    ('{"camera_type": 1}', 'not a whole Basalt'),
+    ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}", 'can be read'),
+    ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
+    ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: plumb_bob\n'
+     'image_width: 4\nimage_height: 4\n', "distortion_model is 'plumb_bob'"),
+])
+def test_refused_in_one_line(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / 'lens.yaml'
+    path.write_text(text)
+    with pytest.raises(LensError, match=said.replace('(', r'\(')) as error:
+        load_lens(path)
+    assert '\n' not in str(error.value)
+    assert str(path) in str(error.value)
+
+
+def test_curves_that_a_form_cannot_say() -> None:
+    bare = replace(LENS, image_height=Equidistant())
+    assert yaml.safe_load(write_foreign(bare, 'kalibr'))['cam0']['distortion_coeffs'] == (
+        pytest.approx([0, 0, 0, 0], abs=1e-9))
+    with pytest.raises(LensError, match='px from any'):
+        write_foreign(replace(
+            bare, image_height=Stereographic(), max_incidence=2.7, width=9000, height=9000,
+            cx=4500.0, cy=4500.0), 'ros')
+
+
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from fisheye_svp_ros.io.lens_files import save_lens
+
+    save_lens(SHORT, tmp_path / 'lens.yaml')
+    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'ros.yaml'),
+                     '--format', 'ros']) == 0
+    said = capsys.readouterr().out
+    assert 'viewpoint shift is left out' in said
+    assert '0.1 m' in said
+    assert cli.main(['lens', str(tmp_path / 'ros.yaml'), '-o', str(tmp_path / 'back.yaml')]) == 0
+    assert load_lens(tmp_path / 'back.yaml').viewpoint_shift is None
