@@ -51,7 +51,7 @@ class LinearImage:
 
     @cached_property
     def incidence(self) -> Incidence:
-        """Where the points meet the lens."""
+        """Where the points have their ray through the lens."""
         return incidence(self.lens, self.points, self.limited)
 
     @property

@@ -73,7 +73,7 @@ class ImageHeight(Curve):
     def from_sine(
         self, theta: Array, sine: Callable[[], tuple[Array, Array]]
     ) -> tuple[Array, Array]:
-        """Do as `value_and_slope`; sine: gives sine and cosine of theta faster than theta does."""
+        """See `value_and_slope`; sine: gives sine and cosine of theta faster than theta does."""
         return self.value_and_slope(theta)
 
     def angle(self, height: Array) -> Array:

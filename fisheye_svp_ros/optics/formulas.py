@@ -100,7 +100,7 @@ def halved(sin: Array, cos: Array) -> tuple[Array, Array]:
     return ahead * smaller + behind * larger, ahead * larger + behind * smaller
 
 
-def approach(
+def newton_step(
     r: Array, z: Array, sin: Array, cos: Array, shift: Array, rise: Array
 ) -> tuple[Array, Array]:
     """Return Newton's step of theta in r cos - (z - s) sin = 0, and the clearance, m.

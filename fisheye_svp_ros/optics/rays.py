@@ -1,4 +1,4 @@
-"""Where points meet a lens: the ray equation r cos(theta) - (Z - s(theta)) sin(theta) = 0.
+"""The ray of a point: r cos(theta) - (Z - s(theta)) sin(theta) = 0 solved for theta.
 
 Source: Kita, section 2 and figure 2.  Newton's method far from the lens; near it, where there may
 be no ray or two, a search.
@@ -13,7 +13,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift, shift_at
-from fisheye_svp_ros.optics.formulas import approach
+from fisheye_svp_ros.optics.formulas import newton_step
 from fisheye_svp_ros.optics.lens import Lens
 
 NEWTON_STEPS, MORE_STEPS = 3, 3  # for all points, and for those that need them
@@ -25,14 +25,14 @@ _MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still get
 _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
 BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
 
-Bent = tuple[Array, Array, Array]  # sine and cosine of theta, clearance (m)
+ShiftedRays = tuple[Array, Array, Array]  # sine and cosine of theta, clearance (m)
 
 
-class Meeting(NamedTuple):
-    """Where points meet the lens; every field (...).
+class RaySolution(NamedTuple):
+    """Where points have their ray through the lens; every field (...).
 
     x, y, z: in the camera frame, m; x2: x^2; r2, r: of the distance r from the axis; d2: of that
-    from the origin; theta: rad; bent: where the lens has a shift; its clearance is the ray
+    from the origin; theta: rad; shifted: where the lens has a shift; its clearance is the ray
     equation's derivative by theta, the sign turned.
     """
 
@@ -44,7 +44,7 @@ class Meeting(NamedTuple):
     d2: Array
     r: Array
     theta: Array
-    bent: Bent | None
+    shifted: ShiftedRays | None
     valid: Mask
 
     def height(self, curve: ImageHeight) -> tuple[Array, Array]:
@@ -52,24 +52,24 @@ class Meeting(NamedTuple):
         return curve.from_sine(self.theta, self._sine)
 
     def _sine(self) -> tuple[Array, Array]:
-        if self.bent is not None:
-            return self.bent[:2]
+        if self.shifted is not None:
+            return self.shifted[:2]
         inverse = 1.0 / np.sqrt(self.d2)
         return self.r * inverse, self.z * inverse
 
     def change(self, outward: Array) -> Array:
         """Write dtheta/dr, 1/m, and return -dtheta/dZ / r, 1/m^2."""
-        if self.bent is None:
+        if self.shifted is None:
             axial = 1.0 / self.d2
             np.multiply(self.z, axial, out=outward)
             return axial
-        sin, cos, clearance = self.bent
+        sin, cos, clearance = self.shifted
         np.divide(cos, clearance, out=outward)
         return sin / (clearance * self.r)
 
 
-def meet(lens: Lens, local: Array, limited: bool) -> Meeting:
-    """Return where points (3, ...) in the camera frame meet the lens, none exactly on its axis.
+def solve_incidence(lens: Lens, local: Array, limited: bool) -> RaySolution:
+    """Return the rays of points (3, ...) in the camera frame, none exactly on the axis.
 
     limited: see `edge`.
     """
@@ -79,15 +79,15 @@ def meet(lens: Lens, local: Array, limited: bool) -> Meeting:
     d2 += r2
     r = np.sqrt(r2)
     theta = np.arctan2(r, z)
-    bent: Bent | None = None
+    shifted: ShiftedRays | None = None
     if lens.viewpoint_shift is None:
         valid = d2 > CLEAR * CLEAR
     else:
         distance = np.sqrt(d2)
-        theta, bent = _past_shift(lens, r, z, distance, (theta, r / distance, z / distance))
-        valid = bent[2] > CLEAR
+        theta, shifted = _shifted_rays(lens, r, z, distance, (theta, r / distance, z / distance))
+        valid = shifted[2] > CLEAR
     valid &= theta <= edge(lens, limited)
-    return Meeting(x, y, z, x2, r2, d2, r, theta, bent, valid)
+    return RaySolution(x, y, z, x2, r2, d2, r, theta, shifted, valid)
 
 
 def edge(lens: Lens, limited: bool) -> float:
@@ -111,9 +111,9 @@ def caustic_range(shift: ViewpointShift, limit: float) -> float:
     return float(max(np.max(outer[along > 0], initial=0.0), np.max(np.abs(value))))
 
 
-def _past_shift(
+def _shifted_rays(
     lens: Lens, r: Array, z: Array, distance: Array, start: tuple[Array, Array, Array]
-) -> tuple[Array, Bent]:
+) -> tuple[Array, ShiftedRays]:
     """Return theta, and its sine, cosine and clearance; NaN where there is no ray."""
     shift = lens.viewpoint_shift
     assert shift is not None
@@ -124,7 +124,7 @@ def _past_shift(
         found = _scan(shift, limit, r[apart], z[apart])
         theta[apart], sin[apart], cos[apart] = found, np.sin(found), np.cos(found)
         value, rise = shift_at(shift, found, sin[apart], cos[apart])
-        clearance[apart] = approach(r[apart], z[apart], sin[apart], cos[apart], value, rise)[1]
+        clearance[apart] = newton_step(r[apart], z[apart], sin[apart], cos[apart], value, rise)[1]
     return theta, (sin, cos, clearance)
 
 
@@ -139,7 +139,7 @@ def _newton(
     for count in range(steps):
         if count:
             sin, cos = _sine_and_cosine(theta)
-        step, clearance = approach(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
+        step, clearance = newton_step(r, z, sin, cos, *shift_at(shift, theta, sin, cos))
         theta += step
     # The last step is so small that sine and cosine follow it in a straight line.
     turned = step * cos

@@ -49,7 +49,7 @@ def settle(points: float) -> str:
 
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
-    """Return where points (M, 3), m, in the camera frame meet the lens."""
+    """Return where points (M, 3), m, in the camera frame have their ray through the lens."""
     return numpy_engine.incidence(lens, points, limited)
 
 

@@ -3,8 +3,8 @@
 A system is V views of a rig of one or two cameras: a pose of the right camera for each view and,
 for two, the rig that they share.  Its state (V + 1, 4, 3) is these poses and last the rig, each a
 rotation and, in the fourth row, a position.  Its normal equations (V + 1, 13, 6) are for each its
-own, those mixed with the rig, and the gradient.  What is not plain sailing (a point near the
-lens, a singular system) is left to the reference.
+own, those mixed with the rig, and the gradient.  A point near the lens and a singular
+system end the compiled run: those systems are solved by the reference.
 """
 
 from __future__ import annotations

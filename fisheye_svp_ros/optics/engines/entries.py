@@ -37,7 +37,7 @@ from fisheye_svp_ros.optics.engines.kernels import (
     factor,
     image,
     load,
-    meet,
+    solve_incidence,
     substitute,
 )
 from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
@@ -81,7 +81,7 @@ def _residual(w, points, uv, row, lens, pose, out):
     for start in range(0, len(points), B):
         n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
         load(w, n, points[start:], *pose)
-        meet(w, n, lens, BEHIND)
+        solve_incidence(w, n, lens, BEHIND)
         image(w, n, lens)
         remaining, off = 0, out[start:]
         for i in range(n):
@@ -151,7 +151,7 @@ def project(points, lens, edge, uv, state):
     for start in range(0, len(points), B):
         n = min(B, len(points) - start)
         _take(w, n, points[start:])
-        meet(w, n, lens, edge)
+        solve_incidence(w, n, lens, edge)
         image(w, n, lens)
         _write(w, n, uv[start:], state[start:])
 
@@ -165,7 +165,7 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
         for start in range(0, points.shape[1], B):
             n = min(B, points.shape[1] - start)
             load(w, n, points[s, start:], r, position[s])
-            meet(w, n, lens, edge)
+            solve_incidence(w, n, lens, edge)
             image(w, n, lens)
             derivatives(w, n, lens)
             _write(w, n, uv[s, start:], state[s, start:])

@@ -25,7 +25,8 @@ BARE = OPTIONS | ({'_nrt': False} if hasattr(CPUTargetOptions, '_nrt') else {})
 HEIGHTS = (formulas.orthographic, formulas.equidistant, formulas.equisolid,
            formulas.stereographic, formulas.kannala_brandt)
 SHIFTS = (formulas.gennery, formulas.flat_port)
-for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.approach, formulas.point_derivatives):
+for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.newton_step,
+                formulas.point_derivatives):
     register_jitable(**OPTIONS)(formula)
 
 B = 248  # points in a block; rows a power of two apart would share the same lines of the cache
@@ -76,7 +77,7 @@ def _turned(sin, cos, turn):
 
 
 @njit(**BARE)
-def meet(w, n, lens, edge):
+def solve_incidence(w, n, lens, edge):
     """Solve the ray equation of n points in the rows X, Y, Z; STATE says how it went."""
     for i in range(n):
         x, y, z = w[X + i] + NOWHERE, w[Y + i], w[Z + i]
@@ -89,7 +90,7 @@ def meet(w, n, lens, edge):
         w[COS0 + i] = w[COS + i] = z * inverse
         w[R + i], w[CLEARANCE + i] = r, d
     if lens[SHIFT_KIND] >= 0:
-        _past_shift(w, n, lens)
+        _shifted_rays(w, n, lens)
     for i in range(n):
         seen = (w[CLEARANCE + i] > CLEAR) & (w[THETA + i] <= edge)
         w[STATE + i] = VALID if seen else INVALID
@@ -101,23 +102,23 @@ def meet(w, n, lens, edge):
 
 
 @njit(**BARE)
-def _past_shift(w, n, lens):
+def _shifted_rays(w, n, lens):
     for i in range(n):
         w[TURN + i] = 0.0
     late = 0
     for _ in range(NEWTON_STEPS):
-        late = _approach(w, 0, n, lens)
+        late = _newton_steps(w, 0, n, lens)
     if late:
         for i in range(n):
             for _ in range(MORE_STEPS):
                 if not w[STATE + i] < SETTLED:
-                    _approach(w, i, i + 1, lens)
+                    _newton_steps(w, i, i + 1, lens)
             if not w[STATE + i] < SETTLED:
                 w[TURN + i] = np.nan
 
 
 @njit(**BARE)
-def _approach(w, first, last, lens):
+def _newton_steps(w, first, last, lens):
     """Take one Newton step with some points; return how many have not settled."""
     k = lens[SHIFT_K:]
     if lens[SHIFT_KIND] == 0:
@@ -130,7 +131,7 @@ def _approach(w, first, last, lens):
                 w[THETA + i], w[SIN + i], w[COS + i], k[0], k[1])
     late = 0
     for i in range(first, last):
-        step, clearance = formulas.approach(
+        step, clearance = formulas.newton_step(
             w[R + i], w[Z + i], w[SIN + i], w[COS + i], w[U + i], w[V + i])
         turn = w[TURN + i] + step
         w[TURN + i], w[CLEARANCE + i] = turn, clearance
@@ -215,7 +216,7 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
             w[X + i] = 0.0 if unused else w[X + i]
             w[Y + i] = 0.0 if unused else w[Y + i]
             w[Z + i] = 1.0 if unused else w[Z + i]
-        meet(w, n, lens, BEHIND)
+        solve_incidence(w, n, lens, BEHIND)
         image(w, n, lens)
         derivatives(w, n, lens)
         failed = 0

@@ -34,7 +34,7 @@ _lenses: dict[int, tuple[Lens, Array | None]] = {}
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
-    """Do as `engines.project` says."""
+    """See `engines.project`."""
     numbers = packed(lens)
     if numbers is None:
         return numpy_engine.project(lens, points, limited)
@@ -54,7 +54,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """Do as `engines.linearise_views` says."""
+    """See `engines.linearise_views`."""
     numbers = packed(lens)
     if numbers is None:
         return numpy_engine.linearise_views(lens, rotation, position, points, limited)
@@ -84,7 +84,7 @@ def linearise_views(
 def localize(
     lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose, limit: int = MAX_ITERATIONS
 ) -> tuple[Localization, int, int] | None:
-    """Do as `engines.localize` says; limit: of the iterations."""
+    """See `engines.localize`; limit: of the iterations."""
     numbers = packed(lens)
     if numbers is None:
         return None
@@ -110,7 +110,7 @@ def localize(
 def adjust_rigs(
     lenses: tuple[Lens, Lens], seen: tuple[Seen, Seen], state: tuple[Array, ...]
 ) -> Rigs | None:
-    """Do as `engines.adjust_rigs` says."""
+    """See `engines.adjust_rigs`."""
     left, right = map(packed, lenses)
     if left is None or right is None:
         return None

@@ -10,7 +10,7 @@ from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.engines.results import Incidence, Seen
 from fisheye_svp_ros.optics.formulas import NOWHERE, point_derivatives
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.optics.rays import Meeting, meet
+from fisheye_svp_ros.optics.rays import RaySolution, solve_incidence
 
 _BLOCK = 16_700  # points; rows a power of two apart would share the same lines of the cache
 
@@ -35,11 +35,11 @@ _quiet = np.errstate(divide='ignore', invalid='ignore')
 
 @_quiet
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
-    """Do as `engines.incidence` says."""
+    """See `engines.incidence`."""
     theta, valid = np.empty(len(points)), np.empty(len(points), dtype=bool)
     unit = np.empty((2, len(points)))
     for part in _blocks(len(points)):
-        met = _meet(lens, _rows(points[part]), limited)
+        met = _solved_incidence(lens, _rows(points[part]), limited)
         theta[part], valid[part] = met.theta, met.valid
         np.divide((met.x, met.y), met.r, out=unit[:, part])
     return Incidence(theta, unit, valid)
@@ -47,10 +47,10 @@ def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
 
 @_quiet
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
-    """Do as `engines.project` says."""
+    """See `engines.project`."""
     uv, valid = np.empty((2, len(points))), np.empty(len(points), dtype=bool)
     for part in _blocks(len(points)):
-        met = _meet(lens, _rows(points[part]), limited)
+        met = _solved_incidence(lens, _rows(points[part]), limited)
         ratio, _ = met.height(lens.image_height)
         ratio /= met.r
         np.multiply(met.x, ratio, out=uv[0, part])
@@ -65,13 +65,13 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
 def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
-    """Do as `engines.linearise_views` says."""
+    """See `engines.linearise_views`."""
     shape = points.shape[:2]
     uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
     d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
     for part in _tiles(*shape):
         local = _seen(rotation, position, points, part)
-        met = _meet(lens, local, limited)
+        met = _solved_incidence(lens, local, limited)
         out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
         _add_up(sums[part[0]], met, met.height(lens.image_height), *out)
         _centre(lens, met.valid, uv[:, *part])
@@ -84,7 +84,7 @@ def linearise_views(
 def pose_equations(
     lens: Lens, rotation: Array, position: Array, seen: Seen
 ) -> tuple[Array, Array, Array]:
-    """Do as `engines.pose_equations` says."""
+    """See `engines.pose_equations`."""
     points, uv, weight = seen
     systems, count = weight.shape
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))
@@ -94,7 +94,7 @@ def pose_equations(
         local = _seen(rotation, position, points, part)
         if not weights.all():
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
-        met = _meet(lens, local, False)
+        met = _solved_incidence(lens, local, False)
         height, slope = met.height(lens.image_height)
         height *= weights
         slope *= weights
@@ -140,10 +140,10 @@ def _rows(points: Array) -> Array:
     return np.array(points.T, order='C')
 
 
-def _meet(lens: Lens, local: Array, limited: bool) -> Meeting:
-    """Do as `rays.meet` does; moves points off the axis."""
+def _solved_incidence(lens: Lens, local: Array, limited: bool) -> RaySolution:
+    """See `rays.solve_incidence`; moves points off the axis."""
     local[0] += NOWHERE
-    return meet(lens, local, limited)
+    return solve_incidence(lens, local, limited)
 
 
 def _seen(
@@ -166,11 +166,11 @@ def _centre(lens: Lens, valid: Mask, uv: Array) -> None:
 
 
 def _add_up(
-    sums: Array, met: Meeting, height: tuple[Array, Array], d_pose: Array, uv: Array
+    sums: Array, met: RaySolution, height: tuple[Array, Array], d_pose: Array, uv: Array
 ) -> None:
     """Write derivatives by place and by turn (S, 12, N), and image points around the origin.
 
-    height: of `Meeting.height`; uv (S, 2, N).
+    height: of `RaySolution.height`; uv (S, 2, N).
     """
     x, y, z, mixed = met.x, met.y, met.z, met.x * met.y
     terms = np.empty((6, *z.shape))  # for both in turn, as it is in the cache

@@ -14,7 +14,7 @@ Seen = tuple[Array, Array, Array]
 
 
 class Incidence(NamedTuple):
-    """Where points meet the lens, and whether they do.
+    """Where points have their ray through the lens, and whether they do.
 
     theta (...), rad; unit (2, ...): direction of the image height; valid (...).
     """
