@@ -93,7 +93,7 @@ def tags(**values: object) -> Any:
     ({'lens': 'a\0b'}, ''),  # rclpy ends a string there
     ({'lens': 'a' * 5000}, 'is a file, and only names in config/'),
     ({'lens': '/dev/zero'}, 'is a file, and only names in config/'),
-    ({'lens': 'nothere'}, 'cannot be read'),
+    ({'lens': 'nothere'}, "'nothere' is neither"),
 ])
 def test_a_scenario_that_cannot_be_used_is_a_set_that_cannot_be_solved(
     graph: Callable[..., Graph], values: dict[str, object], reason: str
