@@ -44,8 +44,10 @@ def test_images_to_points(graph: Graph) -> None:
     where = poses(2, 4)
     images = graph.tell(Image, 'image', SENSOR)
     for i in range(2):
-        graph.until(lambda i=i: (images.publish(raw(photograph(where.take(i)), 7 + i)),
-                                 any(p.header.stamp.nanosec == 7 + i for p in points))[1])
+        message = raw(photograph(where.take(i)), 7 + i)
+        graph.until(lambda message=message: (
+            images.publish(message),
+            any(p.header.stamp == message.header.stamp for p in points))[1])
         found = read_image_points(points[-1])
         true = true_corners(where.take(i))[found.landmark]
         assert np.abs(found.uv - true).max() < 0.1
