@@ -66,7 +66,8 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
         say(f'{args.source}: {bag.damage}')
     if found:
         files.append(args.output / 'residuals.png')
-        draw_residuals([one.points for one in found], files[-1])
+        draw_residuals([one.points for one in found],
+                       [one.tags.get('lens', '') for one in found], files[-1])
         files += _fields(found, args.output / 'residual_fields.png')
     return files
 

@@ -172,23 +172,34 @@ def _draw_spreads(table: SweptTable, by: str | None, path: Path) -> None:
         legend_below(figure, axes[0])
 
 
-def draw_residuals(clouds: Sequence[Points], path: Path) -> None:
-    """Draw residuals (clouds.RESIDUALS) against the incidence angle and the range."""
-    points = np.concatenate(clouds)
-    points = points[::-(-len(points) // _CLOUD)]
-    size = np.hypot(points['du'], points['dv'])
+def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) -> None:
+    """Draw residuals (clouds.RESIDUALS) against the incidence angle and the range.
+
+    lenses: of each cloud, told apart by colour; '' where it is not known.
+    """
+    names = list(dict.fromkeys(lenses))
+    each = max(1, _CLOUD // len(names))
     with picture(path, 8.4, 3.6) as figure:
         axes = figure.subplots(1, 2, sharey=True)
-        for axis, x, label in (
-            (axes[0], np.degrees(points['theta']), 'incidence angle, deg'),
-            (axes[1], points['range'], 'range, m'),
-        ):
-            axis.plot(x, size, '.', color=OURS, alpha=0.4, markersize=4, markeredgewidth=0)
-            axis.set_xlabel(label)
-        if points['range'].min() > 0 and np.ptp(np.log10(points['range'])) >= 1:
+        nearest, farthest = np.inf, 0.0
+        for name, colour in zip(names, _hues(len(names)), strict=True):
+            points = np.concatenate(
+                [cloud for cloud, lens in zip(clouds, lenses, strict=True) if lens == name])
+            points = points[::-(-len(points) // each)]
+            size = np.hypot(points['du'], points['dv'])
+            for axis, x in zip(axes, (np.degrees(points['theta']), points['range']), strict=True):
+                axis.plot(x, size, '.', color=colour, alpha=0.4, markersize=4, markeredgewidth=0,
+                          label=name)
+            nearest = min(nearest, points['range'].min())
+            farthest = max(farthest, points['range'].max())
+        if 0 < 10 * nearest <= farthest:
             axes[1].set_xscale('log')
             axes[1].tick_params(axis='x', which='minor', labelbottom=False)
+        axes[0].set(xlabel='incidence angle, deg')
+        axes[1].set(xlabel='range, m')
         axes[0].set_title('Residual of image points, px', loc='left')
+        if len(names) > 1:
+            legend_below(figure, axes[0])
 
 
 def _hues(count: int) -> list[Any]:

@@ -110,8 +110,15 @@ def test_a_rig_is_drawn(tmp_path: Path) -> None:
 
 def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
     columns = [np.linspace(0.1, 1.0, 50)] * 6
-    draw_residuals([structured(RESIDUALS, np.arange(50), *columns)] * 3, tmp_path / 'a.png')
-    assert imread(tmp_path / 'a.png').shape[1] > 500
+    cloud = structured(RESIDUALS, np.arange(50), *columns)
+    pictures = []
+    for lenses in (['', '', ''], ['a', 'b', 'b']):
+        draw_residuals([cloud] * 3, lenses, tmp_path / 'a.png')
+        pictures.append(imread(tmp_path / 'a.png'))
+    assert pictures[0].shape[1] > 500
+    # Colours of their own and a legend tell lenses apart.
+    assert len(np.unique(pictures[1].reshape(-1, 4), axis=0)) > (
+        len(np.unique(pictures[0].reshape(-1, 4), axis=0)))
 
 
 def test_a_table_in_which_nothing_differs_is_refused(
