@@ -193,7 +193,7 @@ def test_rigs_and_their_covariances(compiled, engine):
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
 
 
-def test_what_is_not_plain_sailing_goes_to_the_reference(compiled, engine):
+def test_points_near_the_lens_and_singular_systems_go_to_the_reference(compiled, engine):
     views, pose = views_and_poses(3)
     model = ForwardModel(FISH214)
     line = np.linspace(0.2, 0.6, 33)[:, None] * [1.0, 0.5, 2.0]
