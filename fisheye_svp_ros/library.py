@@ -48,7 +48,8 @@ class Localized(Result):
     covariance (F, 6, 6), m and rad, of the change in `Pose.retract`; residual (N, 2), px: measured
     minus predicted, in the order of the observations, NaN where not used; sigma_px: noise of u and
     v, estimated, None where the observations bring their own; left_out: frames whose points do
-    not fix a pose.
+    not fix a pose; reasons (F,): why a pose should not be relied on, '' where nothing speaks
+    against it: its misfit, or gross errors, which are not used.
     """
 
     frame: Index
@@ -58,6 +59,7 @@ class Localized(Result):
     residual: Array
     sigma_px: float | None
     left_out: tuple[int, ...]
+    reasons: tuple[str, ...]
 
     def table(self) -> Columns:
         """Return one row a frame, as poses.csv has it, with the rms."""
@@ -229,12 +231,12 @@ def localize(observations: AnyObservations, lens: AnyLens) -> Localized:
     """
     table = _table(observations)
     measured = localize_measured(ForwardModel(load_lens(lens)), table)
-    views, result = measured.views, measured.result
+    views, result, fitted = measured.views, measured.result, measured.fitted
     residual = np.full((len(table), 2), np.nan)
-    residual[views.row[views.used]] = result.residual[views.used]
+    residual[views.row[views.used]] = fitted[views.used]
     return Localized(
-        views.frame, result.pose, result.covariance, np.array([*map(rms_px, result.residual)]),
-        residual, measured.sigma, measured.left_out,
+        views.frame, result.pose, result.covariance, np.array([*map(rms_px, fitted)]), residual,
+        measured.sigma, measured.left_out, measured.reasons,
     )
 
 
