@@ -24,6 +24,7 @@ class Effect:
     `limit` is the largest amount, in `unit`, that anybody would believe.  The displacement grows
     like amount**power.  What is `direct` takes the size for its amount.  `stereo`, `moving` and
     `fitted` say what the scene must be, None that it does not matter.
+    `stage` says where it sits; where the design leaves that open, either place.
     """
 
     stage: str
@@ -283,14 +284,15 @@ EFFECTS: dict[str, Effect] = {
     'decentering': Effect('lens', 'px', 20.0, decentering),
     'sensor_tilt': Effect('lens', 'rad', 0.1, sensor_tilt),
     'flat_port': Effect('lens', 'm', 0.03, flat_port, widest=1.35),
-    'focal_drift': Effect('lens', '1', 0.05, focal_drift),
-    'session_step': Effect('lens', '1', 0.05, session_step),
+    'focal_drift': Effect('lens or frame', '1', 0.05, focal_drift),
+    'session_step': Effect('lens or frame', '1', 0.05, session_step),
     'landmark_survey': Effect('target', 'm', 0.05, landmark_survey),
     'landmark_scale': Effect('target', '1', 0.03, landmark_scale),
     'target_shape': Effect('target', 'm', 0.02, target_shape, kinds=BOARDS),
     'board_pose': Effect('target', 'm', 0.02, board_pose, kinds=('cube',)),
-    'dot_centroid': Effect('target', '1', 0.45, dot_centroid, kinds=BOARDS, power=2.0),
-    'detector_bias': Effect('noise', 'px', 0.14, detector_bias),
+    'dot_centroid': Effect('target or frame', '1', 0.45, dot_centroid, kinds=BOARDS,
+                           power=2.0),
+    'detector_bias': Effect('lens or noise', 'px', 0.14, detector_bias),
     'rolling_shutter': Effect('frame', 's', 0.05, rolling_shutter, moving=True),
     'stereo_time_offset': Effect('frame', 's', 0.05, stereo_time_offset, stereo=True,
                                  moving=True),

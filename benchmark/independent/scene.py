@@ -219,7 +219,7 @@ def _keep_seen(rng: np.random.Generator, scene: Scene, seen: NDArray[np.bool_]) 
     good = views == cameras
     seen &= good[scene.frame]
     count = int(good.sum())
-    if count < 16 or not 900 <= seen.sum() <= 6500:
+    if count < 16 or not 900 <= seen.sum() <= 4500:
         return None
     new, track = np.cumsum(good) - 1, scene.track
     kept = Track(track.times[good], track.centres[good], track.turns[good], track.moving)

@@ -29,7 +29,7 @@ from benchmark.independent.formation import Departure, form, observed, simulated
 from benchmark.independent.generator import CATALOGUE, SIZES, generate, plan, write
 from benchmark.independent.outside import OUTSIDE
 from benchmark.independent.scene import draw_scene, in_camera
-from benchmark.independent.score import score
+from benchmark.independent.score import score, stage_right
 from fisheye_svp_ros.cli import main
 
 SEED = 5
@@ -374,6 +374,7 @@ def test_scores():
         component('lens', 0.2), component('target', 0.1), component('frame', 0.5, 0.2)]))
     assert (facts['found'], facts['exactly'], facts['false']) == ([True], [False], ['skew'])
     assert facts['stage_right'] == [True]
+    assert stage_right('lens or frame', {'frame': 1.0, 'lens': 0.1})
     facts = score(truth, said(verdict='unexplained', components=[component('target', 0.1)]))
     assert (facts['found'], facts['false'], facts['stage_right']) == ([False], [], [False])
     assert score(truth, {'failed': 'exit 1', 'seconds': 2.0})['verdict'] == 'failed'
