@@ -210,6 +210,17 @@ class TestTarget:
         assert np.abs(moved[:, 7]).max() == 0
         assert np.nanmin(np.nanmax(np.abs(moved[:, :7]), axis=(0, 2))) > 0
 
+    @pytest.mark.parametrize(('elsewhere', 'shown'), [(30, True), (31, False)])
+    def test_half_of_the_landmarks_decide(self, elsewhere, shown):
+        table, term = bowed(SEEN)
+        model = ForwardModel(extend_lens(KB, [term], table))
+        views = SEEN[1]._replace(points=SEEN[1].points.copy())
+        assert views.points.shape[1] == 60
+        views.points[:, :elsewhere] += 0.01
+        assert model.seeing(views).plain is not shown
+        moved = model.predict(SEEN[0], views).uv - ForwardModel(KB).predict(SEEN[0], views).uv
+        assert bool(np.nanmax(np.abs(moved)) > 0.1) is shown
+
     def test_new_corrections_of_another_target_replace_the_old(self):
         table, term = bowed(SEEN)
         extended = extend_lens(KB, [term], table)
