@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
+from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.clouds import Points
@@ -188,13 +189,15 @@ def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) 
             points = points[::-(-len(points) // each)]
             size = np.hypot(points['du'], points['dv'])
             for axis, x in zip(axes, (np.degrees(points['theta']), points['range']), strict=True):
-                axis.plot(x, size, '.', color=colour, alpha=0.4, markersize=4, markeredgewidth=0,
+                axis.plot(x, size, '.', color=colour, alpha=0.6, markersize=4, markeredgewidth=0,
                           label=name)
             nearest = min(nearest, points['range'].min())
             farthest = max(farthest, points['range'].max())
         if 0 < 10 * nearest <= farthest:
             axes[1].set_xscale('log')
-            axes[1].tick_params(axis='x', which='minor', labelbottom=False)
+            axes[1].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            axes[1].xaxis.set_major_formatter('{x:g}')
+            axes[1].xaxis.set_minor_formatter('')
         axes[0].set(xlabel='incidence angle, deg')
         axes[1].set(xlabel='range, m')
         axes[0].set_title('Residual of image points, px', loc='left')
