@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from helpers.nodes import ROOT
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -183,3 +184,22 @@ def test_a_lens_file_of_the_user(tmp_path, capsys):
     save_lens(LENS.svp(), path)
     assert main(['budget', '--lens', str(path)]) == 2
     assert 'no viewpoint_shift' in capsys.readouterr().err
+
+
+def test_the_readme_says_what_the_budget_says():
+    text = (ROOT / 'README.md').read_text(encoding='utf-8')
+    for words in ('nearer than 0.5 m', 'further out than 67°', 'only from 13 m on'):
+        assert words in text
+    one, other = (
+        make_budget(Setup(load_lens(lens_path(name)), rig('parallel'), 0.3))
+        for name in ('fish180', 'fish214')
+    )
+
+    def nearest(found, degrees):
+        return max(p.nearest_range for p in at_point(found, np.radians(degrees), 1.0, {}))
+
+    assert max(nearest(one, degrees) for degrees in range(15, 89)) < 0.505
+    assert max(nearest(other, degrees) for degrees in range(15, 68)) < 1.75
+    assert 13 < nearest(other, 88) < 14
+    position = at_point(other, np.radians(60), 1.0, {})[0]
+    assert np.degrees(position.largest_spread) == pytest.approx(67, abs=0.5)
