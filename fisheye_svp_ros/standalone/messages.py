@@ -199,11 +199,12 @@ def deserialize(data: bytes, cls: type[Message]) -> Message:
     for _ in range(_BAD_STRINGS):
         try:
             return cast('Message', _store().deserialize_cdr(data, cls.TYPENAME))
-        except UnicodeDecodeError as error:
-            # As long as before, so that everything else stays where it is.
-            data = data.replace(error.object, error.object.decode('utf-8', 'mark').encode())
         except Exception as error:
-            raise UnreadableError(f'not a {cls.TYPENAME} ({error!r:.80})') from error
+            bad = error.__cause__
+            if not isinstance(bad, UnicodeDecodeError):
+                raise UnreadableError(f'not a {cls.TYPENAME} ({error!r:.80})') from error
+            # As long as before, so that everything else stays where it is.
+            data = data.replace(bad.object, bad.object.decode('utf-8', 'mark').encode())
     raise UnreadableError(f'{cls.TYPENAME} with more than {_BAD_STRINGS} strings not in UTF-8')
 
 

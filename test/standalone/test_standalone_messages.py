@@ -13,7 +13,14 @@ pytest.importorskip('cyclonedds')
 pytest.importorskip('rosbags')
 
 from fisheye_svp_ros.standalone import dds, messages
-from fisheye_svp_ros.standalone.messages import FieldValueError, UnknownFieldError
+from fisheye_svp_ros.standalone.messages import (
+    FieldValueError,
+    UnknownFieldError,
+    UnreadableError,
+    deserialize,
+    message_class,
+    serialize,
+)
 
 
 def _class(name: str) -> Any:
@@ -147,3 +154,20 @@ def test_type_names_on_the_wire(name: str, typename: str) -> None:
     for service in (False, True):
         sample = dds._sample_class(name, service=service)
         assert sample.__idl__.idl_transformed_typename == typename
+
+
+def test_text_that_is_not_utf_8_is_replaced() -> None:
+    pair = message_class('diagnostic_msgs/msg/KeyValue')
+    data = serialize(pair(key='lens', value='fish????'))
+    bad = data.replace(b'fish????', b'fish\xff\xfe\xc3(')
+    assert bad != data
+    back = deserialize(bad, pair)
+    assert back.key == 'lens' and back.value == 'fish???('
+
+
+@pytest.mark.parametrize('cut', [0, 3, 4, 7, 12])
+def test_what_is_no_message_is_one_error(cut: int) -> None:
+    pair = message_class('diagnostic_msgs/msg/KeyValue')
+    data = serialize(pair(key='lens', value='fish'))
+    with pytest.raises(UnreadableError, match='not a diagnostic_msgs/msg/KeyValue'):
+        deserialize(data[:cut], pair)

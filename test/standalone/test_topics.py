@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable
 
 import pytest
@@ -140,3 +141,30 @@ node.create_publisher(String, 'end', latched).publish(String())
 rclpy.spin(node)
 """, 'end')  # fmt: skip
     counter.wait_for('counted')
+
+
+def test_a_subscriber_that_does_not_keep_up_does_not_stop_a_publisher(
+    run_node: Callable[..., NodeProcess]
+) -> None:
+    slow = run_node(HEAD + """
+qos = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+node.create_subscription(String, 'text', lambda _: print('one', flush=True), qos)
+rclpy.spin(node)
+""", 'slow')
+    sender = run_node(HEAD + """
+import time
+publisher = node.create_publisher(String, 'text', 1000)
+while not publisher.get_subscription_count():
+    rclpy.spin_once(node, timeout_sec=0.05)
+publisher.publish(String(data='first'))
+time.sleep(2)
+for _ in range(2000):
+    publisher.publish(String(data=50_000 * 'x'))
+    if publisher.lost >= 3:
+        break
+print('over', publisher.lost, flush=True)
+""", 'sender')
+    slow.wait_for('one')
+    slow.process.send_signal(signal.SIGSTOP)
+    assert int(sender.wait_for(r'over (\d+)')[1]) >= 3
+    assert any('a subscriber is too slow' in line for line in sender.lines)
