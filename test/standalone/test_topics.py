@@ -153,7 +153,7 @@ rclpy.spin(node)
 """, 'slow')
     sender = run_node(HEAD + """
 import time
-publisher = node.create_publisher(String, 'text', 1000)
+publisher = node.create_publisher(String, 'text', QoSProfile(history=HistoryPolicy.KEEP_ALL))
 while not publisher.get_subscription_count():
     rclpy.spin_once(node, timeout_sec=0.05)
 publisher.publish(String(data='first'))
