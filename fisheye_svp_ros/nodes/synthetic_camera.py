@@ -25,7 +25,7 @@ from fisheye_svp_ros.simulate.scenario import (
     camera_names,
     check_sweep,
     scalars,
-    simulate_scenario,
+    simulate_in_pieces,
 )
 from fisheye_svp_ros.study.settings import SyntheticCameraSettings
 
@@ -33,12 +33,14 @@ _SAY_EVERY = 1.0  # s, how far the sweep is
 
 
 class SweepSet(NamedTuple):
-    """One set (`frame`) of scenario `number`.
+    """Set `place` of the `sets` of scenario `number`; `frame` of the piece that is simulated.
 
     swept: values of the sweep point; seen: observations by camera; svp_lens: for `camera_info`.
     """
 
     number: int
+    place: int
+    sets: int
     frame: int
     scenario: Scenario
     swept: dict[str, Any]
@@ -81,7 +83,7 @@ class SyntheticCamera(CameraNode):
                                    throttle_duration_sec=_SAY_EVERY)
         simulation = step.simulation
         place = {'scenario': step.number, 'scenarios': len(self._sweep),
-                 'set': step.frame, 'sets': len(simulation.poses[0].position)}
+                 'set': step.place, 'sets': step.sets}
         text = ', '.join(f'{name} {value}' for name, value in step.swept.items())
         self.tag(stamp, {**place, **scalars(step.scenario)}, text)
         self.publish_landmarks(simulation.landmarks, stamp)
@@ -97,16 +99,17 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
     for repetition in itertools.count():
         for number, swept in enumerate(sweep):
             scenario = changed(settings, swept)
-            simulation = simulate_scenario(scenario, number, repetition)
-            svp_lens = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
-            table = simulation.observations
-            rows_of = rows_by_frame(table)
-            for frame in range(len(simulation.poses[0].position)):
-                seen = {
-                    camera: table.take(rows_of.get((frame, camera), nothing))
-                    for camera in table.cameras
-                }
-                yield SweepSet(number, frame, scenario, swept, simulation, seen, svp_lens)
+            for first, sets, simulation in simulate_in_pieces(scenario, number, repetition):
+                svp_lens = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
+                table = simulation.observations
+                rows_of = rows_by_frame(table)
+                for frame in range(len(simulation.poses[0].position)):
+                    seen = {
+                        camera: table.take(rows_of.get((frame, camera), nothing))
+                        for camera in table.cameras
+                    }
+                    yield SweepSet(number, first + frame, sets, frame, scenario, swept,
+                                   simulation, seen, svp_lens)
         if not settings.repeat:
             return
 

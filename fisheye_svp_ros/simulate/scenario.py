@@ -5,6 +5,7 @@ The synthetic camera and the offline sweep read the same table, so they compute 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
@@ -79,6 +81,8 @@ class Scenario:
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
 
 
+_PIECE = 1000  # sets that are simulated at once
+
 SCALARS = tuple(row.name for row in rows(Scenario) if not isinstance(row.default, tuple))
 
 
@@ -103,12 +107,30 @@ def simulate_scenario(scenario: Scenario, number: int = 0, repetition: int = 0) 
     Raises FisheyeSvpError for a lens, landmarks or poses that
     cannot be used.
     """
-    lens = true_lens(scenario.lens, scenario.shift_scale)
-    landmarks, rig, poses = (
-        scenario_landmarks(scenario), scenario_rig(scenario), scenario_poses(scenario)
-    )
-    model, sigma = ForwardModel(lens), scenario.noise_px
+    return _simulated(scenario, scenario_poses(scenario),
+                      noise_generator(scenario.seed, number, repetition))
+
+
+def simulate_in_pieces(
+    scenario: Scenario, number: int = 0, repetition: int = 0
+) -> Iterator[tuple[int, int, Simulation]]:
+    """Yield a scenario as pieces of bounded length: the first set, how many there are, the piece.
+
+    A scenario of one piece is what `simulate_scenario` returns.
+    """
     rng = noise_generator(scenario.seed, number, repetition)
+    poses, steps = _given_poses(scenario), scenario.trajectory_steps
+    sets = (len(poses.position) - 1) * max(steps, 1) + 1
+    for first in range(0, sets, _PIECE):
+        numbers = np.arange(first, min(first + _PIECE, sets))
+        piece = _along(poses, steps, numbers) if steps else poses.take(numbers)
+        yield first, sets, _simulated(scenario, piece, rng)
+
+
+def _simulated(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
+    lens = true_lens(scenario.lens, scenario.shift_scale)
+    landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
+    model, sigma = ForwardModel(lens), scenario.noise_px
     if rig is None:
         seen = simulate(model, landmarks, poses, sigma, rng)
         return Simulation(lens, landmarks, seen, (poses,), None)
@@ -125,8 +147,8 @@ def check_sweep(base: Scenario, sweep: Sweep) -> None:
     """Raise FisheyeSvpError where a sweep names a lens, landmarks or poses that are unusable."""
     for name in _READ_FILES:
         for value in sweep.lists.get(name, ()):
-            simulate_scenario(changed(base, {name: value}))
-    simulate_scenario(changed(base, sweep.point(0)))
+            next(simulate_in_pieces(changed(base, {name: value})))
+    next(simulate_in_pieces(changed(base, sweep.point(0))))
 
 
 def scalars(scenario: Scenario) -> dict[str, Any]:
@@ -188,13 +210,18 @@ def scenario_rig(scenario: Scenario) -> Pose | None:
 
 def scenario_poses(scenario: Scenario) -> Pose:
     """Return the poses (P,) of the (right) camera in the world, one a set."""
+    poses, steps = _given_poses(scenario), scenario.trajectory_steps
+    if not steps:
+        return poses
+    return _along(poses, steps, np.arange((len(poses.position) - 1) * steps + 1))
+
+
+def _given_poses(scenario: Scenario) -> Pose:
     if scenario.poses_file == CALIBRATION:
-        poses = calibration_poses(scenario.baseline)
-    elif scenario.poses_file:
-        poses = read_poses(scenario.poses_file).pose
-    else:
-        poses = _listed_poses(scenario.poses)
-    return _smooth(poses, scenario.trajectory_steps) if scenario.trajectory_steps else poses
+        return calibration_poses(scenario.baseline)
+    if scenario.poses_file:
+        return read_poses(scenario.poses_file).pose
+    return _listed_poses(scenario.poses)
 
 
 def _listed_poses(numbers: tuple[float, ...]) -> Pose:
@@ -208,13 +235,18 @@ def _listed_poses(numbers: tuple[float, ...]) -> Pose:
     return Pose(rotation_from_quaternion(table[:, 3:]), table[:, :3])
 
 
-def _smooth(poses: Pose, steps: int) -> Pose:
-    """Insert poses between neighbours: straight lines, turns about a fixed axis."""
-    if len(poses.position) < 2:
-        return poses
-    before, after = poses.take(slice(None, -1)), poses.take(slice(1, None))
-    part = np.arange(steps)[:, None] / steps
+def _along(poses: Pose, steps: int, numbers: Index) -> Pose:
+    """Return some (N,) of the poses on the way: straight lines, turns about a fixed axis.
+
+    numbers: of the poses, `steps` from each of the given ones to the next.
+    """
+    last = len(poses.position) - 1
+    start = np.minimum(numbers // steps, max(last - 1, 0))
+    before, after = poses.take(start), poses.take(np.minimum(start + 1, last))
+    part = ((numbers - start * steps) / steps)[:, None]
     turn = vector_from_rotation(after.rotation @ np.swapaxes(before.rotation, -1, -2))
-    rotation = rotation_from_vector(part * turn[:, None]) @ before.rotation[:, None]
-    position = before.position[:, None] + part * (after.position - before.position)[:, None]
-    return Pose.concatenate([Pose(rotation, position).reshape(-1), poses.take(slice(-1, None))])
+    way = Pose(rotation_from_vector(part * turn) @ before.rotation,
+               before.position + part * (after.position - before.position))
+    there = numbers >= last * steps
+    way.rotation[there], way.position[there] = poses.rotation[last], poses.position[last]
+    return way

@@ -1,5 +1,6 @@
 """Simulated observations: what is there, what is absent, and how it scatters."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,12 +13,20 @@ from fisheye_svp_ros.effects.wrong_ids import WrongIdsEffect
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.parameters import Sweep
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
+from fisheye_svp_ros.simulate import scenario
+from fisheye_svp_ros.simulate.scenario import (
+    Scenario,
+    check_sweep,
+    simulate_in_pieces,
+    simulate_scenario,
+)
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
 
 FISH180, FISH214 = (load_lens(lens_path(name)) for name in ('fish180', 'fish214'))
@@ -152,3 +161,32 @@ def test_the_image_ends_half_a_pixel_beyond_the_outer_pixel_centres():
     points = 2.0 * back_project(tall, np.stack([np.full(4, lens.cx), edges], axis=-1)).direction
     seen = simulate(ForwardModel(tall), Landmarks(np.arange(4), points), identity(1), 0.0, rng())
     assert seen.landmark.tolist() == [1, 2]
+
+
+@pytest.mark.parametrize('steps', [0, 1, 7])
+def test_pieces_are_the_whole(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    poses = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0,
+             0.1, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0)
+    one = Scenario(poses=poses, trajectory_steps=steps, noise_px=0.3)
+    whole = simulate_scenario(one)
+    monkeypatch.setattr(scenario, '_PIECE', 4)
+    pieces = list(simulate_in_pieces(one))
+    sets = 2 * max(steps, 1) + 1
+    assert [first for first, _, _ in pieces] == list(range(0, sets, 4))
+    assert {total for _, total, _ in pieces} == {sets}
+    for name in ('uv', 'landmark'):
+        parts = [getattr(piece.observations, name) for _, _, piece in pieces]
+        assert np.array_equal(np.concatenate(parts), getattr(whole.observations, name))
+    places = np.concatenate([piece.poses[0].position for _, _, piece in pieces])
+    assert np.array_equal(places, whole.poses[0].position)
+
+
+def test_a_million_steps_take_little_memory() -> None:
+    poses = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+    one = Scenario(poses=poses, trajectory_steps=1_000_000)
+    tracemalloc.start()
+    check_sweep(one, Sweep({}))
+    first, sets, piece = next(simulate_in_pieces(one))
+    assert (first, sets) == (0, 1_000_001) and len(piece.poses[0].position) < 10_000
+    assert tracemalloc.get_traced_memory()[1] < 200e6
+    tracemalloc.stop()
