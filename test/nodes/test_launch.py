@@ -66,6 +66,41 @@ def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path)
     assert all(error < 0.01 for error in columns['localizer.position_error_m'])
 
 
+def test_a_sweep_whose_recorder_dies_ends_with_the_reason(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    sweep, bag = tmp_path / 'sweep.yaml', tmp_path / 'bag'
+    sweep.write_text(SWEEP)
+    bag.mkdir()
+    launch = NodeProcess(
+        ['ros2', 'launch', 'fisheye_svp_ros', 'sweep.launch.py', f'sweep:={sweep}', f'bag:={bag}'],
+        dict(os.environ),
+    )
+    assert launch.finish() != 0
+    text = '\n'.join(launch.lines)
+    assert 'a recording cannot be written there' in text and 'ended with status 2' in text
+
+
+def test_a_choice_that_is_none_is_refused(ros_domain: int) -> None:
+    launch = NodeProcess(
+        ['ros2', 'launch', 'fisheye_svp_ros', 'mono.launch.py', 'svp:=maybe'], dict(os.environ))
+    assert launch.finish() != 0
+    assert 'maybe' in '\n'.join(launch.lines) and 'process started' not in '\n'.join(launch.lines)
+
+
+def test_everything_goes_below_a_namespace(graph: Graph) -> None:
+    results = graph.hear(DiagnosticArray, '/robot/mono/localizer/result')
+    launch = NodeProcess(
+        ['ros2', 'launch', 'fisheye_svp_ros', 'whole.launch.py', 'namespace:=robot'],
+        dict(os.environ))
+    try:
+        graph.until(lambda: results)
+        launch.finish(signal.SIGINT)
+    finally:
+        if launch.process.poll() is None:
+            launch.process.kill()
+
+
 @pytest.mark.parametrize('name', FILES)
 def test_a_launch_file_starts_nodes_that_give_results_and_end_cleanly(
     name: str, graph: Graph
