@@ -31,16 +31,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    from fisheye_svp_ros.commands.lenses import load_lenses
+    from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
     from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
     from fisheye_svp_ros.commands.photographs import measured as read
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.measured import localize_measured
 
+    given = load_lenses(args.lens)
     observations, _ = read(args.observations, args)
-    lenses = load_lenses(args.lens, observations.cameras)
-    for camera, (name, lens) in enumerate(lenses.items()):
+    for camera, (name, lens) in enumerate(lenses_of(observations.cameras, given).items()):
         model = ForwardModel(lens)
         with progress('localizing'):
             measured = localize_measured(

@@ -216,7 +216,8 @@ class TestCalibrate:
         folder, _, _ = scene
         observations = folder / 'observations.csv'
         base = ('calibrate', observations, '--model', 'equidistant')
-        assert '--model' in refused(capsys, *base[:2], '--image-size', '9x9')
+        assert 'check the image size' in refused(capsys, *base[:2], '--image-size', '9x9')
+        assert 'add --image-size' in refused(capsys, *base[:2])
         assert 'pinhole' in refused(capsys, *base[:3], 'pinhole', '--image-size', '9x9')
         for size in ('1280', '1280x', '0x960', '1280x960x3', '-1x5', '12.5x9', 'large'):
             assert 'form 1280x800' in refused(capsys, *base, f'--image-size={size}')
