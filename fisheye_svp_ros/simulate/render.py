@@ -107,8 +107,8 @@ def render(
             # The image of a place is moved: look where the unmoved image of what is seen lies.
             off = moved(_near(places, printed)) if moved is not None else 0.0
             places = _seen_places(lens, printed, camera, exposure, part - off)
-        light[window] = _light(printed, places)
-    light = _blurred(light, theta, exposure, lens.max_incidence)
+        light[window] = _blurred(
+            _light(printed, places), theta[window], exposure, lens.max_incidence)
     outwards = np.nan_to_num(theta / lens.max_incidence)
     light *= exposure.gain * (1 - exposure.vignetting * outwards**2)
     light *= 1 + (uv / lens.width - 0.5) @ np.array(exposure.slope)
@@ -116,7 +116,7 @@ def render(
     level = 255 * light
     scatter = exposure.noise * np.sqrt(0.5 + np.clip(level, 0, 255) / 255)
     level = np.round(level + scatter * rng.standard_normal(level.shape))
-    return np.clip(level, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(level, 0, 255), dtype=np.uint8)
 
 
 def _window(lens: Lens, printed: Print, camera: Pose) -> tuple[slice, slice]:
@@ -186,20 +186,21 @@ def _near(places: Array, printed: Print) -> Array:
     return np.clip(np.nan_to_num(places, nan=-around, posinf=0, neginf=0), -around, high)
 
 
-def _light(printed: Print, places: Array) -> Array:
-    """Return the reflectance (H, W) that each pixel sees on average."""
+def _light(printed: Print, places: Array) -> NDArray[np.float32]:
+    """Return the reflectance (H, W, each times _BETWEEN) that the parts of pixels see."""
     part = places / printed.size
     by_v, by_u = np.gradient(part, axis=(0, 1))
     (vv, uv_), uu = np.gradient(by_v, axis=(0, 1)), np.gradient(by_u, axis=1)
-    total = np.zeros(part.shape[:2])
+    light = np.empty((_BETWEEN * part.shape[0], _BETWEEN * part.shape[1]), np.float32)
     steps = (np.arange(_BETWEEN) + 0.5) / _BETWEEN - 0.5
-    for b in steps:
-        for a in steps:
+    for row, b in enumerate(steps):
+        for column, a in enumerate(steps):
             sample = (part + a * by_u + b * by_v
                       + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv)
             slope = (by_u + a * uu + b * uv_, by_v + a * uv_ + b * vv)
-            total += _reflectance(printed, sample, slope)
-    return np.where(np.isfinite(total), total / _BETWEEN**2, _ROOM)
+            light[row::_BETWEEN, column::_BETWEEN] = _reflectance(printed, sample, slope)
+    light[~np.isfinite(light)] = _ROOM
+    return light
 
 
 def _reflectance(printed: Print, places: Array, slope: tuple[Array, Array]) -> Array:
@@ -223,21 +224,28 @@ def _inside(places: Array, low: Any, high: Any, width: Array) -> Array:
     return np.asarray(np.clip(depth + 0.5, 0.0, 1.0).prod(axis=-1))
 
 
-def _blurred(light: Array, theta: Array, exposure: Exposure, edge: float) -> Array:
+def _blurred(
+    light: NDArray[np.float32], theta: Array, exposure: Exposure, edge: float
+) -> Array:
+    """Return what pixels (H, W) see of light between them: the lens blurs before they sample."""
     if not exposure.blur_edge:
-        return np.asarray(_gaussian(light, exposure.blur))
+        return _sampled(light, exposure.blur)
     # Blur that grows outwards: between images of few blurs, by the square of the blur.
     part = np.nan_to_num(theta / edge, nan=1.0)
     square = exposure.blur**2 + (exposure.blur_edge * part) ** 2
     levels = np.linspace(exposure.blur**2, exposure.blur**2 + exposure.blur_edge**2, 6)
     place = np.clip((square - levels[0]) / (levels[1] - levels[0]), 0, len(levels) - 1 - 1e-9)
-    stack = np.stack([_gaussian(light, float(np.sqrt(level))) for level in levels])
+    stack = np.stack([_sampled(light, float(np.sqrt(level))) for level in levels])
     lower = np.floor(place).astype(int)
-    row, column = np.indices(light.shape)
+    row, column = np.indices(theta.shape)
     weight = place - lower
     return np.asarray((1 - weight) * stack[lower, row, column]
                       + weight * stack[lower + 1, row, column])
 
 
-def _gaussian(light: Array, blur: float) -> Array:
-    return np.asarray(cv2.GaussianBlur(light, (0, 0), blur)) if blur > 0.05 else light.copy()
+def _sampled(light: NDArray[np.float32], blur: float) -> Array:
+    if blur > 0.05:
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), _BETWEEN * blur))
+    height, width = (size // _BETWEEN for size in light.shape)
+    parts = light.reshape(height, _BETWEEN, width, _BETWEEN)
+    return np.asarray(parts.mean(axis=(1, 3), dtype=float))

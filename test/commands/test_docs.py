@@ -19,7 +19,7 @@ from helpers.nodes import ROOT
 from fisheye_svp_ros import standalone
 
 PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
-         'whats_wrong.md')
+         'whats_wrong.md', 'photographs.md')
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```bash\n(.*?)```', re.DOTALL)
 BLOCKS = [
     pytest.param(block, id=f'{page} {number}')
