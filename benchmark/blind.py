@@ -35,6 +35,9 @@ def tasks(mode: str, trials: int, seed: int) -> Iterator[Task]:
     for number in range(trials):
         if mode == 'one':
             yield from (Task(mode, s, (names[number % len(names)],), seed, number) for s in SIZES)
+        elif mode == 'background':
+            hidden = () if number % 2 else (names[number // 2 % len(names)],)
+            yield Task(mode, 1.0, hidden, seed, number)
         elif mode == 'clean':
             yield Task(mode, 0.0, (), seed, number)
         elif mode == 'outside':

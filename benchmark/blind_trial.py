@@ -8,17 +8,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark.blind_background import background, with_outliers
 from benchmark.blind_effects import HIDDEN
 from benchmark.blind_hidden import Hidden
 from benchmark.blind_oracle import LinearScene, oracle_finds
 from benchmark.blind_outside import OUTSIDE
-from benchmark.blind_scene import Needs, Scene, draw_scene
+from benchmark.blind_scene import Needs, Scene, World, draw_scene
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, swept
 from fisheye_svp_ros.diagnosis.model import intrinsic_names
 
-MODES = ('one', 'clean', 'outside', 'two')
+MODES = ('one', 'clean', 'outside', 'two', 'background')
 _WEAKEST = 0.02  # an effect of which what is free leaves less than this is drawn again
 _STEPS = 6
 _LARGEST = 1e4  # px
@@ -42,7 +43,7 @@ class Outcome:
     extra: named effects whose class holds nothing hidden; oracle: whether it finds each hidden
     effect; recovered: held-out misfit above noise that the extended model takes away, over what
     the true one does; errors: of parameters, over their standard errors; p_values: of the first
-    screening; trace: its steps.
+    screening; trace: its steps; background: rms of nameless local errors, over the noise.
     """
 
     task: Task
@@ -58,6 +59,7 @@ class Outcome:
     errors: dict[str, float] = field(default_factory=dict)
     p_values: dict[str, float] = field(default_factory=dict)
     trace: list[str] = field(default_factory=list)
+    background: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields by name; `from_dict` reads them."""
@@ -80,6 +82,7 @@ class Case(NamedTuple):
     ideal: Array
     exact: Array
     given: Array
+    background: float = 0.0
 
 
 def run_trial(task: Task) -> Outcome:
@@ -107,10 +110,11 @@ def run_trial(task: Task) -> Outcome:
         verdict = f'error: {type(error).__name__}: {error}'
         return Outcome(task, _described(scene), hidden, verdict, {}, [], False, [], oracle)
     outcome = _judged(task, case, found, hidden)
-    outcome.oracle = oracle
-    if task.mode == 'one':
+    outcome.oracle, outcome.background = oracle, case.background
+    if task.mode in ('one', 'background') and task.names:
         outcome.errors = _errors(case, task, found)
-        outcome.recovered = None if test is None else _recovered(case, found)
+        lasting = test is not None and not case.background
+        outcome.recovered = _recovered(case, found) if lasting else None
     if task.mode == 'clean':
         outcome.p_values = _null_p_values(found, scene.free)
     return outcome
@@ -169,6 +173,10 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
         world = one.world(world, amount) if one.moves else world
         hidden.append(one)
         amounts.append(amount)
+    level = 0.0
+    if task.mode == 'background':
+        level = float(10 ** rng.uniform(-1, 0))
+        world = _with_background(world, scene, linear, level, rng)
     exact = world.image()
     if not np.isfinite(exact[scene.seen]).all():
         return None
@@ -178,7 +186,19 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
     given = exact + noise
     for one, amount in zip(hidden, amounts, strict=True):
         given = one.recorded(given, amount, rng)
-    return Case(scene, hidden, amounts, linear, ideal, exact, given)
+    if level:
+        given = with_outliers(given, scene, rng)
+    return Case(scene, hidden, amounts, linear, ideal, exact, given, level)
+
+
+def _with_background(
+    world: World, scene: Scene, linear: LinearScene, level: float, rng: np.random.Generator
+) -> World:
+    """Return the world with local errors of a size (rms over the noise, poses taken out)."""
+    add = background(scene, rng)
+    small = 0.1 * scene.noise
+    unit = linear.rms(add(scene.world(), small).image() - linear.ideal, outside=True)
+    return add(world, small * level * scene.noise / unit)
 
 
 def _amount(

@@ -10,6 +10,7 @@ from fisheye_svp_ros.errors import ParameterError
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
+    from fisheye_svp_ros.diagnosis.calibration import Trust
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
@@ -55,16 +56,20 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'{args.observations}: the size of the images is not known; add '
                              '--image-size 1280x800')
     results: dict[str, Calibration] = {}
+    trusts: dict[str, Trust] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
         results[camera] = _calibrated(table, args, size, name)
+        trusts[camera] = _trusted(table, results[camera])
     # Written before a word is printed: nobody may be reading.
     if args.output:
         for camera, result in results.items():
-            _write(result, args.output / f'{camera}.yaml' if camera else args.output)
-    for number, result in enumerate(results.values()):
-        _report(result, args.model, observations.sigma[observations.camera == number])
+            path = args.output / f'{camera}.yaml' if camera else args.output
+            _write(result, trusts[camera], path)
+    for number, (camera, result) in enumerate(results.items()):
+        sigmas = observations.sigma[observations.camera == number]
+        _report(result, trusts[camera], args.model, sigmas)
     if set(results) == {'left', 'right'}:
         _rig(observations, results, args.output)
 
@@ -85,13 +90,30 @@ def _calibrated(
         return calibrate(table, args.model, size, args.free, name)
 
 
-def _report(result: Calibration, model: str, sigmas: Array) -> None:
+def _trusted(table: Observations, result: Calibration) -> Trust:
+    """Return what may be trusted, beside local errors of target and frames."""
+    import numpy as np
+
+    from fisheye_svp_ros.diagnosis.calibration import trust
+    from fisheye_svp_ros.reporting.progress import stages
+
+    with stages('how far it may be trusted'):
+        posed = table.take(~np.isin(table.frame, result.left_out))
+        return trust(posed, result.adjusted.lens, result.adjusted.names)
+
+
+def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:
     """Print the lens, and what there is to say against it; sigmas (N,), px, NaN = unknown."""
     import numpy as np
 
     from fisheye_svp_ros.commands.notes import note_left_out, say
 
-    _print(result)
+    _print(result, trust)
+    for name, range_ in trust.shift.items():
+        low, high = 1e3 * range_.low, 1e3 * range_.high
+        if not range_.settled:
+            say(f'{name} is not settled: from {low:.2f} to {high:.2f} mm over all targets that '
+                'these data admit, whose shape can explain it; ask `fisheye-svp diagnose`')
     note_left_out(result.left_out)
     if not result.adjusted.converged:
         say('the adjustment has not converged; take the lens for a rough one')
@@ -115,12 +137,12 @@ def _size_beside(path: Path) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
-def _write(result: Calibration, path: Path) -> None:
+def _write(result: Calibration, trust: Trust, path: Path) -> None:
     from fisheye_svp_ros.io.lens_files import save_lens
     from fisheye_svp_ros.io.results import write_json
 
     save_lens(result.adjusted.lens, path)
-    write_json(path.with_suffix('.calibrate.json'), _document(result))
+    write_json(path.with_suffix('.calibrate.json'), _document(result, trust))
 
 
 def _rig(
@@ -147,14 +169,14 @@ def _rig(
         save_rig(fitted.rig.take(0), folder / 'rig.yaml')
 
 
-def _print(result: Calibration) -> None:
+def _print(result: Calibration, trust: Trust) -> None:
     import numpy as np
 
     from fisheye_svp_ros.reporting.tables import noise_text, print_table, with_error
 
-    lens, names = result.adjusted.lens, result.adjusted.names
+    lens = result.adjusted.lens
     figures = lens.calibration or {}
-    errors = dict(zip(names, np.sqrt(np.diag(result.adjusted.covariance)).tolist(), strict=True))
+    errors = dict(trust.stderr)
     if 'f' in errors:
         errors['fx'] = errors['fy'] = errors['f']
     print_table(
@@ -169,8 +191,10 @@ def _print(result: Calibration) -> None:
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}; {noise_text(result.sigma)}')
 
 
-def _document(result: Calibration) -> dict[str, Any]:
+def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself."""
+    from dataclasses import asdict
+
     from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
     adjusted = result.adjusted
@@ -183,6 +207,8 @@ def _document(result: Calibration) -> dict[str, Any]:
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)
         ),
         'covariance': adjusted.covariance.tolist(),
+        'stderr': trust.stderr,
+        'admissible': {name: asdict(range_) for name, range_ in trust.shift.items()},
     }
 
 

@@ -17,6 +17,7 @@ from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.localization import localize
 
 
@@ -231,7 +232,7 @@ class _Fit:
         self._poses_only = poses_only
 
     def pack(self, state: State) -> Arrays:
-        lens = [state.lens.parameters[name] for name in self._free]
+        lens = parameter_values(state.lens, self._free)
         values = [v for effect, v in state.terms if is_shared(effect)]
         parts = (*state.pose, *state.rig, np.concatenate([np.array(lens), *values]))
         return tuple(array[None] for array in parts)

@@ -49,11 +49,12 @@ class Gross(NamedTuple):
 
 
 class NoiseCause(NamedTuple):
-    """A cause without a pattern: value, standard error, p-value."""
+    """Noise that changes: value, standard error, p-value; variance (F, M): over the mean one."""
 
     value: float
     stderr: float
     p_value: float
+    variance: Array
 
 
 def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
@@ -156,8 +157,9 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     linear = fitted.linear
     used = linear.used
     e2 = np.minimum(squares[used], 20.0)
-    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[used]
-    z = theta**2 - (theta**2).mean()
+    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
+    every = theta**2 - (theta[used] ** 2).mean()
+    z = every[used]
 
     def deviance(growth: float) -> float:
         # With z centred the mean of log sigma does not change: only the scale is profiled out.
@@ -168,7 +170,12 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     tails = max(float(e2.var()) / 2, 1.0)
     gain = (deviance(0.0) - float(best.fun)) / tails
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    return NoiseCause(float(best.x), stderr, float(stats.chi2.sf(max(gain, 0.0), 1)))
+    p = float(stats.chi2.sf(max(gain, 0.0), 1))
+    # Logarithms do not mind heavy tails: where these grow with the angle, the bulk grows less.
+    of_bulk = float(z @ np.log(np.maximum(squares[used], 1e-6)) / (z @ z)) / 2
+    value = float(best.x) if abs(best.x) < abs(of_bulk) else of_bulk
+    level = float(np.mean(e2 * np.exp(-2 * value * z)))
+    return NoiseCause(value, stderr, p, level * np.exp(2 * value * every))
 
 
 def with_noise_growth(state: State, growth: float) -> State:

@@ -65,7 +65,9 @@ def _ratio(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> Array:
 def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldOut:
     """Predict other frames of the same camera and target."""
     data = test if local is None else local.applied(test)
-    linear = Linearised(data, start_poses(data, state), ())
+    # In px every point counts alike, however noisy it is.
+    plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
+    linear = Linearised(data, start_poses(data, plain), ())
     return _figures(linear, linear.residual)
 
 
@@ -127,10 +129,18 @@ def frames_in_turn(
         left = evidence.border[mine] @ way
         if local:
             left = left - _local_rows(evidence, *f.coefficients(way), mine)
-        poses = linear.frame_columns[mine]
+        even = _evenly(linear)[mine]
+        left, poses = left * even, linear.frame_columns[mine] * even[..., None]
         fitted = np.linalg.pinv(poses, rcond=1e-9) @ left[..., None]
-        residual[mine] = left - (poses @ fitted)[..., 0]
+        residual[mine] = (left - (poses @ fitted)[..., 0]) / even
     return _figures(linear, residual)
+
+
+def _evenly(linear: Linearised) -> Array:
+    """Return what takes the weights (F, M) of uneven noise out of whitened rows."""
+    weight, own = (linear.data.blocks(w[..., None] * np.ones(2))
+                   for w in (linear.data.views.weight, linear.weight))
+    return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
 
 
 def _local_rows(evidence: Evidence, e: Array, r: Array, frames: Index) -> Array:

@@ -60,7 +60,7 @@ def search(
     base: Evidence | None = None
     dropped: set[str] = set()
     growth: NoiseCause | None = None
-    cleaned = False
+    cleaned = settled = False
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
@@ -88,8 +88,9 @@ def search(
         if not changed:
             break
         state = refit(data, state, free, before).state
-        if wanted.quick:
+        if wanted.quick or (cleaned and settled):
             break
+        settled = cleaned
     if changed:
         evidence = gather_evidence(data, state, free, before, wanted.left_out)
     fitted = fit_linear(evidence.linear, evidence.variances)
@@ -116,16 +117,16 @@ def _changed(
 def _cleaned(
     data: Data, fitted: Fitted, gross: Gross, wanted: Wanted
 ) -> tuple[Data, Gross, NoiseCause | None, bool]:
-    """Set aside outlying points, then ask whether the noise grows with the angle."""
+    """Ask whether the noise grows with the angle, then set aside what is too far off for it."""
     squares = standardised_squares(fitted)
+    growth: NoiseCause | None = None
+    if 'noise_vs_angle' not in wanted.left_out:
+        growth = noise_growth(fitted, squares)
+        squares = squares / growth.variance
+        if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
+            growth = None
     cleaned, more = outlying(data, fitted, gross, squares)
-    shifted = len(more.rows) > len(gross.rows)
-    if 'noise_vs_angle' in wanted.left_out:
-        return cleaned, more, None, shifted
-    growth = noise_growth(fitted, squares)
-    if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
-        return cleaned, more, None, shifted
-    return cleaned, more, growth, True
+    return cleaned, more, growth, growth is not None or len(more.rows) > len(gross.rows)
 
 
 def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) -> State:

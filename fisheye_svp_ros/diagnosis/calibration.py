@@ -1,0 +1,78 @@
+"""How far a calibration may be trusted, beside random local errors and other targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.budget import stage_of
+from fisheye_svp_ros.diagnosis.causes import standard_errors
+from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
+from fisheye_svp_ros.diagnosis.model import fit, prepare, start
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
+
+SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
+_WIDE = 2.0  # standard errors of an interval
+
+
+@dataclass(frozen=True)
+class Admissible:
+    """A coefficient of a viewpoint shift, m, over all targets that the data admit.
+
+    low, high: of 95 % intervals with the target as it is said to be and with its shape, scale and
+    boards free; settled: whether both intervals agree that it is not zero.
+    """
+
+    low: float
+    high: float
+    settled: bool
+
+
+@dataclass(frozen=True)
+class Trust:
+    """Standard errors of a calibration's parameters, by name, and the range of its shift."""
+
+    stderr: dict[str, float]
+    shift: dict[str, Admissible]
+
+
+def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust:
+    """Return what the null model of a diagnosis says of a lens fitted to one camera's views.
+
+    names: the parameters that were fitted.
+    """
+    data = prepare(observations)
+    evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
+    errors = standard_errors(evidence)
+    stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
+    shift = {
+        name: _over_targets(evidence, i, float(lens.parameters[name]), stderr[name])
+        for i, name in enumerate(names) if name in SHIFT_NAMES
+    }
+    return Trust(stderr, shift)
+
+
+def _over_targets(evidence: Evidence, column: int, value: float, stderr: float) -> Admissible:
+    """Return the range of a parameter with the target as it is said to be, and free."""
+    columns, prior = [np.arange(evidence.own)], [np.zeros(evidence.own)]
+    for form, effect in enumerate(evidence.forms.effects):
+        if stage_of(effect.name) == 'target':
+            columns.append(evidence.columns_of(form))
+            large = np.array([parameter.large for parameter in effect.parameters])
+            prior.append(1 / (large * evidence.scale[columns[-1]]) ** 2)
+    every, information = np.concatenate(columns), evidence.information
+    # Larger errors than `large` are no target that anybody would take for exact.
+    inverse, _ = pseudo_inverse(
+        information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
+    )
+    scale = evidence.scale[column]
+    moved = value + float((inverse @ information[every, -1])[column] / scale)
+    spread = float(np.sqrt(max(inverse[column, column], 0.0)) / scale)
+    pairs = ((value, stderr), (moved, spread))
+    ends = [middle + sign * _WIDE * error for middle, error in pairs for sign in (-1, 1)]
+    alike = all(end > 0 for end in ends) or all(end < 0 for end in ends)
+    near = abs(moved - value) < _WIDE * np.hypot(stderr, spread)
+    return Admissible(min(ends), max(ends), bool(alike and near))

@@ -1,0 +1,53 @@
+"""Standard errors, proved by sampling: noise and local errors drawn anew."""
+
+from dataclasses import replace
+
+import numpy as np
+from helpers.scenes import lens, observe, scene
+
+from fisheye_svp_ros.diagnosis.calibration import trust
+from fisheye_svp_ros.diagnosis.causes import standard_errors
+from fisheye_svp_ros.diagnosis.evidence import gather_evidence
+from fisheye_svp_ros.diagnosis.model import fit, prepare, start
+from fisheye_svp_ros.diagnosis.refit import refit
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+
+SIGMA, SHIFT = 0.1, 0.004
+DRAWS = 14
+
+
+def test_standard_errors_hold_with_local_errors_in_the_background():
+    """Offsets of landmarks as large in the image as the noise: e0 stays within its errors."""
+    off = []
+    for seed in range(DRAWS):
+        rng = np.random.default_rng(300 + seed)
+        pose, views = scene(rng, frames=16)
+        moves = rng.normal(size=views.points[0].shape) * 3e-4
+        terms = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
+        true = views._replace(points=views.points + moves)
+        table = observe(lens(), terms, pose, true, SIGMA, rng)
+        data = prepare(replace(table, xyz=views.points[0][table.landmark]))
+        begin = start(data, lens())
+        state = fit(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
+        evidence = gather_evidence(data, state, ())
+        fitted = refit(data, state, (), evidence.variances).state
+        error, = standard_errors(evidence)
+        off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
+    # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
+    assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
+
+
+def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
+    rng = np.random.default_rng(5)
+    pose, views = scene(rng, frames=16)
+    data = prepare(observe(lens(), (), pose, views, SIGMA, rng))
+    model_scene = gather_evidence(data, start(data, lens()), ()).linear.scene
+    shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
+    bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
+    table = observe(lens(), bent, pose, views, SIGMA, rng)
+    shifted = ViewpointShiftEffect(1).curved(lens(), np.array([1e-6]))
+    found = trust(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
+    assert set(found.stderr) == {'fx', 'fy', 'cx', 'cy', 'e0'}
+    assert not found.shift['e0'].settled
+    assert found.shift['e0'].low < 0 < found.shift['e0'].high
