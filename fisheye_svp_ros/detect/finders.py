@@ -17,6 +17,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.detect.square_grid import find_squares
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.registry import Registry
 
 Grey = NDArray[np.uint8]
 Found = tuple[Index, Array]
@@ -137,7 +138,8 @@ def squares(image: Grey, pattern: Pattern) -> Found | None:
     return find_squares(image, pattern)
 
 
-DETECTORS: dict[str, tuple[tuple[str, ...], Finder]] = {
+# Which patterns a detector is for, and its finder
+DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
     'saddle': (('chessboard',), _smaller(chessboard)),
     'quick': (('chessboard',), _smaller(classic)),
     'sb': (('chessboard',), sector_based),
@@ -146,7 +148,7 @@ DETECTORS: dict[str, tuple[tuple[str, ...], Finder]] = {
     'aprilgrid': (('aprilgrid',), aprilgrid),
     'circles': (('circles', 'asymmetric_circles'), _smaller(circles)),
     'squares': (('squares',), squares),
-}
+}, tuple)
 AS_FOUND = ('sb', 'classic')  # keep their own points; the others are fitted
 
 
