@@ -24,7 +24,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
+from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
@@ -81,7 +81,7 @@ class ModelCritic(SolverNode):
         super().__init__()
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._simulation: Lens
-        self._frames: dict[int, Seen] = {}
+        self._frames: dict[int, CollectedSet] = {}
         self._new = 0
         self._judged = False
         self._running: _Running | None = None
@@ -109,7 +109,7 @@ class ModelCritic(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
-        seen = seen_in(stamp, landmarks, items, self.cameras)
+        seen = collected_set(stamp, landmarks, items, self.cameras)
         lens, scenario = true_lens(*self.lens(items)), scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._judged = scenario, {}, False

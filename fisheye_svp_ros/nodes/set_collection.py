@@ -16,7 +16,7 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 _WITHIN_SCENARIO = ('set', 'frame')
 
 
-class Seen(NamedTuple):
+class CollectedSet(NamedTuple):
     """What the cameras see in one set; every array has N rows (camera: which of them)."""
 
     stamp: int
@@ -26,15 +26,15 @@ class Seen(NamedTuple):
     camera: Index
 
 
-def seen_in(
+def collected_set(
     stamp: int, landmarks: decoding.LandmarkSet, items: Items, cameras: Sequence[str]
-) -> Seen:
+) -> CollectedSet:
     """Return one set of cameras given by namespace, each with its slash.
 
     Raises ObservationError for an unknown landmark.
     """
     sets = [items[f'{camera}image_points'] for camera in cameras]
-    return Seen(
+    return CollectedSet(
         stamp,
         np.concatenate([seen.landmark for seen in sets]),
         np.concatenate([seen.uv for seen in sets]),
@@ -43,7 +43,7 @@ def seen_in(
     )
 
 
-def table_of(window: Sequence[Seen], cameras: Sequence[str]) -> Observations:
+def table_of(window: Sequence[CollectedSet], cameras: Sequence[str]) -> Observations:
     """Return sets as a table, one frame a set; t is the stamp, s."""
     landmark, uv, xyz, camera = (
         np.concatenate(arrays) for arrays in list(zip(*window, strict=True))[1:]

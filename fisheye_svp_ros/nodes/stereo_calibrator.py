@@ -7,7 +7,7 @@ from geometry_msgs.msg import TransformStamped, Vector3Stamped
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.set_collection import Seen, scenario_of, seen_in, table_of
+from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
@@ -32,14 +32,15 @@ class StereoCalibrator(SolverNode):
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._scenario: frozenset[tuple[str, str]] = frozenset()
-        self._window: list[Seen] = []
+        self._window: list[CollectedSet] = []
         self.start()
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
         model, scenario = self.model(items), scenario_of(items)
         known = self._window if scenario == self._scenario else []
-        window = [*known, seen_in(stamp, landmarks, items, self.CAMERAS)][-self.settings.views:]
+        one = collected_set(stamp, landmarks, items, self.CAMERAS)
+        window = [*known, one][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
         found = calibrated(model, left, right, true=true_rig(items)).checked()
         # Only now: a set that cannot be used must not spoil those to come.

@@ -65,7 +65,7 @@ class Time:
         return message_class('builtin_interfaces/msg/Time')(sec=sec, nanosec=nanosec)
 
     def seconds_nanoseconds(self) -> tuple[int, int]:
-        """Return whole seconds and the nanoseconds that are left."""
+        """Return whole seconds and the remaining nanoseconds."""
         return divmod(self.nanoseconds, _NS)
 
     def __add__(self, other: object) -> Time:
