@@ -113,11 +113,17 @@ class Measured:
         return [name for name in self.names if stage_of(name) != 'lens']
 
     @property
+    def _noise_square(self) -> float:
+        """Variance of whitened noise: 1 where the table states sigma, else as it was estimated."""
+        stated = np.isfinite(self.evidence.linear.data.observations.sigma).all()
+        return 1.0 if stated else self.evidence.variances.sigma**2
+
+    @property
     def base(self) -> Fit:
         """The simulation as it was fitted."""
         linear = self.found.base.linear
         freedom = self.evidence.full.rows - self.evidence.full.poses - len(self.free)
-        chi2 = float((linear.residual**2).sum()) / max(freedom, 1)
+        chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
         return Fit(rms_px(linear, linear.residual), self._base.rms, chi2)
 
     @property
@@ -140,7 +146,7 @@ class Measured:
     def extended(self) -> Fit:
         """Causes and predicted local offsets."""
         left = conditional_residuals(self.found.fitted)
-        chi2 = float((left**2).sum()) / self.evidence.variances.sigma**2 / self.evidence.full.rows
+        chi2 = float((left**2).sum()) / self._noise_square / self.evidence.full.rows
         return Fit(rms_px(self.evidence.linear, left), self._best.rms, chi2)
 
     @property

@@ -98,6 +98,9 @@ class TestFiles:
         assert found['noise_px'] == pytest.approx(0.05, rel=0.1)
         fit = {'rms_px', 'heldout_rms_px', 'chi2_per_dof'}
         assert set(found['base']) == set(found['extended']) == fit
+        # Both beside the noise, though the table says nothing of it.
+        assert found['base']['chi2_per_dof'] > 1.2
+        assert found['extended']['chi2_per_dof'] == pytest.approx(1.0, abs=0.2)
         cause, = found['causes']
         assert {'effect', 'parameters', 'p_value', 'heldout_rms_px', 'gain',
                 'indistinguishable_from', 'to_separate'} <= set(cause)
