@@ -17,9 +17,6 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
     SetParametersResult,
 )
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -31,9 +28,10 @@ from rclpy.serialization import deserialize_message
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import nanoseconds
-from fisheye_svp_ros.io.parameters import Row, changed, rows
+from fisheye_svp_ros.io.parameters import changed, rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
+from fisheye_svp_ros.nodes.declaration import declare
 from fisheye_svp_ros.study.settings import Settings
 
 # All topics are reliable; inputs are deep enough for what comes while a solver is busy.
@@ -322,38 +320,6 @@ def twins(receive: Callable[[bytes], None]) -> tuple[Callable[[bytes], None], ..
         return hear
 
     return callback(0), callback(1)
-
-
-def declare(node: Any, kind: type[S]) -> S:
-    """Declare every row of a table on a node, and return the values it starts with.
-
-    Raises ParameterError for a value that is not allowed; rclpy's own errors for a wrong type.
-    """
-    values = {}
-    for row in rows(kind):
-        default = list(row.default) if isinstance(row.default, tuple) else row.default
-        values[row.name] = node.declare_parameter(row.name, default, descriptor(row)).value
-    return changed(kind(), values)
-
-
-def descriptor(row: Row) -> Any:
-    """Return the ParameterDescriptor of a row."""
-    unit = f' [{row.unit}]' if row.unit else ''
-    message = ParameterDescriptor(
-        name=row.name, description=row.description + unit, read_only=row.fixed)
-    # A parameter of one type would not let both `auto` and YAML's true be given.
-    message.dynamic_typing = row.takes_booleans
-    if row.choices:
-        message.additional_constraints = row.constraint()
-    if row.low is None or row.high is None:
-        return message
-    if isinstance(row.default, int):
-        limits = IntegerRange(from_value=int(row.low), to_value=int(row.high))
-        message.integer_range = [limits]
-    else:
-        limits = FloatingPointRange(from_value=float(row.low), to_value=float(row.high))
-        message.floating_point_range = [limits]
-    return message
 
 
 def run(kind: type[BaseNode], args: list[str] | None = None) -> int:

@@ -28,14 +28,14 @@ _MODULES = {
     'rclpy.logging': 'logging',
     'rclpy.node': 'node',
     'rclpy.parameter': 'parameters',
-    'rclpy.publisher': 'node',
+    'rclpy.publisher': 'entities',
     'rclpy.qos': 'qos',
     'rclpy.qos_overriding_options': 'qos',
     'rclpy.serialization': 'serialization',
-    'rclpy.service': 'node',
-    'rclpy.subscription': 'node',
+    'rclpy.service': 'entities',
+    'rclpy.subscription': 'entities',
     'rclpy.time': 'clock',
-    'rclpy.timer': 'node',
+    'rclpy.timer': 'entities',
 }
 
 _installed = False

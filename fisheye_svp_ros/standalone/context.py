@@ -11,6 +11,7 @@ from typing import Any
 
 from fisheye_svp_ros.standalone import arguments, dds, logging
 from fisheye_svp_ros.standalone.exceptions import NotInitializedException, RCLError
+from fisheye_svp_ros.standalone.graph import Graph
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LAST_DOMAIN = 232  # the ports of higher ones do not exist
@@ -24,7 +25,7 @@ class Context:
         self.nodes: list[Any] = []
         self.interrupted = False
         self._running = False
-        self._wire: tuple[dds.Participant, dds.Graph] | None = None
+        self._wire: tuple[dds.Participant, Graph] | None = None
         self._handlers: dict[signal.Signals, Any] = {}
 
     def init(self, args: list[str] | None = None, domain_id: int | None = None) -> None:
@@ -39,7 +40,7 @@ class Context:
         if not given.isdecimal() or int(given) > _LAST_DOMAIN:
             raise RCLError(f'ROS_DOMAIN_ID={given} is not a number from 0 to {_LAST_DOMAIN}')
         participant = dds.Participant(int(given))
-        self._wire = participant, dds.Graph(participant)
+        self._wire = participant, Graph(participant)
         self._running, self.interrupted = True, False
         if threading.current_thread() is threading.main_thread():
             self._handlers = {s: signal.signal(s, self._on_signal) for s in _SIGNALS}
@@ -54,7 +55,7 @@ class Context:
         return self._connected()[0]
 
     @property
-    def graph(self) -> dds.Graph:
+    def graph(self) -> Graph:
         """What this process tells about its nodes."""
         return self._connected()[1]
 
@@ -68,7 +69,7 @@ class Context:
             signal.signal(number, handler)
         self._handlers = {}
 
-    def _connected(self) -> tuple[dds.Participant, dds.Graph]:
+    def _connected(self) -> tuple[dds.Participant, Graph]:
         if self._wire is None:
             raise NotInitializedException('rclpy.init() has not been called')
         return self._wire
