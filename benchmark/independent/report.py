@@ -23,7 +23,7 @@ quadratic field in each view, a static field in each camera; and up to 2 % gross
 
 An effect is named if a cause or its class (`indistinguishable_from`) has it. A name is false if
 nothing of its class is hidden. The stage is right if the strongest significant component (1 %)
-lies where the hidden effect does.
+lies where the hidden effect does; under a background, which lies everywhere, it is not asked.
 """
 
 
@@ -80,7 +80,7 @@ def _one(runs: Mapping[float, Scores]) -> str:
     for background, scores in sorted(runs.items()):
         for size in sorted({s['hidden'][0]['size'] for s in scores}, reverse=True):
             some = [s for s in scores if s['hidden'][0]['size'] == size]
-            stages = [s['stage_right'][0] for s in some if s['stage_right']]
+            stages = [s['stage_right'][0] for s in some if s['stage_right'] and not background]
             rows.append((f'{background:g}', f'{size:g}', _rate(s['found'][0] for s in some),
                          _rate(s['exactly'][0] for s in some), _rate(s['false'] for s in some),
                          _rate(stages), _verdicts(some)))
@@ -150,12 +150,13 @@ def _outside(runs: Mapping[float, Scores]) -> str:
         for effect, size in keys:
             some = [s for s in scores if s['hidden'][0]['effect'] == effect
                     and s['hidden'][0]['size'] == -size]
-            rows.append((f'{background:g}', effect, f'{-size:g}', *_line(some)))
-        rows.append((f'{background:g}', 'all', '', *_line(scores)))
+            rows.append((f'{background:g}', effect, f'{-size:g}', *_line(some, background)))
+        rows.append((f'{background:g}', 'all', '', *_line(scores, background)))
     return _table(('background', 'what', 'size', 'no name', 'names', 'stage right', 'verdicts'),
                   rows)
 
 
-def _line(scores: Scores) -> tuple[str, ...]:
+def _line(scores: Scores, background: float) -> tuple[str, ...]:
     return (_rate(not s['said'] for s in scores), _names(scores),
-            _rate(hit for s in scores for hit in s['stage_right']), _verdicts(scores))
+            '-' if background else _rate(hit for s in scores for hit in s['stage_right']),
+            _verdicts(scores))
