@@ -184,10 +184,10 @@ def _hide(task: Task, scene: Scene, rng: np.random.Generator) -> Case | None:
     for one, amount in zip(hidden, amounts, strict=True):
         noise = noise * one.scatter(theta, amount, rng)
     given = exact + noise
-    for one, amount in zip(hidden, amounts, strict=True):
-        given = one.recorded(given, amount, rng)
     if level:
         given = with_outliers(given, scene, rng)
+    for one, amount in zip(hidden, amounts, strict=True):
+        given = one.recorded(given, amount, rng)
     return Case(scene, hidden, amounts, linear, ideal, exact, given, level)
 
 

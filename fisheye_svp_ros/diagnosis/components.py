@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.reml import (
 _CALLED, _CALLED_LATE = 0.3, 0.01
 _LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
 _SHARE = 0.02
+_WARM = 6  # steps from the variances of a similar state
 _DOUBTFUL = (6.0, 100.0)  # likelihood ratios between which the other variances are found anew
 
 
@@ -35,11 +36,14 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
         lam = np.array([first.lam[i] if p.get(n, 1.0) < _CALLED else GONE
                         for i, n in enumerate(NAMES)])
         now = Variances(1.0, lam, first.weight)
+        now, _ = estimate(eq, now)
+        asked = NAMES
     else:
-        now = before
-    now, _ = estimate(eq, now)
-    missing = [n for n, there in zip(NAMES, now.alive, strict=True) if not there]
-    p = score_components(eq, now, missing)
+        # A similar state has similar variances; only what was not asked before is asked now.
+        now, _ = estimate(eq, before, _WARM)
+        asked = ('image_finest',) if first.lam[NAMES.index('image_finest')] < GONE else ()
+    missing = [n for n in asked if not now.alive[NAMES.index(n)]]
+    p = score_components(eq, now, missing) if missing else {}
     lam = now.lam.copy()
     for name in missing:
         if p.get(name, 1.0) < _CALLED_LATE:

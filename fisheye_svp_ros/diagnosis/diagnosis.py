@@ -123,7 +123,8 @@ def diagnose(
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data')
     return _judged(
-        observations, lens, found, Measured(found, free, held_out, wanted.quick), noise_causes
+        observations, lens, found, Measured(found, free, held_out, wanted.quick), noise_causes,
+        held_out,
     )
 
 
@@ -135,7 +136,7 @@ def _residual_px(linear: Linearised) -> float:
 
 def _judged(
     observations: Observations, lens: Lens, found: Found, measured: Measured,
-    noise_causes: list[Cause],
+    noise_causes: list[Cause], held_out: Observations | None,
 ) -> Diagnosis:
     evidence = found.evidence
     components = measured.components({c.effect: c.p_value for c in noise_causes})
@@ -146,6 +147,9 @@ def _judged(
         evidence, found.fitted, found_components(components), stated
     )
     left = with_outliers(left, found.gross, len(observations))
+    gross = gross_rows(observations, found.gross)
+    if held_out is not None and measured.test_gross is not None:
+        gross += gross_rows(held_out, measured.test_gross, 'held out: ')
     return Diagnosis(
         verdict=_verdict(causes, left),
         noise_px=measured.noise,
@@ -157,7 +161,7 @@ def _judged(
         named=measured.named,
         lens_only=measured.lens_only,
         extended=measured.extended,
-        gross=gross_rows(observations, found.gross),
+        gross=gross,
         advice=advise(found, causes, measured, found_components(components)),
         remaining=left,
         untestable=found.base.untestable,

@@ -146,9 +146,12 @@ def frame_folds(frames: int) -> Index:
 
 def gather_evidence(
     data: Data, state: State, free: Sequence[str], before: Variances | None = None,
-    left_out: Sequence[str] = (),
+    left_out: Sequence[str] = (), finest: bool = False,
 ) -> Evidence:
-    """Linearise a state, find the variances of its null model, multiply out all forms."""
+    """Linearise a state, find the variances of its null model, multiply out all forms.
+
+    before: variances to start from; left_out: effects; finest: with the finest image field.
+    """
     linear = Linearised(data, state, free)
     forms = forms_of(linear, left_out)
     fields = mean_fields(linear)
@@ -156,7 +159,7 @@ def gather_evidence(
     scale = np.sqrt((columns**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
-    random = design(linear)
+    random = design(linear, finest)
     full = equations(random, linear.frame_columns, border)
     own = linear.shared_columns.shape[-1]
     free_ones = np.concatenate([np.arange(own), own + forms.generic])

@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import identifiable
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, fit, prepare, start_poses
-from fisheye_svp_ros.diagnosis.noise import find_gross_errors
+from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
     Gain,
     HeldOut,
@@ -67,10 +67,11 @@ class Measured:
         self.names = [e.name for e, _ in found.state.terms if e.stage != 'noise']
         self.local: Local = local_offsets(found.fitted)
         self.test: Data | None = None
+        self.test_gross: Gross | None = None
         if held_out is not None:
-            # Held-out outliers are no measure of a model.
+            # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
-            self.test, _ = find_gross_errors(test, start_poses(test, found.base.linear.state))
+            self.test, self.test_gross = find_gross_errors(test, start_poses(test, found.state))
 
     @cached_property
     def errors(self) -> Array:

@@ -171,11 +171,8 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     gain = (deviance(0.0) - float(best.fun)) / tails
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
     p = float(stats.chi2.sf(max(gain, 0.0), 1))
-    # Logarithms do not mind heavy tails: where these grow with the angle, the bulk grows less.
-    of_bulk = float(z @ np.log(np.maximum(squares[used], 1e-6)) / (z @ z)) / 2
-    value = float(best.x) if abs(best.x) < abs(of_bulk) else of_bulk
-    level = float(np.mean(e2 * np.exp(-2 * value * z)))
-    return NoiseCause(value, stderr, p, level * np.exp(2 * value * every))
+    level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
+    return NoiseCause(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
 
 
 def with_noise_growth(state: State, growth: float) -> State:

@@ -16,14 +16,15 @@ from fisheye_svp_ros.diagnosis.model import Linearised
 
 MILLIMETRE = 1e-3  # unit of offsets on the target
 STAGE_OF = {
-    'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
+    'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
     'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
     'board_in_plane': 'target', 'board_normal': 'target',
     'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
     'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
 }
 NAMES = tuple(STAGE_OF)
-_STATIC = (('image_coarse', 6, 0.0), ('image_fine', 14, 3.0), ('image_finest', 26, 4.5))
+_STATIC = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine', 14, 3.0),
+           ('image_finest', 26, 3.0))
 _FRAME_CELLS, _BOARD_CELLS = 4, 4
 _FEWEST_ON_BOARD = 12
 _REACH = 3.0  # of a bump, in its standard deviations
@@ -211,7 +212,9 @@ def _grids(points: Points, finest: bool) -> list[Grid]:
             continue
         uv = points.uv[mine]
         low, high = uv.min(axis=0), uv.max(axis=0)
-        for name, cells, fewest in _STATIC[: 3 if finest else 2]:
+        for name, most, fewest in _STATIC[: 4 if finest else 3]:
+            fits = max(int(np.sqrt(len(uv) / fewest)), 16)
+            cells = min(most, fits) if name == 'image_finest' else most
             pitch = max(float((high - low).max()) / cells, 1e-9)
             centres = hexagons(low, high, pitch)
             seen = bump_values(points.uv, mine, centres, pitch).sum(axis=(0, 1)) > 4.0

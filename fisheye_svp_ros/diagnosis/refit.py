@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.mixed import (
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
+    NAMES,
     Design,
     Grid,
     bump_values,
@@ -76,7 +77,8 @@ def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -
 
 def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
     """Solve the mixed-model equations of one linearisation."""
-    random = design(linear).kept(variances.alive)
+    finest = bool(variances.alive[NAMES.index('image_finest')])
+    random = design(linear, finest).kept(variances.alive)
     scale = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate(

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.model import flat_rows
 from fisheye_svp_ros.diagnosis.refit import Fitted
 
 _PROBES = 24
+_FINEST = 80  # of the image: how near to each other points have the same place
+_FEWEST_PAIRS = 100
 
 
 def conditional_residuals(fitted: Fitted) -> Array:
@@ -37,6 +40,27 @@ def standardised_squares(fitted: Fitted) -> Array:
     """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
     left = conditional_residuals(fitted)
     return np.asarray(left**2 / (1 - leverages(fitted)) / fitted.solution.variance)
+
+
+def ripples(fitted: Fitted) -> float:
+    """Return how alike points of different frames err on the same place, in standard errors.
+
+    Residuals with everything predicted that are finer than the image fields have room for.
+    """
+    linear = fitted.linear
+    left = conditional_residuals(fitted).reshape(*linear.residual.shape[:1], -1, 2)
+    uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
+    used = linear.used[:, ::2]
+    frame = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
+    places, errors = uv[used], left[used]
+    reach = float(np.ptp(places, axis=0).max()) / _FINEST
+    pairs = cKDTree(places).query_pairs(reach, output_type='ndarray')
+    pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]
+    if len(pairs) < _FEWEST_PAIRS:
+        return 0.0
+    products = (errors[pairs[:, 0]] * errors[pairs[:, 1]]).sum(axis=1)
+    typical = np.clip(products, *np.quantile(products, (0.005, 0.995)))
+    return float(typical.mean() / max(typical.std(), 1e-300) * np.sqrt(len(pairs)))
 
 
 def _own(fitted: Fitted) -> Array:

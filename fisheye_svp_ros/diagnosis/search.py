@@ -22,7 +22,7 @@ from fisheye_svp_ros.diagnosis.noise import (
 from fisheye_svp_ros.diagnosis.prediction import placed_terms
 from fisheye_svp_ros.diagnosis.refit import Fitted, fit_linear, refit
 from fisheye_svp_ros.diagnosis.reml import Variances
-from fisheye_svp_ros.diagnosis.residuals import standardised_squares
+from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 from fisheye_svp_ros.diagnosis.single_landmarks import single_landmarks
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.base import Effect, Untestable
@@ -31,6 +31,7 @@ from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError
 
 _ROUNDS = 6
+_RIPPLES = 4.0  # standard errors
 _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a round
 
 
@@ -60,11 +61,11 @@ def search(
     base: Evidence | None = None
     dropped: set[str] = set()
     growth: NoiseCause | None = None
-    cleaned = settled = False
+    cleaned = settled = finest = False
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
-        evidence = gather_evidence(data, state, free, before, wanted.left_out)
+        evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
         base, before = base or evidence, evidence.variances
         included, gone = _needed(evidence, wanted.included)
         trace += [_gone(name) for name in gone]
@@ -85,6 +86,12 @@ def search(
             cleaned = True
             if growth is not None:
                 state = with_noise_growth(state, growth.value)
+        if not changed and not finest and cleaned and (
+            ripples(fit_linear(evidence.linear, before)) > _RIPPLES
+        ):
+            # Points of different frames err alike where they fall on the same place.
+            finest = changed = True
+            continue
         if not changed:
             break
         state = refit(data, state, free, before).state
@@ -92,7 +99,7 @@ def search(
             break
         settled = cleaned
     if changed:
-        evidence = gather_evidence(data, state, free, before, wanted.left_out)
+        evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
     fitted = fit_linear(evidence.linear, evidence.variances)
     assert base is not None
     return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)

@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evidence import Evidence, swept
 from fisheye_svp_ros.diagnosis.refit import Fitted
-from fisheye_svp_ros.diagnosis.residuals import standardised_squares
+from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 
 _VARIABLE = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
 
@@ -44,9 +44,10 @@ def remaining_structure(
         old = found.get(name, Structure(name, 1.0, 0.0))
         found[name] = Structure(name, min(old.p_value, part.p_value), old.share + part.share)
     tests = [*_field_tests(evidence), *_scatter_tests(fitted, known_noise)]
+    tests.append(('image', float(stats.norm.sf(ripples(fitted))), 0.0))
     for name, p, share in tests:
         corrected = min(1.0, p * len(tests))
-        if corrected < SIGNIFICANCE:
+        if corrected < SIGNIFICANCE and name not in found:
             found[name] = Structure(name, corrected, share)
     return list(found.values())
 

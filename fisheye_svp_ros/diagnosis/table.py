@@ -16,7 +16,8 @@ def table_causes(observations: Observations, gross: Gross, step: float) -> list[
     """Return causes in the table: wrong ids, and rounding to a step (px; 0 for none)."""
     causes = []
     swapped = gross.swapped
-    if swapped and 2 * swapped >= len(gross.rows):
+    # A point lies on another landmark's prediction by chance once in thousands.
+    if swapped > 1 or 2 * swapped >= len(gross.rows) > 0:
         fraction = swapped / len(observations)
         value = {'value': fraction, 'stderr': fraction / np.sqrt(swapped), 'unit': '1'}
         causes.append(plain_cause('wrong_ids', {'fraction': value}, 0.0, 0.0))
@@ -45,14 +46,16 @@ def with_outliers(
     return [*rest, Structure('outliers', 0.0, far / observations)]
 
 
-def gross_rows(observations: Observations, gross: Gross) -> list[dict[str, Any]]:
+def gross_rows(
+    observations: Observations, gross: Gross, where: str = ''
+) -> list[dict[str, Any]]:
     """Return gross errors by frame and landmark, the farthest first."""
     order = np.argsort(-gross.px, kind='stable')
     return [
         {
             'frame': int(observations.frame[gross.rows[i]]),
             'landmark': int(observations.landmark[gross.rows[i]]),
-            'px': float(gross.px[i]), 'why': gross.why[i],
+            'px': float(gross.px[i]), 'why': where + gross.why[i],
             **({'camera': observations.cameras[observations.camera[gross.rows[i]]]}
                if len(observations.cameras) > 1 else {}),
         }

@@ -52,8 +52,9 @@ _MEASURES = {
 COMPONENTS = {
     'named_lens': 'lens, by name', 'named_target': 'target, by name',
     'named_frame': 'frames, by name',
-    'image_coarse': 'image field of a sixth', 'image_fine': 'image field of a fourteenth',
-    'image_finest': 'finer image field', 'landmark_in_plane': 'landmarks along their board',
+    'image_broad': 'image field of a third', 'image_coarse': 'image field of a sixth',
+    'image_fine': 'image field of a fourteenth', 'image_finest': 'finer image field',
+    'landmark_in_plane': 'landmarks along their board',
     'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
     'board_in_plane': 'board field along it', 'board_normal': 'board field off it',
     'frame_focal': 'focal length of each frame', 'frame_centre': 'centre of each frame',

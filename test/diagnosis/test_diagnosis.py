@@ -9,8 +9,10 @@ from helpers.scenes import lens, observe, scene
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
 from fisheye_svp_ros.diagnosis.noise import quantisation_step
+from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.errors import ParameterError
 
 SIGMA = 0.2
 
@@ -155,3 +157,31 @@ def test_what_no_effect_explains_stays_unexplained():
     found = diagnose(replace(table, uv=table.uv + ripple), lens())
     assert found.verdict in ('unexplained', 'partly_explained')
     assert 'image' in [s.variable for s in found.remaining]
+
+
+def test_a_fine_ripple_of_the_image_has_its_place():
+    rng = np.random.default_rng(18)
+    pose, views = scene(rng, frames=40)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    turns = 2 * np.pi * table.uv / 153.6
+    ripple = 0.6 * np.stack([np.sin(turns[:, 1]), np.cos(turns[:, 0])], axis=-1)
+    found = diagnose(replace(table, uv=table.uv + ripple), lens())
+    assert found.verdict == 'unexplained'
+    assert [s.variable for s in found.remaining] == ['image']
+    lens_share = sum(part.share for part in found.components if part.stage == 'lens')
+    assert lens_share > 0.7
+
+
+def test_what_the_user_knows_is_taken_in_or_left_out():
+    rng = np.random.default_rng(19)
+    pose, views = scene(rng)
+    table = observe(lens(), [(CATALOGUE['skew'](), np.array([0.002]))], pose, views, SIGMA, rng)
+    known = diagnose(table, lens(), wanted=Wanted(included=('aspect',), quick=True))
+    assert {cause.effect for cause in known.causes} == {'aspect', 'skew'}
+    without = diagnose(table, lens(), wanted=Wanted(left_out=('skew',), quick=True))
+    assert 'skew' not in {cause.effect for cause in without.causes}
+    assert without.verdict != 'adequate'
+    with pytest.raises(ParameterError, match='known are'):
+        Wanted(left_out=('skwe',))
+    with pytest.raises(ParameterError, match='without a test'):
+        Wanted(included=('wrong_ids',))
