@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import stats
 
@@ -19,6 +21,7 @@ from fisheye_svp_ros.diagnosis.reml import (
 _CALLED, _CALLED_LATE = 0.3, 0.01
 _LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
 _SHARE = 0.02
+_CHANCE = 0.05
 _WARM = 6  # steps from the variances of a similar state
 _DOUBTFUL = (6.0, 100.0)  # likelihood ratios between which the other variances are found anew
 
@@ -50,6 +53,18 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
             lam[NAMES.index(name)] = first.lam[NAMES.index(name)]
     if (lam < GONE).sum() > now.alive.sum():
         now, _ = estimate(eq, Variances(now.sigma, lam, now.weight))
+    return now if before is not None else _without_chance(eq, now)
+
+
+def _without_chance(eq: Equations, now: Variances) -> Variances:
+    """Switch off what may as well be chance: a variance hardly known makes every test unsure."""
+    found = significance(eq, now)
+    lam = now.lam.copy()
+    for name, p in found.items():
+        if p > _CHANCE:
+            lam[NAMES.index(name)] = GONE
+    if (lam < GONE).sum() < now.alive.sum():
+        now, _ = estimate(eq, replace(now, lam=lam), _WARM)
     return now
 
 
