@@ -20,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Spin the node until it ends; exit with its status."""
-    supply_rclpy()
+    with executables.ending_quietly():
+        supply_rclpy()
     raise SystemExit(executables.run(args.node, args.arguments))
 
 

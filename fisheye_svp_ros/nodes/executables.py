@@ -7,21 +7,30 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 
 from fisheye_svp_ros.nodes import NODES
 
 
-def run(name: str, args: list[str] | None = None) -> int:
-    """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
-    # There is nothing to clean up yet.
+@contextmanager
+def ending_quietly() -> Iterator[None]:
+    """End the process at once on SIGINT or SIGTERM: while modules load, nothing is to be saved."""
     before = {number: signal.signal(number, lambda *_: os._exit(0))
               for number in (signal.SIGINT, signal.SIGTERM)}
-    module = import_module(f'fisheye_svp_ros.nodes.{name}')
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def run(name: str, args: list[str] | None = None) -> int:
+    """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
+    with ending_quietly():
+        module = import_module(f'fisheye_svp_ros.nodes.{name}')
     return int(module.main(args))
 
 

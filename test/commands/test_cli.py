@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.nodes import hears_sigint
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
@@ -47,7 +48,8 @@ def process(*arguments, **options):
     """Start the command line in a process of its own."""
     return subprocess.Popen(
         [sys.executable, '-m', 'fisheye_svp_ros.cli', *map(str, arguments)], cwd=ROOT,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_sigint,
+        **options,
     )
 
 

@@ -20,6 +20,11 @@ TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is
 SHARED = ROOT.parent / 'shared' / 'data'
 
 
+def hears_sigint() -> None:
+    """Undo, in a child, that whoever runs the tests in the background ignores SIGINT."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class NodeProcess:
     """A node in a process of its own, and the lines it writes."""
 
@@ -27,7 +32,8 @@ class NodeProcess:
         self.lines: list[str] = []
         self._queue: queue.Queue[str | None] = queue.Queue()
         self.process = subprocess.Popen(
-            command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+            command, env=env, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            preexec_fn=hears_sigint)
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 

@@ -18,8 +18,11 @@ if not standalone.is_genuine():
 _CODE = """
 import sys
 from fisheye_svp_ros import cli
-print('loading', flush=True)
-sys.exit(cli.main(['run', *sys.argv[1:]]))
+try:
+    print('loading', flush=True)
+    sys.exit(cli.main(['run', *sys.argv[1:]]))
+except KeyboardInterrupt:  # before or after the command itself
+    sys.exit(130)
 """
 
 

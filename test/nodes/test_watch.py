@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from helpers.nodes import ROOT, TIMEOUT
+from helpers.nodes import ROOT, TIMEOUT, hears_sigint
 
 from fisheye_svp_ros import standalone
 
@@ -26,7 +26,7 @@ def test_results_are_shown_with_their_metrics(ros_domain: int, tmp_path: Path) -
     def start(*arguments: str) -> subprocess.Popen[str]:
         processes.append(subprocess.Popen(
             [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments], env=env, text=True,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT))
+            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, preexec_fn=hears_sigint))
         return processes[-1]
 
     few = tmp_path / 'few.csv'
