@@ -39,6 +39,8 @@ it and hands nothing but table and lens to `diagnose`. What is hidden is simulat
 it and not by the columns of the catalogue: boards are bent, rows exposed one after the other, rays
 traced through the window.
 
+Modes without a table below have not been run since the null model has random parts.
+
 The size of an effect is the RMS, over the noise, of what is left of it once poses, rig and free
 intrinsics are fitted. For `noise_vs_angle` it is the RMS of the relative change of the scatter;
 for `quantisation` the RMS of rounding; `wrong_ids` swaps one pair or more, however small the size.

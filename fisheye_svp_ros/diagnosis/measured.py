@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -71,7 +71,9 @@ class Measured:
         if held_out is not None:
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
-            self.test, self.test_gross = find_gross_errors(test, start_poses(test, found.state))
+            solved = start_poses(test, found.state)
+            self.test, self.test_gross = find_gross_errors(test, solved)
+            self.test_pose = start_poses(self.test, found.state).pose
 
     @cached_property
     def errors(self) -> Array:
@@ -88,7 +90,8 @@ class Measured:
             state = without_causes(self.evidence, without, self.free)
         else:
             state = self.found.state
-        return on_other_data(self.test, state, self.local if local else None)
+        near = replace(state, pose=self.test_pose, rig=self.found.state.rig)
+        return on_other_data(self.test, near, self.local if local else None)
 
     @cached_property
     def _base(self) -> HeldOut:

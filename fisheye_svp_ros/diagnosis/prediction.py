@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.evidence import Evidence, frame_folds, pseudo_inverse
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved, start_poses
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit_poses, moved
 from fisheye_svp_ros.diagnosis.refit import Local
 
 _RESAMPLES = 2000
@@ -63,11 +63,11 @@ def _ratio(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> Array:
 
 
 def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldOut:
-    """Predict other frames of the same camera and target."""
+    """Predict other frames of the same camera and target, from poses in the state."""
     data = test if local is None else local.applied(test)
     # In px every point counts alike, however noisy it is.
     plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
-    linear = Linearised(data, start_poses(data, plain), ())
+    linear = Linearised(data, fit_poses(data, plain), ())
     return _figures(linear, linear.residual)
 
 

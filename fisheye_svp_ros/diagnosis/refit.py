@@ -9,7 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.evidence import Evidence
 from fisheye_svp_ros.diagnosis.mixed import (
+    Equations,
     Factored,
     Solution,
     equations,
@@ -85,6 +87,20 @@ def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
         [linear.shared_columns / scale, linear.residual[..., None]], axis=-1
     )
     eq = equations(random, linear.frame_columns, border).trimmed(variances.alive)
+    return _solved(linear, random, eq, variances, scale)
+
+
+def fit_of(evidence: Evidence) -> Fitted:
+    """Solve the mixed-model equations of evidence for what is in its model."""
+    basis = np.eye(len(evidence.scale), evidence.own)
+    random = evidence.design.kept(evidence.variances.alive)
+    return _solved(evidence.linear, random, evidence.equations.bordered(basis),
+                   evidence.variances, evidence.scale[: evidence.own])
+
+
+def _solved(
+    linear: Linearised, random: Design, eq: Equations, variances: Variances, scale: Array
+) -> Fitted:
     # What the data leave open stays where it is.
     ridge = np.append(np.full(len(scale), 1e-9), 0.0)
     eq = replace(eq, blocks=eq.blocks._replace(xx=eq.blocks.xx + np.diag(ridge)))

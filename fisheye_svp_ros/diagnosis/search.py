@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.noise import (
     with_noise_growth,
 )
 from fisheye_svp_ros.diagnosis.prediction import placed_terms
-from fisheye_svp_ros.diagnosis.refit import Fitted, fit_linear, refit
+from fisheye_svp_ros.diagnosis.refit import Fitted, fit_of, refit
 from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 from fisheye_svp_ros.diagnosis.single_landmarks import single_landmarks
@@ -81,13 +81,13 @@ def search(
             state, changed = with_effect(state, effect, offset), True
         if not changed and growth is None and not cleaned and not wanted.quick:
             # Once the causes are known: what is far off even beside random errors, and the noise.
-            fitted = fit_linear(evidence.linear, before)
+            fitted = fit_of(evidence)
             data, gross, growth, changed = _cleaned(data, fitted, gross, wanted)
             cleaned = True
             if growth is not None:
                 state = with_noise_growth(state, growth.value)
         if not changed and not finest and cleaned and (
-            ripples(fit_linear(evidence.linear, before)) > _RIPPLES
+            ripples(fit_of(evidence)) > _RIPPLES
         ):
             # Points of different frames err alike where they fall on the same place.
             finest = changed = True
@@ -100,7 +100,7 @@ def search(
         settled = cleaned
     if changed:
         evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
-    fitted = fit_linear(evidence.linear, evidence.variances)
+    fitted = fit_of(evidence)
     assert base is not None
     return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)
 
