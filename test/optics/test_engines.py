@@ -146,6 +146,8 @@ def test_both_take_the_same_steps(compiled, monkeypatch):
     # What is given up for the reference takes no steps of the compiled form to the end.
     kept = compiled.localize(*given)[0].converged
     assert kept.sum() > 40
+    # The array form, whichever engine other tests have made the one that answers.
+    monkeypatch.setattr(localization.engines, 'localize', lambda *_: None)
     for limit in range(1, 40):
         monkeypatch.setattr(least_squares.levenberg_marquardt, '__defaults__', (limit,))
         expected = localization.localize(ForwardModel(FISH214), views, start)
