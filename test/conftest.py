@@ -40,17 +40,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.xdist_group('engines'))
 
 
+@pytest.fixture(autouse=True)
+def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take back what a test settles about the engine: the two agree to 1e-12, not to the bit."""
+    monkeypatch.setattr(engines, '_engine', engines._engine)
+    monkeypatch.setenv(engines.VARIABLE, os.environ.get(engines.VARIABLE, 'auto'))
+
+
 @pytest.fixture(params=['numpy', 'numba'])
-def engine(request: pytest.FixtureRequest) -> Iterator[str]:
+def engine(request: pytest.FixtureRequest, same_engine: None) -> Iterator[str]:
     """Run a test on each engine."""
     if request.param == 'numba':
         pytest.importorskip('numba', reason='the engine numba comes with the extra `fast`')
-    before = os.environ.get(engines.VARIABLE)
+    before = os.environ[engines.VARIABLE]
     engines.use(request.param)
     yield request.param
-    engines.use(before or 'auto')
-    if before is None:
-        del os.environ[engines.VARIABLE]
+    engines.use(before)
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
 from fisheye_svp_ros.io.parameters import changed
+from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
 from fisheye_svp_ros.solve.localization import localize
@@ -50,6 +51,12 @@ synthetic_camera:
 TASKS = 10
 
 
+@pytest.fixture(autouse=True)
+def reference_engine(same_engine: None) -> None:
+    """Solve by the reference: which engine `auto` takes depends on what was compiled before."""
+    engines.use('numpy')
+
+
 @pytest.fixture(scope='module')
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the finished sweep LONG."""
@@ -76,7 +83,7 @@ def sweep(*arguments: Any) -> None:
 
 def start(*arguments: Any) -> subprocess.Popen[str]:
     """Start a sweep in a process of its own."""
-    env = os.environ | {'PYTHONPATH': str(ROOT)}
+    env = os.environ | {'PYTHONPATH': str(ROOT), engines.VARIABLE: 'numpy'}
     command = [sys.executable, '-m', 'fisheye_svp_ros.cli', 'sweep', *map(str, arguments)]
     return subprocess.Popen(command, env=env, text=True, stderr=subprocess.PIPE,
                             stdout=subprocess.DEVNULL)
