@@ -2,35 +2,34 @@
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
 
-PACKAGE = 'fisheye_svp_ros'
+from fisheye_svp_ros.nodes.launching import COMMON, arguments, file_arguments, node, value
+
+NODES = ('detector', 'localizer', 'model_critic')
 ARGUMENTS = {
-    'board': ('chessboard:9x6:25mm', 'the board, as for `fisheye-svp detect`'),
-    'lens': ('', 'lens file, also of other tools'),
     'image': ('image', 'topic of the images; compressed ones are taken from IMAGE/compressed'),
-    'namespace': ('', 'namespace of the nodes'),
+    'camera_info': ('', 'topic of the camera_info; empty: the one beside the images'),
+    'lens': ('camera_info', 'lens file, also of other tools; camera_info: what that topic says'),
+    'board': ('chessboard:9x6:25mm', 'the board, as for `fisheye-svp detect`'),
 }
 
 
 def nodes(context):
     """Return the detector and what follows it."""
-    value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    lens = {'lens': value['lens']} if value['lens'] else {}
-    parameters = {'detector': {'board': value['board']}, 'localizer': lens, 'model_critic': lens}
-    topics = [('image', value['image']), ('image/compressed', f'{value["image"]}/compressed')]
-    return [
-        Node(package=PACKAGE, executable=name, namespace=value['namespace'], output='screen',
-             parameters=[given], remappings=topics)
-        for name, given in parameters.items()
-    ]
+    image, info = value(context, 'image'), value(context, 'camera_info')
+    beside = image.rpartition('/')
+    topics = [('image', image), ('image/compressed', f'{image}/compressed'),
+              ('camera_info', info or f'{beside[0]}{beside[1]}camera_info')]
+    given = {'detector': {'board': value(context, 'board')}}
+    return [node(context, name, given.get(name, {}), topics) for name in NODES]
 
 
 def generate_launch_description():
     """Return arguments and nodes."""
     return LaunchDescription([
+        *arguments(name for name in COMMON if name not in ARGUMENTS),
         *(DeclareLaunchArgument(name, default_value=default, description=text)
           for name, (default, text) in ARGUMENTS.items()),
+        *file_arguments(NODES),
         OpaqueFunction(function=nodes),
     ])

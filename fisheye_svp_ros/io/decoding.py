@@ -43,6 +43,15 @@ class ImagePoints(NamedTuple):
     frame: str
 
 
+class CameraModel(NamedTuple):
+    """A CameraInfo: distortion model; width, height, px; fx, fy, cx, cy, px; coefficients."""
+
+    model: str
+    size: tuple[int, int]
+    intrinsics: tuple[float, float, float, float]
+    d: tuple[float, ...]
+
+
 class Status(NamedTuple):
     """One status of a DiagnosticArray; level: 0 for OK."""
 
@@ -98,6 +107,21 @@ def read_pose(message: Any, topic: str = 'true_pose') -> Pose:
 def read_transform(message: Any, topic: str = 'rig') -> Pose:
     """Return the pose of a TransformStamped's child in its frame."""
     return _pose(message.transform.translation, message.transform.rotation, topic)
+
+
+def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
+    """Return the model of a CameraInfo: of the whole, raw image."""
+    k, d = [float(value) for value in message.k], tuple(float(value) for value in message.d)
+    if not k[0]:
+        raise ObservationError(f'{topic}: k is 0, as of a camera that is not calibrated')
+    if not np.isfinite([*k, *d]).all():
+        raise ObservationError(f'{topic}: k or d holds a value that is not a finite number')
+    size, roi = (int(message.width), int(message.height)), message.roi
+    part = roi.x_offset or roi.y_offset or (roi.width or size[0], roi.height or size[1]) != size
+    if part or max(message.binning_x, message.binning_y) > 1:
+        raise ObservationError(f'{topic}: of a part of the image, or binned; whole images are '
+                               'needed')
+    return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5]), d)
 
 
 def statuses(message: Any) -> list[Status]:

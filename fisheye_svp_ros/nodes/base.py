@@ -22,7 +22,7 @@ from rcl_interfaces.msg import (
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 
@@ -38,7 +38,9 @@ from fisheye_svp_ros.study.settings import Settings
 RELIABLE = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 INPUT = QoSProfile(depth=1000)
+SENSOR_INPUT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED_INPUT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+HEARD_LATER = QoSProfile(depth=100)
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
@@ -205,8 +207,12 @@ class BaseNode(Node):  # type: ignore[misc]
         read: Callable[[Any, str], Any],
         use: Callable[[int, Unread], None],
         qos: Any = INPUT,
+        volatile_qos: Any = HEARD_LATER,
     ) -> None:
-        """Subscribe, as `listen` does, but leave it to `use` whether a message is decoded."""
+        """Subscribe, as `listen` does, but leave it to `use` whether a message is decoded.
+
+        volatile_qos: of the second subscription of what is latched.
+        """
         count = self._inputs[topic] = _Input()
 
         def receive(data: bytes) -> None:
@@ -229,7 +235,11 @@ class BaseNode(Node):  # type: ignore[misc]
         # Only what is latched comes late; only a volatile subscription hears what is not.
         latched, volatile = twins(receive)
         create(latched, qos=qos, raw=True)
-        create(volatile, qos=QoSProfile(depth=qos.depth), entity='volatile', raw=True)
+        create(volatile, qos=volatile_qos, entity='volatile', raw=True)
+
+    def listens_to(self, topic: str) -> bool:
+        """Say whether there is a subscription of a topic."""
+        return topic in self._inputs
 
     def _with_qos(
         self, create: Callable[..., Any], *arguments: Any, qos: Any, entity: str | None = None,

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array
@@ -18,11 +17,10 @@ from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Unread, run
+from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, Unread, run
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
-_SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 _QUICK = {'saddle': 'quick'}  # a live camera has another image soon
 _LOOK = 0.002  # s, how often a waiting image is looked for
 
@@ -58,7 +56,7 @@ class Detector(BaseNode):
         self._waiting: tuple[int, Unread] | None = None
         self._counts = {'images overtaken': 0, 'images without board': 0}
         for kind, topic in ((Image, 'image'), (CompressedImage, 'image/compressed')):
-            self.collect(kind, topic, partial(_read, kind), self._take, _SENSOR)
+            self.collect(kind, topic, partial(_read, kind), self._take, SENSOR_INPUT)
         self.every(_LOOK, self._work)
         self.start()
 

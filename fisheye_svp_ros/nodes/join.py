@@ -59,6 +59,10 @@ class StampJoin:
         """Stop waiting for an optional topic until an item of it comes again."""
         self._expected[topic] = False
 
+    def expect(self, topic: str) -> None:
+        """Wait for an optional topic, for the patience of one set."""
+        self._expected[topic] = True
+
     def ready(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that are ready."""
         for one in list(self._pending.values()):

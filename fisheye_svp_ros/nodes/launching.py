@@ -16,6 +16,7 @@ PACKAGE = 'fisheye_svp_ros'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _FLAG = ('true', 'false')
+_WORDS = {'detector': (), 'synthetic_camera': ('lens',), 'measured_camera': ('lens',)}
 
 # By name: what it is for, the default, and the choices if there are any.
 COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
@@ -32,10 +33,11 @@ COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
 
 def arguments(names: Iterable[str] = COMMON) -> list[Any]:
     """Return declarations of common arguments."""
+    wanted = set(names)
     return [
         DeclareLaunchArgument(name, description=text, default_value=default,
                               **({'choices': list(choices)} if choices else {}))
-        for name, (text, default, choices) in COMMON.items() if name in names
+        for name, (text, default, choices) in COMMON.items() if name in wanted
     ]
 
 
@@ -63,8 +65,8 @@ def value(context: Any, name: str) -> str:
 def node(
     context: Any, name: str, given: Mapping[str, Any], remappings: Sequence[Any] = ()
 ) -> Any:
-    """Return a node with its files, then what was given; lens and svp where they are not empty."""
-    words = ('lens', 'svp') if 'camera' not in name else ('lens',)
+    """Return a node with its files, then what was given; lens and svp where it has them."""
+    words = _WORDS.get(name, ('lens', 'svp'))
     files = [value(context, f'{name}_params'), value(context, 'params')]
     return Node(
         package=PACKAGE, executable=name, namespace=value(context, 'namespace'), output='screen',

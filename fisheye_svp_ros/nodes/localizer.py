@@ -47,7 +47,7 @@ class Localizer(SolverNode):
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         seen: decoding.ImagePoints = items['image_points']
-        views, model = self.views(stamp, landmarks, seen), self.model(items)
+        views, model = self.views(stamp, landmarks, seen), self.model(stamp, items)
         true: Pose | None = items.get('true_pose')
         found = self._localized(model, views, true).checked()
         solution = found.solution

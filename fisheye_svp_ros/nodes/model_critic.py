@@ -24,12 +24,12 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import STEREO, Observations
-from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.study.settings import SolverSettings
 
 T = TypeVar('T')
@@ -100,6 +100,9 @@ class ModelCritic(SolverNode):
         """Refuse settings that cannot be used."""
         if settings.min_frames > settings.max_frames:
             raise ParameterError('min_frames is above max_frames; no diagnosis would ever start')
+        if settings.stereo and settings.lens == CAMERA_INFO:
+            raise ParameterError('lens is camera_info, of each camera its own; a rig is judged '
+                                 'with one lens for both, named by its file')
         return super().prepare(settings)
 
     def configure(self, settings: Any) -> None:
@@ -110,11 +113,11 @@ class ModelCritic(SolverNode):
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
         seen = collected_set(stamp, landmarks, items, self.cameras)
-        lens, scenario = true_lens(*self.lens(items)), scenario_of(items)
+        lens, scenario = self.lens(stamp, items), scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._judged = scenario, {}, False
             self._running = self._verdict = None
-        self._simulation = lens.svp() if self.settings.solves_svp else lens
+        self._simulation = lens
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
         for old in list(self._frames)[: -self.settings.max_frames]:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import CameraInfo, PointCloud2
 from std_msgs.msg import Float64
 
 from fisheye_svp_ros.arrays import Array
@@ -22,6 +22,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io.decoding import (
     ImagePoints,
     LandmarkSet,
+    read_camera_info,
     read_image_points,
     read_key_values,
     read_landmarks,
@@ -30,13 +31,16 @@ from fisheye_svp_ros.io.decoding import (
 from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, BaseNode, Unread
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT, BaseNode, Unread
+from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.join import LIMIT, Pending, StampJoin
 from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import STEREO, Views
-from fisheye_svp_ros.simulate.scenario import Scenario, model_of
+from fisheye_svp_ros.simulate.scenario import Scenario, true_lens
 from fisheye_svp_ros.study.settings import SolverSettings
+from fisheye_svp_ros.study.solutions import Pair
 
 Items = Mapping[str, Any]
 
@@ -115,7 +119,9 @@ class SolverNode(BaseNode):
         self._arrivals = _Arrivals()
         self._standing: LandmarkSet | None = None
         self._in_series = False
-        self._model: ForwardModel | None = None  # that of the parameter lens
+        self._lens: Lens | None = None  # that of the parameter lens
+        self._infos = CameraInfos(self.get_logger().info)
+        self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
         self._wake = self.create_guard_condition(self.guarded(self._work))
         self.collect(
             PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, LATCHED_INPUT
@@ -141,16 +147,20 @@ class SolverNode(BaseNode):
 
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
-        if settings.lens:
-            model_of(settings.lens, 1.0, settings.solves_svp)
+        if settings.lens not in ('', CAMERA_INFO):
+            _lens_of(settings.lens, 1.0, settings)
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
         """Load the lens and say which; do not wait for a scenario that nobody needs."""
-        self._model = model_of(settings.lens, 1.0, settings.solves_svp) if settings.lens else None
+        told = settings.lens in ('', CAMERA_INFO)
+        self._lens = None if told else _lens_of(settings.lens, 1.0, settings)
+        if settings.lens == CAMERA_INFO:
+            self._listen_to_camera_info()
         if settings.lens and not self.BY_SCENARIO:
             self._join.expect_no_more('scenario')
-        lens = f'lens {settings.lens}' if settings.lens else 'lens that scenario names'
+        lens = (f'lens {settings.lens}' if not told else
+                f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
         how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
         self.get_logger().info(f'solving with the {lens} {how} (svp: {settings.svp})')
 
@@ -158,21 +168,33 @@ class SolverNode(BaseNode):
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
         """Solve one set and publish what comes out; items by topic."""
 
-    def model(self, items: Items) -> ForwardModel:
-        """Return the lens to solve with; raise ParameterError where nobody names one."""
-        if self._model is not None:
-            return self._model
-        return model_of(*self.lens(items), self.settings.solves_svp)
+    def model(self, stamp: int, items: Items, camera: str = '') -> ForwardModel:
+        """Return what to solve with, as `lens` does."""
+        lens, known = self.lens(stamp, items, camera), self._models.get(camera)
+        if known is None or known[0] is not lens:
+            known = self._models[camera] = lens, ForwardModel(lens)
+        return known[1]
 
-    def lens(self, items: Items) -> tuple[str, float]:
-        """Return the lens to solve with, file or name, and the scale of its shift."""
-        if self.settings.lens:
-            return self.settings.lens, 1.0
+    def models(self, stamp: int, items: Items) -> Pair:
+        """Return what to solve with for each camera of a rig, as `lens` does."""
+        left, right = (self.model(stamp, items, camera) for camera in self.cameras)
+        return left, right
+
+    def lens(self, stamp: int, items: Items, camera: str = '') -> Lens:
+        """Return the lens to solve the set of a camera with, its shift left out where it is to be.
+
+        camera: its namespace, with its slash.  Raises FisheyeSvpError where nobody names a lens.
+        """
+        if self._lens is not None:
+            return self._lens
+        if self.settings.lens == CAMERA_INFO:
+            return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp)
         scenario = items.get('scenario', {})
         if 'lens' not in scenario:
             raise ParameterError('no scenario names a lens; set the parameter lens')
         name = allowed(scenario['lens'], self.settings.folder, 'scenario: lens')
-        return name, shift_scale(scenario.get('shift_scale', '1.0'))
+        scale = shift_scale(scenario.get('shift_scale', '1.0'))
+        return _lens_of(name, scale, self.settings)
 
     def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
         """Return image points as one view; raise ObservationError for an unknown landmark."""
@@ -224,6 +246,18 @@ class SolverNode(BaseNode):
         return told, (f'cannot keep up: {came:.0f} sets come in a second and {done:.0f} are '
                       f'solved, {latency:.2f} s late; {waiting} wait, {counts.dropped} are '
                       'dropped')
+
+    def _listen_to_camera_info(self) -> None:
+        def hear(topic: str, stamp: int, unread: Unread) -> None:
+            self._infos.hear(topic, stamp, unread)
+            self._join.expect_no_more(topic)
+            self._wake.trigger()
+
+        for topic in (f'{camera}{CAMERA_INFO}' for camera in self.cameras):
+            if not self.listens_to(topic):
+                self._join.expect(topic)
+                self.collect(CameraInfo, topic, read_camera_info, functools.partial(hear, topic),
+                             LATCHED_INPUT, SENSOR_INPUT)
 
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         self.collect(kind, topic, read, functools.partial(self._add, topic))
@@ -322,6 +356,11 @@ class SolverNode(BaseNode):
         for topic in present:
             self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
         self._counts.incomplete += bool(present)
+
+
+def _lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
+    lens = true_lens(name, scale)
+    return lens.svp() if settings.solves_svp else lens
 
 
 def shift_scale(text: str) -> float:

@@ -37,12 +37,12 @@ class StereoCalibrator(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
-        model, scenario = self.model(items), scenario_of(items)
+        scenario = scenario_of(items)
         known = self._window if scenario == self._scenario else []
         one = collected_set(stamp, landmarks, items, self.CAMERAS)
         window = [*known, one][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
-        found = calibrated(model, left, right, true=true_rig(items)).checked()
+        found = calibrated(self.models(stamp, items), left, right, true=true_rig(items)).checked()
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario = window, scenario
         self._publish(stamp, items, found)

@@ -8,7 +8,6 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
@@ -26,7 +25,7 @@ from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
 from fisheye_svp_ros.study.settings import StereoDepthSettings
-from fisheye_svp_ros.study.solutions import measured
+from fisheye_svp_ros.study.solutions import Pair, measured
 
 
 class StereoDepth(SolverNode):
@@ -51,14 +50,14 @@ class StereoDepth(SolverNode):
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Measure one set; raise GeometryError where no landmark is in both images."""
-        model, rig = self.model(items), self._rig(items)
+        models, rig = self.models(stamp, items), self._rig(items)
         left, right = (items[f'{camera}image_points'] for camera in self.CAMERAS)
         ids, in_left, in_right = np.intersect1d(
             left.landmark, right.landmark, assume_unique=True, return_indices=True
         )
         uv = left.uv[in_left], right.uv[in_right]
         found = measured(
-            model, rig.take(None), uv[0][None], uv[1][None],
+            models, rig.take(None), uv[0][None], uv[1][None],
             _true_points(known_points(landmarks, right)[in_right], items), self.settings.optimal,
         ).checked()
         points = found.solution.points[0]
@@ -69,7 +68,7 @@ class StereoDepth(SolverNode):
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame
-            shapes = _shapes(model, rig, pose or identity(), *uv)
+            shapes = _shapes(models, rig, pose or identity(), *uv)
             self._markers.publish(messages.markers_message(shapes, stamp, frame))
 
     def _rig(self, items: Items) -> Pose:
@@ -88,11 +87,11 @@ def _true_points(points: Array, items: Items) -> Array | None:
 
 
 def _shapes(
-    model: ForwardModel, rig: Pose, left: Pose, uv_left: Array, uv_right: Array
+    models: Pair, rig: Pose, left: Pose, uv_left: Array, uv_right: Array
 ) -> list[messages.Segments]:
-    curves = epipolar_curves(model, model, rig, uv_right)
+    curves = epipolar_curves(*models, rig, uv_right)
     return [camera_shape(left, 'left', alpha=0.6),
-            *epipolar_shapes(model.lens, left, curves, uv_left)]
+            *epipolar_shapes(models[0].lens, left, curves, uv_left)]
 
 
 def main(args: list[str] | None = None) -> int:

@@ -151,10 +151,9 @@ def calibrate_rigs(
             blank = views_of(points, np.zeros((len(right.position), len(points), 2)))
             seen.append(views_of(points, model.predict(pose, blank).uv))
     left_views, right_views = map(Views.concatenate, views)
-    found = calibrated(
-        ForwardModel(lens.svp() if solver is None else solver), left_views, right_views,
-        len(systems), Pose.stack([true for _, true in systems]),
-    )
+    known = ForwardModel(lens.svp() if solver is None else solver)
+    found = calibrated((known, known), left_views, right_views, len(systems),
+                       Pose.stack([true for _, true in systems]))
     table = _rows(found.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
     return table.reshape(len(RADII), len(STYLE_NAMES), -1), found.solution
@@ -172,7 +171,8 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     uv_right = model.predict(right, blank).uv
     uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv
     known = ForwardModel(lens.svp() if solver is None else solver)
-    solved = measured(known, left_in_right.take(None), uv_left, uv_right, right.into_body(points))
+    solved = measured((known, known), left_in_right.take(None), uv_left, uv_right,
+                      right.into_body(points))
     found = solved.solution
     return Measured(
         uv_left[0], uv_right[0], found.foot[0], found.distance[0], found.vertical[0], points,

@@ -44,8 +44,8 @@ class SolverSettings(Settings):
     """Parameters of every node that solves."""
 
     lens: str = parameter(
-        '', 'Lens to solve with: a file, or a name in config/lenses; empty: the one that '
-        '`scenario` names', file=True
+        '', 'Lens to solve with: a file, or a name in config/lenses; `camera_info`: what that '
+        'topic says; empty: the one that `scenario` names', file=True
     )
     svp: str = parameter(
         'auto', 'Solve with the single-viewpoint approximation of the lens; auto: of one that '

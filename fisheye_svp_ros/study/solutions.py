@@ -30,6 +30,7 @@ from fisheye_svp_ros.study.metrics import (
 )
 
 T = TypeVar('T')
+Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
 
 _NO_POSE = 'image_points: they do not fix a pose (all near one line?)'
 _NO_RIG = 'image_points: they do not fix a rig'
@@ -90,13 +91,13 @@ def localized(
 
 
 def calibrated(
-    model: ForwardModel, left: Views, right: Views, systems: int = 1, true: Pose | None = None
+    models: Pair, left: Views, right: Views, systems: int = 1, true: Pose | None = None
 ) -> Solved[StereoCalibration]:
-    """Calibrate S rigs of two like cameras from S * V views; true: rigs (S,).
+    """Calibrate S rigs from S * V views; models: left, right; true: rigs (S,).
 
     Raises GeometryError as `calibrate_stereo` does.
     """
-    found = calibrate_stereo(model, model, left, right, systems)
+    found = calibrate_stereo(*models, left, right, systems)
     metrics = stereo_calibration_metrics(
         found.rig, found.left_residual, found.right_residual, true
     )
@@ -111,16 +112,16 @@ def calibrated(
 
 
 def measured(
-    model: ForwardModel, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
+    models: Pair, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
     optimal: bool = False,
 ) -> Solved[Measurement]:
-    """Measure landmarks with rigs (S,) of two like cameras that are known.
+    """Measure landmarks with rigs (S,) that are known; models: left, right.
 
     uv_left, uv_right (S, N, 2), px, of the same landmarks, NaN = unseen; true (S, N, 3), m: where
     these are in the right camera's frame; optimal: by least reprojection error.
     """
     both = np.isfinite(np.concatenate([uv_left, uv_right], axis=-1)).all(axis=-1)
-    pairs = model, model, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
+    pairs = *models, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
     offset = epipolar_offset(*pairs)
     points = (triangulate_optimally if optimal else triangulate)(*pairs).points
 

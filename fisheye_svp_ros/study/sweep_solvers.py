@@ -115,7 +115,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
         of = index // per_scenario
         rows = np.array([windows[scenario] for scenario in of])
         left, right = (sets.views(i, rows.ravel(), settings.sigma_px) for i in (0, 1))
-        return calibrated(model, left, right, len(index), rig.take(of))
+        return calibrated((model, model), left, right, len(index), rig.take(of))
 
     for number in range(per_scenario):
         index = np.arange(scenarios) * per_scenario + number
@@ -142,7 +142,7 @@ def stereo_depth(batch: Batch, settings: StereoDepthSettings) -> Outcome:
         true = sets.poses[1].take(index).into_body(sets.points[index])
         left, right = (uv[index] for uv in sets.uv)
         rigs = rig.take(index // per_scenario)
-        return measured(model, rigs, left, right, true, settings.optimal)
+        return measured((model, model), rigs, left, right, true, settings.optimal)
 
     for index in _chunks(np.arange(len(sets.landmark))):
         outcome.attempt(index, solve)

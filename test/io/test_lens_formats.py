@@ -173,8 +173,9 @@ def test_boofcv() -> None:
     ('{"camera_type": 1}', 'not a whole Basalt'),
     ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}", 'can be read'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
-    ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: plumb_bob\n'
-     'image_width: 4\nimage_height: 4\n', "distortion_model is 'plumb_bob'"),
+    ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
+     'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',
+     "distortion_model is 'scara'"),
 ])
 def test_refused_in_one_line(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'lens.yaml'

@@ -135,7 +135,7 @@ def test_a_node_says_which_lens_it_solves_with(
     node = start('localizer', *(word for one in arguments for word in ('-p', one)))
     assert node.settings.solves_svp is solves_svp
     if node.settings.lens:
-        shift = node.model({}).lens.viewpoint_shift
+        shift = node.model(0, {}).lens.viewpoint_shift
         assert (shift is None) is solves_svp
     assert said in ' '.join(capfd.readouterr().err.split())
 

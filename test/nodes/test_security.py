@@ -22,6 +22,7 @@ OBSERVATIONS = 'frame,landmark,u,v,x,y,z,camera\n' + ''.join(
     f'0,{i},{100 + 7 * i},{200 - 3 * i},{0.1 * i},{0.01 * i * i},1,{camera}\n'
     for camera in ('left', 'right') for i in range(6)
 )
+SOLVERS = ('localizer', 'stereo_calibrator', 'stereo_depth', 'model_critic')
 
 
 @pytest.fixture
@@ -29,8 +30,9 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     """Return a graph in which every node has what it needs, and answers to wait for."""
     path = tmp_path / 'observations.csv'
     path.write_text(OBSERVATIONS)
+    solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
     one = Graph('-p', f'observations:={path}', '-p', 'style:=parallel',
-                '-p', 'lock_step:=localizer/result')
+                '-p', 'lock_step:=localizer/result', *solvers)
     yield one
     one.close()
 

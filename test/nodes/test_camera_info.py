@@ -1,0 +1,183 @@
+"""CameraInfo as the lens of the solvers: of a simulated camera, of a driver, of no use."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.graph import LATCHED, Graph
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
+from sensor_msgs.msg import CameraInfo, PointCloud2, RegionOfInterest  # isort: skip
+
+from fisheye_svp_ros.effects import forward
+from fisheye_svp_ros.errors import FisheyeSvpError, LensError, ObservationError
+from fisheye_svp_ros.io.decoding import read_camera_info, read_key_values, stamp_of
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.lens_formats.ros import lens_of
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.model_critic import ModelCritic
+from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
+from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.rigs import paper_pose
+
+DRIVER = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+K = (570.0, 571.0, 320.0, 240.0)
+
+
+@pytest.fixture
+def graphs(ros_domain: int) -> Iterator[list[Graph]]:
+    started: list[Graph] = []
+    yield started
+    for one in started:
+        one.close()
+
+
+def start(graphs: list[Graph], *parameters: str) -> Graph:
+    graphs.append(Graph(*(word for p in ('lens:=camera_info', *parameters) for word in ('-p', p))))
+    return graphs[-1]
+
+
+def numbers(message: Any) -> dict[str, float]:
+    return {name: float(value) for name, value in read_key_values(message).items()}
+
+
+def test_a_lens_without_a_shift_is_wholly_told_by_camera_info(graphs: list[Graph]) -> None:
+    g = start(graphs, 'synthetic_camera:lens:=fish214', 'shift_scale:=0.0', 'rate:=50.0')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    g.start(SyntheticCamera)
+    g.until(lambda: results and numbers(results[-1]))
+    assert numbers(results[-1])['position_error_m'] < 1e-6
+    assert numbers(results[-1])['rms_px'] < 1e-4
+
+
+def test_each_camera_of_a_rig_has_its_own(graphs: list[Graph]) -> None:
+    g = start(graphs, 'synthetic_camera:lens:=fish214', 'shift_scale:=0.0', 'style:=parallel',
+              'poses_file:=calibration', 'repeat:=false', 'wait_for_subscribers:=2',
+              'stereo_calibrator:wait_for_subscribers:=0', 'stereo_depth:wait_for_subscribers:=0',
+              'lock_step:=stereo_calibrator/result stereo_depth/result')
+    calibrated = g.hear(DiagnosticArray, 'stereo_calibrator/result')
+    measured = g.hear(DiagnosticArray, 'stereo_depth/result')
+    nodes = [g.start(StereoCalibrator), g.start(StereoDepth)]
+    g.start(SyntheticCamera)
+    g.until(lambda: len(calibrated) > 2 and len(measured) > 2)
+    assert numbers(calibrated[-1])['position_error_m'] < 1e-5
+    assert numbers(measured[-1])['error3_m'] < 1e-5
+    for node in nodes:
+        left, right = (node._models[f'{name}/'][0] for name in ('left', 'right'))
+        assert (left.name, right.name) == ('left_camera_info', 'right_camera_info')
+
+
+def test_an_ordinary_driver_is_heard_and_the_set_has_the_camera_info_of_its_stamp(
+    graphs: list[Graph]
+) -> None:
+    g = start(graphs, 'patience:=0.3')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    lens = load_lens(lens_path('fish214')).svp()
+    landmarks = environment('whole', 2.0)
+    told = g.tell(PointCloud2, 'landmarks', LATCHED)
+    driver = g.tell(CameraInfo, 'camera_info', DRIVER)
+    points = g.tell(PointCloud2, 'image_points')
+    told.publish(messages.landmarks_message(landmarks, 0, 'world'))
+    longer = replace(lens, fx=1.2 * lens.fx, fy=1.2 * lens.fy)
+    stamps = {5: lens, 6: longer}
+
+    def tell(stamp: int, one: Any) -> None:
+        image = project(one, paper_pose().into_body(landmarks.points))
+        points.publish(messages.image_points_message(
+            landmarks.ids[image.valid], image.uv[image.valid], stamp, 'camera'))
+
+    g.idle(0.2)
+    for stamp, one in stamps.items():
+        driver.publish(messages.camera_info_message(one, stamp, 'camera'))
+    g.idle(0.2)
+    for stamp, one in stamps.items():
+        tell(stamp, one)
+    tell(7, longer)  # of another stamp than any camera_info: the latest holds
+    g.until(lambda: len(results) == 3)
+    assert {stamp_of(m) for m in results} == {5, 6, 7}
+    assert max(numbers(m)['rms_px'] for m in results) < 1e-3
+
+
+def test_a_set_without_one_says_so(graphs: list[Graph]) -> None:
+    g = start(graphs, 'patience:=0.1')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    landmarks = environment('whole', 2.0)
+    told.publish(messages.landmarks_message(landmarks, 0, 'world'))
+    points.publish(messages.image_points_message(
+        landmarks.ids, landmarks.points[:, :2] + 9, 3, 'camera'))
+    g.until(lambda: results)
+    assert 'camera_info: none has come' in results[0].status[0].message
+
+
+def test_the_critic_of_a_rig_takes_one_lens(graphs: list[Graph]) -> None:
+    start(graphs, 'stereo:=true')
+    with pytest.raises(FisheyeSvpError, match='one lens for both'):
+        graphs[-1].start(ModelCritic)
+
+
+def info(**changes: Any) -> Any:
+    message = CameraInfo(width=640, height=480, distortion_model='equidistant')
+    message.k, message.d = [K[0], 0.0, K[2], 0.0, K[1], K[3], 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 0.0]
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def test_what_a_camera_info_says() -> None:
+    model = read_camera_info(info())
+    assert model == ('equidistant', (640, 480), K, (0.1, 0.0, 0.0, 0.0))
+    assert read_camera_info(info(roi=RegionOfInterest(width=640, height=480))) == model
+
+
+@pytest.mark.parametrize(('changes', 'reason'), [
+    ({'k': [0.0] * 9}, 'not calibrated'), ({'d': [np.nan] * 4}, 'not a finite number'),
+    ({'binning_x': 2}, 'binned'), ({'roi': RegionOfInterest(x_offset=4)}, 'a part of the image'),
+])
+def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ObservationError, match=reason):
+        read_camera_info(info(**changes))
+
+
+@pytest.mark.parametrize(('model', 'd', 'reason'), [
+    ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
+    ('equidistant', (0.1,), 'has 1 coefficients'), ('plumb_bob', (0.1,), 'has 1 coefficients'),
+    ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate it anew, as equidistant'),
+])
+def test_a_model_that_no_lens_comes_near_to(
+    model: str, d: tuple[float, ...], reason: str
+) -> None:
+    with pytest.raises(LensError, match=reason):
+        lens_of(model, (640, 480), (380.0, 380.0, 320.0, 240.0), d, 'camera', 'camera_info')
+
+
+@pytest.mark.parametrize(('model', 'd'), [
+    ('equidistant', (0.02, -0.01, 0.003, -0.0005)), ('plumb_bob', ()),
+    ('plumb_bob', (0.1, -0.25, 0.001, -0.002, 0.05)), ('plumb_bob', (-0.2, 0.05, 0.001, 0.0005)),
+    ('rational_polynomial', (0.3, 0.02, 0.0, 0.0, 0.001, 0.5, 0.03, 0.0)),
+])
+def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> None:
+    lens, worst = lens_of(model, (640, 480), K, d, 'camera', 'camera_info')
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 12), np.linspace(-0.4, 0.4, 12))
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
+    matrix = np.array([[K[0], 0, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
+    through = cv2.fisheye.projectPoints if model == 'equidistant' else cv2.projectPoints
+    uv, _ = through(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(d or [0.0] * 4))
+    seen = forward.project(lens, rays)
+    assert seen.valid.sum() > 100
+    off = np.abs(seen.uv - uv[:, 0])[seen.valid].max()
+    assert off < max(1.05 * worst, 1e-5) and worst <= 0.2
