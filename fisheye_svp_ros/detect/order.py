@@ -50,6 +50,7 @@ def _agreed(field: Array, turns: tuple[Turn, ...]) -> tuple[Index, Array]:
     """Return the best turns (V,) and how much better each is than the next, (V,)."""
     turned = np.stack([field[:, turn.source] @ turn.matrix.T for turn in turns])
     turned = turned.reshape(len(turns), len(field), -1)
+    turned -= turned.mean(axis=0)  # what looks the same in all turns tells nothing
     turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
     # Views alike in all turns say nothing: start from each view in turn, keep the best agreement.
     found = [_settled(turned, turned[0, seed]) for seed in range(len(field))]
