@@ -18,6 +18,8 @@ _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _LEAST = 4
 _ODD = 6.0  # times the median sigma
+_ROOM = 30.0  # px to the next edge, three times the largest window
+_SOFT = 2.0  # px of blur; the window must reach well beyond it
 
 
 class Points(NamedTuple):
@@ -60,10 +62,27 @@ def find_points(
         return _checked(index, whole, pattern, reach)
     square = bool(np.any(pattern.inward))
     towards = pattern.inward[index, :, None] if square else 1.0
-    corners = fit_corners(pixels, uv, axes * towards, reach, square)
+    corners = _fitted(pixels, uv, axes * towards, reach, square)
     if detector in AS_FOUND:
         corners = corners._replace(uv=uv)
     return _checked(index, corners, pattern, reach)
+
+
+def _fitted(pixels: Pixels, start: Array, axes: Array, reach: Array, square: bool) -> Corners:
+    """Fit corners; those too soft for their window again at half the size, if there is room."""
+    corners = fit_corners(pixels, start, axes, reach, square)
+    soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
+    if not len(soft):
+        return corners
+    height, width = (side // 2 * 2 for side in pixels.shape)
+    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
+                      interpolation=cv2.INTER_AREA)
+    again = _fitted(half, (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2, reach[soft] / 2, square)
+    found = soft[again.ok]
+    size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
+    for name, whole, part in zip(Corners._fields, corners, again, strict=True):
+        whole[found] = size.get(name, part)[again.ok]
+    return corners
 
 
 def local_axes(points: Array, uv: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +12,10 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.patterns import Pattern
 
 _BLOCKS = (31, 61, 121, 241)  # px, of the local threshold
+_BELOW = (10, 30, 60)  # grey levels below the mean there
 _ROUNDNESS = 0.04  # of its perimeter, what a side through a fisheye may bend
 _NEAR = 0.3  # of the step to the next square, how far off its centre may be
+_GROWTH = 4.0  # of the area, from square to square
 _SMALLEST = 40  # px^2
 
 
@@ -22,20 +26,30 @@ def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
     """
     step = 1 + float(np.linalg.norm(pattern.points[4] - pattern.points[1])
                      / pattern.size if pattern.columns > 1 else 1)
-    for block in _BLOCKS:
-        quads = _quads(image, block)
-        for first in range(len(quads)):
-            grid = _grown(quads, first, step)
-            found = _whole(grid, pattern)
-            if found is not None:
-                return np.arange(4 * pattern.columns * pattern.rows), found
+    tries = (_quads(image, block, below) for block, below in product(_BLOCKS, _BELOW))
+    together = np.empty((0, 4, 2))
+    for quads in tries:
+        # The edge of a shadow spoils some squares at each threshold, and not the same ones.
+        together = _joined(together, quads)
+        for squares in (quads, together):
+            for first in range(len(squares)):
+                found = _whole(_grown(squares, first, step), pattern)
+                if found is not None:
+                    return np.arange(4 * pattern.columns * pattern.rows), found
     return None
 
 
-def _quads(image: NDArray[np.uint8], block: int) -> Array:
-    """Return dark quadrilaterals (Q, 4, 2), px, clockwise as seen."""
+def _joined(quads: Array, more: Array) -> Array:
+    """Return quadrilaterals and those of `more` that lie elsewhere."""
+    distance = np.linalg.norm(more.mean(axis=1)[:, None] - quads.mean(axis=1), axis=-1)
+    size = np.linalg.norm(more[:, 2] - more[:, 0], axis=-1)
+    return np.concatenate([quads, more[distance.min(axis=1, initial=np.inf) > _NEAR * size]])
+
+
+def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
+    """Return quadrilaterals (Q, 4, 2), px, darker than their surroundings, clockwise as seen."""
     dark = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV,
-                                 block, 10)
+                                 block, below)
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     quads = []
     for contour in contours:
@@ -66,7 +80,9 @@ def _grown(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array
             distance = np.linalg.norm(centres - quad.mean(axis=0) - move, axis=1)
             nearest = int(np.argmin(distance))
             far = distance[nearest] > _NEAR * np.linalg.norm(move)
-            if place in grid or nearest in used or far:
+            growth = _area(quads[nearest]) / _area(quad)
+            unlike = not 1 / _GROWTH < growth < _GROWTH
+            if place in grid or nearest in used or far or unlike:
                 continue
             turned = [np.roll(quads[nearest], k, axis=0) for k in range(4)]
             grid[place] = max(turned, key=lambda q: float((q[1] - q[0]) @ sides[0]
@@ -74,6 +90,11 @@ def _grown(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array
             used.add(nearest)
             waiting.append(place)
     return grid
+
+
+def _area(quad: Array) -> float:
+    a, b = quad[2] - quad[0], quad[3] - quad[1]
+    return abs(float(a[0] * b[1] - a[1] * b[0])) / 2
 
 
 def _whole(grid: dict[tuple[int, int], Array], pattern: Pattern) -> Array | None:

@@ -19,7 +19,7 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
 
-PHOTOS = SHARED / 'photos' / 'chessboard'
+PHOTOS = SHARED / 'photos'
 
 
 @pytest.fixture(scope='module')
@@ -115,13 +115,18 @@ def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.skipif(not PHOTOS.exists(), reason='the photographs are not here')
-def test_real_photographs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(('folder', 'board', 'frames', 'rms'), [
+    ('chessboard', 'chessboard:4x6:30mm', 26, 0.25),
+    ('square_grid', 'squares:3x4:30mm:30mm', 22, 0.65),
+])
+def test_real_photographs(
+    tmp_path: Path, folder: str, board: str, frames: int, rms: float
+) -> None:
     out = tmp_path / 'lens.yaml'
-    assert cli.main(['calibrate', str(PHOTOS), '--board', 'chessboard:4x6:30mm',
-                     '-o', str(out)]) == 0
+    assert cli.main(['calibrate', str(PHOTOS / folder), '--board', board, '-o', str(out)]) == 0
     figures = load_lens(out).calibration
-    assert figures['frames'] >= 24
-    assert figures['rms_px'] < 0.25
+    assert figures['frames'] == frames
+    assert figures['rms_px'] < rms
 
 
 def test_render_and_example_are_deterministic(tmp_path: Path) -> None:

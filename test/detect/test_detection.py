@@ -88,6 +88,16 @@ class TestCorners:
         error = points.uv - true_corners(pose)[points.ids]
         assert np.abs(error.mean(axis=0)).max() < 0.02
 
+    def test_a_large_soft_image(self) -> None:
+        pose = poses(3, 1).take(1)
+        large = cv2.resize(photograph(pose), None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+        points = find_points(large, PATTERN, 'saddle')
+        assert not isinstance(points, str), points
+        assert len(points.ids) == 30
+        error = (points.uv + 0.5) / 6 - 0.5 - true_corners(pose)
+        assert np.abs(error).max() < 0.04
+        assert points.blur > 3
+
     @pytest.mark.parametrize('detector', ['saddle', 'sb', 'classic'])
     def test_every_detector_keeps_the_order(self, detector: str) -> None:
         # SB wants the whole board in view; in the fourth of these poses a corner is beyond it.
@@ -182,11 +192,15 @@ class TestTags:
         expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
         assert np.abs(points.uv - expected).max() < 1.0
 
-    def test_squares(self) -> None:
+    @pytest.mark.parametrize('shadow', [False, True])
+    def test_squares(self, shadow: bool) -> None:
         pattern = parse_pattern('squares:3x4:40mm:30mm')
         flat = np.full((900, 800), 255, np.uint8)
         for x, y in pattern.points[::4, :2] * 2500 + 150:
             flat[round(y):round(y) + 100, round(x):round(x) + 100] = 0
+        if shadow:
+            flat[300:] = (0.5 * flat[300:]).astype(np.uint8)
+            flat[:, 340:] = (0.6 * flat[:, 340:] + 30).astype(np.uint8)
         image, turn = self.warped(flat)
         points = find_points(image, pattern, 'squares')
         assert not isinstance(points, str), points
