@@ -9,7 +9,7 @@ from pathlib import Path
 # What the nodes tell, and what they were told; markers and diagnostics are left out.
 TOPICS = (
     r'.*/(scenario|landmarks|camera_info|image_points|true_pose|pose|position_error'
-    r'|rotation_error|residuals|points|rig|metrics/[^/]+|result)'
+    r'|rotation_error|residuals|points|rig|metrics/[^/]+|result|tf|tf_static)'
 )
 
 

@@ -18,13 +18,13 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 
-WORLD = 'world'
 _TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 _SET_BACK = 10**9  # ns by which a clock is not early but set back
 _LONG = 15.0  # s without an answer after which a set is published again
@@ -33,9 +33,10 @@ _LONG = 15.0  # s without an answer after which a set is published again
 class CameraTopics:
     """The topics of one camera; name: its namespace, empty for the only camera."""
 
-    def __init__(self, node: BaseNode, name: str) -> None:
-        prefix = f'{name}/' if name else ''
-        self.frame = f'{name}_camera_optical_frame' if name else 'camera_optical_frame'
+    def __init__(self, node: CameraNode, name: str) -> None:
+        prefix, settings = f'{name}/' if name else '', node.settings
+        self._world, self._transforms = settings.world_frame, node.transforms
+        self.frame = f'{name}_{settings.camera_frame}' if name else settings.camera_frame
         self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED)
         self._pose = node.announce(PoseStamped, f'{prefix}true_pose')
         self._points = node.announce(PointCloud2, f'{prefix}image_points', wait=True)
@@ -47,7 +48,8 @@ class CameraTopics:
         if lens is not None:
             self._info.publish(messages.camera_info_message(lens, stamp, self.frame))
         if pose is not None:
-            self._pose.publish(messages.pose_message(pose, stamp, WORLD))
+            self._pose.publish(messages.pose_message(pose, stamp, self._world))
+            self._transforms.publish(pose, stamp, self._world, f'{self.frame}_true')
         self._points.publish(
             messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame)
         )
@@ -62,6 +64,7 @@ class CameraNode(BaseNode):
         super().__init__()
         self._landmarks = self.announce(PointCloud2, 'landmarks', LATCHED)
         self._scenario = self.announce(DiagnosticArray, 'scenario')
+        self.transforms = Transforms(self, self.settings.publish_tf)
         self._cameras: dict[str, CameraTopics] = {}
         self._timer: Any = None
         self._steps: Iterator[Any] = iter(())
@@ -113,7 +116,8 @@ class CameraNode(BaseNode):
 
     def publish_landmarks(self, landmarks: Landmarks, stamp: int) -> None:
         """Publish landmarks; stamp 0: they hold for every set."""
-        self._landmarks.publish(messages.landmarks_message(landmarks, stamp, WORLD))
+        self._landmarks.publish(messages.landmarks_message(
+            landmarks, stamp, self.settings.world_frame))
 
     def _hear_answers_on(self, topic: str) -> None:
         def use(stamp: int, _: Any) -> None:

@@ -16,7 +16,8 @@ PACKAGE = 'fisheye_svp_ros'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _FLAG = ('true', 'false')
-_WORDS = {'detector': (), 'synthetic_camera': ('lens',), 'measured_camera': ('lens',)}
+_WORDS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'), ('lens',))}
+_OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator')
 
 # By name: what it is for, the default, and the choices if there are any.
 COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
@@ -25,6 +26,7 @@ COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
             '', ('', 'auto', *_FLAG)),
     'namespace': ('namespace of the nodes', '', ()),
     'params': ('parameter file for all nodes, after their own; empty: none', '', ()),
+    'publish_tf': ('tell tf2 the cameras, as estimated and as true, and the rig', 'false', _FLAG),
     'use_sim_time': ('take the time from /clock', 'false', _FLAG),
     'log_level': ('what the nodes log from', 'info', _LEVELS),
     'respawn': ('start a node again when it ends', 'false', _FLAG),
@@ -73,6 +75,7 @@ def node(
         parameters=[
             *filter(None, files),
             {word: value(context, word) for word in words if value(context, word)},
+            {'publish_tf': value(context, 'publish_tf') == 'true'} if name in _OF_TF else {},
             {'use_sim_time': value(context, 'use_sim_time') == 'true', **given},
         ],
         ros_arguments=['--log-level', value(context, 'log_level')],

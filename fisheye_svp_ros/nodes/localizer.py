@@ -14,12 +14,13 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.markers import camera_shape
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
-from fisheye_svp_ros.study.settings import SolverSettings
+from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import Solved, localized
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
@@ -31,8 +32,9 @@ class Localizer(SolverNode):
     """Publishes a pose, its residuals and, where the true pose is known, its errors."""
 
     NAME = 'localizer'
-    SETTINGS = SolverSettings
+    SETTINGS = LocalizerSettings
     METRICS = LOCALIZATION_METRICS
+    settings: LocalizerSettings
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,6 +43,7 @@ class Localizer(SolverNode):
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
         self._residuals = self.announce(PointCloud2, '~/residuals')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
+        self._transforms = Transforms(self, self.settings.publish_tf)
         self._before: tuple[Pose | None, float] = None, 0.0
         self.start()
 
@@ -52,12 +55,14 @@ class Localizer(SolverNode):
         found = self._localized(model, views, true).checked()
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
+        camera = self.settings.camera_frame or seen.frame
         self._pose.publish(
             messages.pose_with_covariance_message(pose, solution.covariance[0], stamp, world)
         )
         self._residuals.publish(
-            messages.cloud_message(residuals(model, views, solution), stamp, seen.frame)
+            messages.cloud_message(residuals(model, views, solution), stamp, camera)
         )
+        self._transforms.publish(pose, stamp, world, camera)
         if true is not None:
             error = pose.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, world))

@@ -9,6 +9,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
+from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.metrics import STEREO_CALIBRATION_METRICS
@@ -31,6 +32,7 @@ class StereoCalibrator(SolverNode):
         self._rig = self.announce(TransformStamped, '~/rig', LATCHED)
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')
+        self._transforms = Transforms(self, self.settings.publish_tf, static=True)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._window: list[CollectedSet] = []
         self.start()
@@ -51,6 +53,7 @@ class StereoCalibrator(SolverNode):
         rig, true = found.solution.rig.take(0), true_rig(items)
         left, right = (items[f'{camera}image_points'].frame for camera in self.CAMERAS)
         self._rig.publish(messages.transform_message(rig, stamp, right, left))
+        self._transforms.publish(rig, stamp, right, left)
         if true is not None:
             error = rig.difference(true)
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))

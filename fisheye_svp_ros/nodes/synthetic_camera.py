@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, sweep_of
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
-from fisheye_svp_ros.nodes.camera import WORLD, CameraNode, rows_by_frame
+from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
@@ -90,7 +90,8 @@ class SyntheticCamera(CameraNode):
         for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):
             self.camera(name).publish(stamp, seen, poses.take(step.frame), step.svp_lens)
         if self._markers.get_subscription_count():
-            self._markers.publish(messages.markers_message(_shapes(step), stamp, WORLD))
+            world = self.settings.world_frame
+            self._markers.publish(messages.markers_message(_shapes(step), stamp, world))
 
 
 def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]:

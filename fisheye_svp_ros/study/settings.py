@@ -32,6 +32,15 @@ class CameraSettings(Settings):
         '', 'Result topics, separated by blanks: each set waits until all of them have answered '
         'the one before; then `rate` does not count. Empty: do not wait'
     )
+    world_frame: str = parameter('world', 'Frame id of the world', fixed=True)
+    camera_frame: str = parameter(
+        'camera_optical_frame', 'Frame id of the camera; those of a rig have left_ and right_ '
+        'before it', fixed=True
+    )
+    publish_tf: bool = parameter(
+        False, 'Tell tf2 the true pose: `world_frame` to the frame of the camera with _true '
+        'after it', fixed=True
+    )
 
 
 @dataclass(frozen=True)
@@ -71,8 +80,26 @@ class SolverSettings(Settings):
 
 
 @dataclass(frozen=True)
+class LocalizerSettings(SolverSettings):
+    """Parameters of the localizer."""
+
+    publish_tf: bool = parameter(
+        False, 'Tell tf2 the estimated pose: the frame of the landmarks to that of the camera; '
+        'only where no other node tells of the latter', fixed=True
+    )
+    camera_frame: str = parameter(
+        '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True
+    )
+
+
+@dataclass(frozen=True)
 class StereoCalibratorSettings(SolverSettings):
     """Parameters of the stereo calibrator."""
+
+    publish_tf: bool = parameter(
+        False, 'Tell tf2 the rig, as a static transform: the frame of the right camera to that of '
+        'the left one', fixed=True
+    )
 
     views: int = parameter(
         10, 'Calibrate from this many of the last sets of a scenario, or as many as there are',

@@ -20,6 +20,7 @@ from fisheye_svp_ros.study.metrics import (
     STEREO_DEPTH_METRICS,
 )
 from fisheye_svp_ros.study.settings import (
+    LocalizerSettings,
     SolverSettings,
     StereoCalibratorSettings,
     StereoDepthSettings,
@@ -87,7 +88,7 @@ def _chunks(index: Index) -> list[Index]:
     return [index[i:i + _TOGETHER] for i in range(0, len(index), _TOGETHER)]
 
 
-def localizer(batch: Batch, settings: SolverSettings) -> Outcome:
+def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
     """Localize the camera of every set, as the localizer does."""
     sets, model = _sets(batch), _model(batch, settings)
     outcome = Outcome(len(sets.landmark), LOCALIZATION_METRICS)
@@ -158,7 +159,7 @@ class Solver(NamedTuple):
 
 
 SOLVERS: Mapping[str, Solver] = {
-    'localizer': Solver(SolverSettings, LOCALIZATION_METRICS, localizer),
+    'localizer': Solver(LocalizerSettings, LOCALIZATION_METRICS, localizer),
     'stereo_calibrator': Solver(
         StereoCalibratorSettings, STEREO_CALIBRATION_METRICS, stereo_calibrator
     ),

@@ -32,7 +32,7 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     path.write_text(OBSERVATIONS)
     solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
     one = Graph('-p', f'observations:={path}', '-p', 'style:=parallel',
-                '-p', 'lock_step:=localizer/result', *solvers)
+                '-p', 'lock_step:=localizer/result', '-p', 'publish_tf:=true', *solvers)
     yield one
     one.close()
 
