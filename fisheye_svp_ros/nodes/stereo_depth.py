@@ -13,7 +13,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
-from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes
+from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
@@ -68,7 +68,7 @@ class StereoDepth(SolverNode):
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame
-            shapes = _shapes(models, rig, pose or identity(), *uv)
+            shapes = _shapes(models, rig, pose or identity(), *uv, points[seen])
             self._markers.publish(messages.markers_message(shapes, stamp, frame))
 
     def _rig(self, items: Items) -> Pose:
@@ -87,11 +87,14 @@ def _true_points(points: Array, items: Items) -> Array | None:
 
 
 def _shapes(
-    models: Pair, rig: Pose, left: Pose, uv_left: Array, uv_right: Array
+    models: Pair, rig: Pose, left: Pose, uv_left: Array, uv_right: Array, points: Array
 ) -> list[messages.Segments]:
+    # As markers, because RViz draws no cloud of doubles.
+    place = left.compose(rig.inverse()).transform(points)
+    found = landmarks_shape(place)._replace(name='measured points', colour=(0.8, 0.2, 0.2, 1.0))
     curves = epipolar_curves(*models, rig, uv_right)
     return [camera_shape(left, 'left', alpha=0.6),
-            *epipolar_shapes(models[0].lens, left, curves, uv_left)]
+            *epipolar_shapes(models[0].lens, left, curves, uv_left), found]
 
 
 def main(args: list[str] | None = None) -> int:

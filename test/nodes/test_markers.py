@@ -37,7 +37,9 @@ def test_epipolar_curves_run_through_the_image_points(
     g.close()
     shown = {marker.ns: np.array([[p.x, p.y, p.z] for p in marker.points])
              for marker in markers[0].markers}
-    assert list(shown) == ['camera left', 'epipolar curves', 'image points']
+    assert list(shown) == ['camera left', 'epipolar curves', 'image points', 'measured points']
+    distance = np.linalg.norm(shown['measured points'], axis=-1)
+    assert len(distance) == 33 and (frame != 'world' or distance == pytest.approx(2.0))
     assert {marker.header.frame_id for marker in markers[0].markers} == {frame}
     start, end = shown['epipolar curves'].reshape(-1, 2, 3).swapaxes(0, 1)
     points, along = shown['image points'], end - start
