@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
     from fisheye_svp_ros.commands.photographs import measured
+    from fisheye_svp_ros.scene.observations import rig_cameras
 
     observations, size = measured(args.observations, args)
     size = args.image_size or size or _size_beside(Path(args.observations))
@@ -70,8 +71,8 @@ def run(args: argparse.Namespace) -> None:
     for number, (camera, result) in enumerate(results.items()):
         sigmas = observations.sigma[observations.camera == number]
         _report(result, trusts[camera], args.model, sigmas)
-    if set(results) == {'left', 'right'}:
-        _rig(observations, results, args.output)
+    if pair := rig_cameras(observations.cameras):
+        _rig(observations, results, pair, args.output)
 
 
 def _calibrated(
@@ -146,7 +147,8 @@ def _write(result: Calibration, trust: Trust, path: Path) -> None:
 
 
 def _rig(
-    observations: Observations, results: dict[str, Calibration], folder: Path | None
+    observations: Observations, results: dict[str, Calibration], names: tuple[str, str],
+    folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
     import numpy as np
@@ -156,17 +158,17 @@ def _rig(
     from fisheye_svp_ros.scene.observations import stereo_views
     from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
-    left, right = (ForwardModel(results[name].adjusted.lens) for name in ('left', 'right'))
+    left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
     seen = [set(table.frame.tolist()) for table in (
         observations.take(observations.camera == observations.cameras.index(name))
-        for name in ('left', 'right'))]
+        for name in names)]
     both = observations.take(np.isin(observations.frame, sorted(seen[0] & seen[1])))
     fitted = calibrate_stereo(left, right, *stereo_views(both))
     place = 1000 * fitted.rig.position[0]
-    print(f'rig: left camera in the right one at {place[0]:.3f}, {place[1]:.3f}, {place[2]:.3f} '
-          f'mm, from {len(both.frames)} frames')
+    print(f'rig: camera {names[0]} in {names[1]} at {place[0]:.3f}, {place[1]:.3f}, '
+          f'{place[2]:.3f} mm, from {len(both.frames)} frames')
     if folder:
-        save_rig(fitted.rig.take(0), folder / 'rig.yaml')
+        save_rig(fitted.rig.take(0), folder / 'rig.yaml', names)
 
 
 def _print(result: Calibration, trust: Trust) -> None:

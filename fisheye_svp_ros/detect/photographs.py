@@ -14,12 +14,16 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
 
 IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp', '.jp2')
 VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
 RECORDINGS = ('.mcap', '.db3')
+# Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
+_PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
+_COMPRESSED = '/compressed'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
 _ORIENTATION = re.compile(
     rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL)
@@ -62,8 +66,9 @@ class Photograph:
 def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
     """Yield the photographs of files, folders, videos and rosbag2 recordings, in their order.
 
-    Subfolders left/ and right/, or topics in those namespaces, are the cameras of a rig; equal
-    file names, and equal stamps, are the same instant.  every: take one of so many.
+    Subfolders such as left/ and right/, file names that begin so, or topics in such namespaces are
+    the cameras of a rig; equal file names, and equal stamps, are the same instant.  every: take
+    one of so many.
     Raises ObservationError for a path without any.
     """
     for path in map(Path, paths):
@@ -169,11 +174,22 @@ def _file(path: Path, camera: str = '') -> Photograph:
     return Photograph(str(path), path.stem, camera, np.nan, path)
 
 
+def _images(path: Path) -> list[Path]:
+    return sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGES), key=_natural)
+
+
 def _folder(path: Path) -> Iterator[Photograph]:
-    cameras = [name for name in ('left', 'right') if (path / name).is_dir()]
-    for camera in cameras or ['']:
-        files = (p for p in (path / camera).iterdir() if p.suffix.lower() in IMAGES)
-        yield from (_file(p, camera) for p in sorted(files, key=_natural))
+    files = _images(path)
+    folders = [p for p in sorted(path.iterdir()) if not files and p.is_dir() and _images(p)]
+    for folder in folders:
+        camera = folder.name if len(folders) > 1 or folder.name in STEREO else ''
+        yield from (_file(p, camera) for p in _images(folder))
+    named = [_PREFIX.fullmatch(p.stem) for p in files]
+    if len({match and match[1] for match in named}) > 1 and all(named):
+        yield from (Photograph(str(p), match[2], match[1].lower(), np.nan, p)
+                    for p, match in zip(files, named, strict=True) if match)
+    else:
+        yield from map(_file, files)
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:
@@ -196,11 +212,27 @@ def _video(path: Path) -> Iterator[Photograph]:
 
 def _recording(path: Path) -> Iterator[Photograph]:
     kinds = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-    for record in Bag(path).records(lambda _, kind: kind in kinds):
+    topics: set[str] = set()
+
+    def wanted(topic: str, kind: str) -> bool:
+        if kind in kinds:
+            topics.add(topic)
+        return kind in kinds
+
+    for record in Bag(path).records(wanted):
+        if record.topic.removesuffix(_COMPRESSED) in topics - {record.topic}:
+            continue  # the same images once more
         stamp = record.message.header.stamp
         t = stamp.sec + 1e-9 * stamp.nanosec
         name = f'{path} {record.topic} {t:.9f}'
-        words = record.topic.split('/')
-        camera = next((word for word in words if word in ('left', 'right')), '')
+        camera = _camera(record.topic, topics)
         data = message_pixels(record.message, record.typename, name)
         yield Photograph(name, f'{stamp.sec:012d}.{stamp.nanosec:09d}', camera, t, data)
+
+
+def _camera(topic: str, topics: set[str]) -> str:
+    """Return the part of a topic that tells its camera from the recording's others."""
+    words = topic.removesuffix(_COMPRESSED).split('/')
+    others = [other.removesuffix(_COMPRESSED).split('/') for other in topics]
+    own = [word for word in words if not all(word in other for other in others)]
+    return '_'.join(own) or next((word for word in words if word in STEREO), '')

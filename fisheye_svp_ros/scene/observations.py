@@ -148,14 +148,20 @@ def group_views(observations: Observations, default_sigma: float = 1.0) -> Views
     return _views(observations, row, groups[:, 0], groups[:, 1], default_sigma)
 
 
+def rig_cameras(cameras: tuple[str, ...]) -> tuple[str, str] | None:
+    """Return the names of a rig's cameras: left and right, or the only two there are."""
+    names = STEREO if set(STEREO) <= set(cameras) else sorted(cameras)
+    return (names[0], names[1]) if len(names) == 2 else None
+
+
 def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tuple[Views, Views]:
-    """Return the views of the cameras left and right with the same frames and the same slots.
+    """Return the views of the two cameras of a rig with the same frames and the same slots.
 
     Frame s and slot n mean the same frame and landmark in both; what one camera lacks is padding.
     Raises ObservationError for a missing camera or a landmark that stands twice in a view.
     """
-    missing = [name for name in STEREO if name not in observations.cameras]
-    if missing or not len(observations):
+    pair_names = rig_cameras(observations.cameras)
+    if pair_names is None or not len(observations):
         held = ', '.join(observations.cameras) if len(observations) else 'no observation'
         raise ObservationError(
             f'{observations.source}: the cameras left and right are needed; it holds {held}'
@@ -163,7 +169,7 @@ def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tupl
     frames, frame = np.unique(observations.frame, return_inverse=True)
     landmarks, slot = np.unique(observations.landmark, return_inverse=True)
     pair = []
-    for camera in map(observations.cameras.index, STEREO):
+    for camera in map(observations.cameras.index, pair_names):
         mine = np.flatnonzero(observations.camera == camera)
         row = np.full((len(frames), len(landmarks)), -1, dtype=np.int64)
         row[frame[mine], slot[mine]] = mine

@@ -16,6 +16,7 @@ from helpers.photographs import (
     true_corners,
     write,
 )
+from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.detect.detection import Detection, detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
@@ -23,6 +24,7 @@ from fisheye_svp_ros.detect.photographs import exif_turned, find_photographs, me
 from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.simulate.render import Exposure, Print
 
 PATTERN = parse_pattern(BOARD)
@@ -325,6 +327,51 @@ class TestPhotographs:
         message.data = message.data[:-8]
         with pytest.raises(FisheyeSvpError, match='do not hold'):
             message_pixels(message, 'sensor_msgs/msg/Image', 'one')
+
+
+class TestCameras:
+    def cameras(self, *paths: Path) -> list[tuple[str, str]]:
+        return [(one.camera, one.key) for one in find_photographs([str(p) for p in paths])]
+
+    @pytest.mark.parametrize(('files', 'cameras'), [
+        (['left/1.png', 'right/1.png'], [('left', '1'), ('right', '1')]),
+        (['cam0/7.png', 'cam1/7.png'], [('cam0', '7'), ('cam1', '7')]),
+        (['left01.png', 'right01.png'], [('left', '01'), ('right', '01')]),
+        (['photos/1.png'], [('', '1')]),
+        (['left01.png', 'left02.png'], [('', 'left01'), ('', 'left02')]),
+        (['1.png', 'results/1.png'], [('', '1')]),
+    ])
+    def test_folders_and_names(
+        self, tmp_path: Path, files: list[str], cameras: list[tuple[str, str]]
+    ) -> None:
+        for name in files:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).touch()
+        assert self.cameras(tmp_path) == cameras
+
+    @pytest.mark.parametrize(('topics', 'cameras'), [
+        (['/image_raw', '/image_raw/compressed'], ['']),
+        (['/left/image', '/right/image'], ['left', 'right']),
+        (['/camera/left/image_raw/compressed'], ['left']),
+        (['/cam0/image_raw', '/cam0/image_raw/compressed', '/cam1/image_raw/compressed'],
+         ['cam0', 'cam1']),
+    ])
+    def test_topics(self, tmp_path: Path, topics: list[str], cameras: list[str]) -> None:
+        store = get_typestore(Stores.ROS2_JAZZY)
+        make = store.types
+        stamp = make['builtin_interfaces/msg/Time'](3, 0)
+        header = make['std_msgs/msg/Header'](stamp, 'camera')
+        grey = np.full((4, 6), 9, np.uint8)
+        with BagWriter(tmp_path / 'bag') as bag:
+            for topic in topics:
+                kind = 'sensor_msgs/msg/Image'
+                message = make[kind](header, 4, 6, 'mono8', 0, 6, grey.ravel())
+                if topic.endswith('compressed'):
+                    kind = 'sensor_msgs/msg/CompressedImage'
+                    data = np.frombuffer(cv2.imencode('.png', grey)[1], np.uint8)
+                    message = make[kind](header, 'png', data)
+                bag.write(topic, kind, bytes(store.serialize_cdr(message, kind)))
+        assert sorted(camera for camera, _ in self.cameras(tmp_path / 'bag')) == cameras
 
 
 class TestOrder:

@@ -9,6 +9,7 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import project, unique_range
 from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL
+from fisheye_svp_ros.scene.observations import rig_cameras
 from fisheye_svp_ros.scene.landmarks import RADII
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, paper_pose, rig
 
@@ -62,3 +63,11 @@ def test_calibration_poses_differ_in_place_and_turn():
     others = ~np.eye(10, dtype=bool)
     assert np.degrees(np.arccos(cosines[others].max())) > 5
     assert np.linalg.matrix_rank(pose.position - pose.position.mean(axis=0), 1e-3) == 3
+
+
+@pytest.mark.parametrize(('cameras', 'pair'), [
+    (('left', 'right'), ('left', 'right')), (('right', 'left', 'top'), ('left', 'right')),
+    (('cam1', 'cam0'), ('cam0', 'cam1')), (('',), None), (('a', 'b', 'c'), None),
+])
+def test_which_cameras_are_a_rig(cameras, pair):
+    assert rig_cameras(cameras) == pair
