@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
+import shlex
 import socket
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 from helpers.nodes import ROOT
 
-from fisheye_svp_ros import standalone
+from fisheye_svp_ros import cli, standalone
 
 PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
-         'whats_wrong.md', 'photographs.md')
-_BLOCK = re.compile(r'<!-- a test runs this -->\n```bash\n(.*?)```', re.DOTALL)
+         'whats_wrong.md', 'photographs.md', '../README.md')
+_BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
+_COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
 BLOCKS = [
     pytest.param(block, id=f'{page} {number}')
     for page in PAGES
@@ -47,6 +51,21 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
     done = subprocess.run(['bash', '-euc', block], cwd=tmp_path, env=env, text=True, timeout=240,
                           stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize('page', [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))],
+                         ids=lambda page: page.name)
+def test_every_command_is_one(page: Path) -> None:
+    blocks = re.findall(r'```(?:ba)?sh\n(.*?)```', page.read_text(), re.DOTALL)
+    text = '\n'.join(blocks).replace('\\\n', ' ') + '\n'.join(
+        re.findall(r'`(fisheye-svp [a-z]+ [^`…]*)`', page.read_text()))
+    for command in _COMMAND.findall(text):
+        name, *words = shlex.split(command.translate(str.maketrans('', '', '[]')))
+        assert name in cli.COMMANDS, command
+        parser = argparse.ArgumentParser(name)
+        import_module(f'fisheye_svp_ros.commands.{name}').add_arguments(parser)
+        if not {'-h', '--help', '…', '...'} & set(words):
+            parser.parse_args(words)  # ends the test where it does not parse
 
 
 @pytest.mark.parametrize('page', sorted(path.name for path in (ROOT / 'docs').glob('*.md')))
