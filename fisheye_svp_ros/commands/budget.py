@@ -18,8 +18,8 @@ _LIMITS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='a lens file with a viewpoint_shift, or the name of one that comes '
-                        'with the package')
+                        help='a lens file with a viewpoint_shift or a port, or the name of one '
+                        'that comes with the package')
     parser.add_argument('--range', type=float, default=0.5, metavar='M', dest='working_range',
                         help='nearest range of the landmarks or targets; default: 0.5')
     parser.add_argument('--spread', type=float, metavar='DEG',
@@ -47,7 +47,6 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.budget_report import (
-        HEADER,
         Asked,
         answer,
         document,
@@ -66,10 +65,11 @@ def run(args: argparse.Namespace) -> None:
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))
     points = at_point(budget, spread, args.working_range, limits)
     given = frozenset(name for name, value in limits.items() if value is not None)
-    asked = Asked(lens.name, spread, args.working_range, given)
+    asked = Asked(lens.name, spread, args.working_range, given,
+                  lens.port is not None)
     print_table(
         f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '
-        f'{args.working_range:g} m, {args.noise:g} px of noise', HEADER, rows(points, asked),
+        f'{args.working_range:g} m, {args.noise:g} px of noise', asked.header, rows(points, asked),
     )
     print(f'  {answer(points, asked)}')
     if args.output:

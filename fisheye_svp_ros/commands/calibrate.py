@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 _UNITS = {
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
     **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
+    **dict.fromkeys(('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y',
+                     'port_z'), 'm'),
+    **dict.fromkeys(('port_tilt_x', 'port_tilt_y'), 'rad'),
 }
 _HUGE = 20.0  # m; a target larger than this was measured in other units
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
@@ -25,6 +28,7 @@ _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens s
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     from fisheye_svp_ros.commands.photographs import add_board_arguments
+    from fisheye_svp_ros.commands.ports import add_port_arguments
     from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 
     parser.add_argument('observations', metavar='OBS',
@@ -40,7 +44,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--free', type=_names, metavar='NAME,...',
                         help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
                         'model, those of a viewpoint shift (e0,e1,e2 or '
-                        'thickness,refractive_index); all but the shift by default')
+                        'thickness,refractive_index), those of a port (port_medium_index, ...); '
+                        'all but the shift, and the place of the port, by default')
+    add_port_arguments(parser)
+    parser.add_argument('--lens', metavar='AIR.yaml', type=Path,
+                        help='the same camera calibrated in air: with --medium or --port the '
+                        'place of the port alone is fitted')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
                         help='lens file to write; covariances go beside it as .calibrate.json; '
                         'for the cameras left and right a folder, for a lens of each and rig.yaml')
@@ -49,9 +58,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
     from fisheye_svp_ros.commands.photographs import measured
+    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.scene.observations import rig_cameras
 
+    if args.lens and not (args.medium or args.port):
+        raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
+                             'water, or --port')
     observations, size = measured(args.observations, args)
+    if args.lens:
+        air = load_lens(args.lens)
+        size = air.width, air.height
     size = args.image_size or size or _size_beside(Path(args.observations))
     if size is None:
         raise ParameterError(f'{args.observations}: the size of the images is not known; add '
@@ -81,14 +97,19 @@ def _calibrated(
     import numpy as np
 
     from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.ports import port_of
+    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.solve.lens_calibration import calibrate
+    from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
 
+    port = port_of(args)
     across = float(np.ptp(table.xyz, axis=0).max())
     if across > _HUGE:
         say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
     with progress('calibrating'):
-        return calibrate(table, args.model, size, args.free, name)
+        if args.lens and port:
+            return calibrate_port(table, load_lens(args.lens), port, args.free)
+        return calibrate(table, args.model, size, args.free, name, port)
 
 
 def _trusted(table: Observations, result: Calibration) -> Trust:

@@ -62,10 +62,12 @@ def _lost(lens: Lens, written: Lens) -> None:
     import numpy as np
 
     from fisheye_svp_ros.optics.camera import project
+    from fisheye_svp_ros.optics.lens import PORT
     from fisheye_svp_ros.reporting.tables import print_table
 
-    if lens.corrections or lens.target:
-        print(f'left out: {", ".join((*lens.corrections, *lens.target))}')
+    port = () if lens.port is None else (PORT,)
+    if port or lens.corrections or lens.target:
+        print(f'left out: {", ".join((*port, *lens.corrections, *lens.target))}')
     if lens.viewpoint_shift is None or written.viewpoint_shift == lens.viewpoint_shift:
         return
     angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]

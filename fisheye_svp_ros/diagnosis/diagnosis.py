@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import Step
 from fisheye_svp_ros.diagnosis.measured import Fit, Intrinsic, Measured
+from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import (
     Linearised,
     State,
@@ -118,13 +119,19 @@ def diagnose(
     if rounded:
         # Values on a lattice repeat with the pixel by themselves.
         wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
+    medium = None
+    if 'flat_port' not in wanted.left_out:
+        medium = find_medium(data, lens, base, free, progress)
+    if medium is not None:
+        # Index and lens curve look alike: the intrinsics stay as they were in air.
+        base, free = medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data')
     return _judged(
-        observations, lens, found, Measured(found, free, held_out, wanted.quick), noise_causes,
-        held_out,
+        observations, lens, found, Measured(found, free, held_out, wanted.quick, medium),
+        noise_causes, held_out,
     )
 
 
@@ -170,7 +177,7 @@ def _judged(
         intrinsics=measured.intrinsics,
         lens=extended_lens(lens, found.state, observations),
         local=measured.local,
-        before=found.base.linear,
+        before=measured.before,
         after=evidence.linear,
     )
 

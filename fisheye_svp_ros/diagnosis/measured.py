@@ -18,7 +18,8 @@ from fisheye_svp_ros.diagnosis.budget import (
 )
 from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
-from fisheye_svp_ros.diagnosis.evidence import identifiable
+from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
+from fisheye_svp_ros.diagnosis.medium import Medium
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, fit, prepare, start_poses
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
@@ -56,12 +57,16 @@ class Intrinsic:
 
 
 class Measured:
-    """Figures of what was found; held_out: other frames, None for frames left out in turn."""
+    """Figures of what was found; held_out: other frames, None for frames left out in turn.
+
+    medium: the cause that was found before the search, if there is one.
+    """
 
     def __init__(
-        self, found: Found, free: Sequence[str], held_out: Observations | None, quick: bool
+        self, found: Found, free: Sequence[str], held_out: Observations | None, quick: bool,
+        medium: Medium | None = None,
     ) -> None:
-        self.found, self.free, self.quick = found, tuple(free), quick
+        self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
         self.evidence = found.evidence
         self.noise = noise_px(found.evidence)
         self.names = [e.name for e, _ in found.state.terms if e.stage != 'noise']
@@ -98,6 +103,19 @@ class Measured:
         return self.held_out(self.names)
 
     @cached_property
+    def _simulation(self) -> HeldOut:
+        if self.medium is None:
+            return self._base
+        if self.test is None:
+            return self.medium.held_out()
+        return on_other_data(self.test, replace(self.medium.air.state, pose=self.test_pose))
+
+    @property
+    def before(self) -> Linearised:
+        """The simulation as it was fitted."""
+        return self.found.base.linear if self.medium is None else self.medium.air
+
+    @cached_property
     def _prefixes(self) -> list[HeldOut]:
         """Predictions with the first 0, 1, ... causes."""
         return [self._base, *(
@@ -125,10 +143,10 @@ class Measured:
     @property
     def base(self) -> Fit:
         """The simulation as it was fitted."""
-        linear = self.found.base.linear
+        linear = self.before
         freedom = self.evidence.full.rows - self.evidence.full.poses - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
-        return Fit(rms_px(linear, linear.residual), self._base.rms, chi2)
+        return Fit(rms_px(linear, linear.residual), self._simulation.rms, chi2)
 
     @property
     def named(self) -> Fit:
@@ -156,13 +174,13 @@ class Measured:
     @property
     def gain(self) -> Gain:
         """Of the best prediction over the simulation."""
-        return gain_between(self._base, self._best, self.noise)
+        return gain_between(self._simulation, self._best, self.noise)
 
     def gains(self) -> dict[str, Gain]:
         """Return what the lens alone, and then the target and its offsets, gain."""
         return {
-            'lens': gain_between(self._base, self._lens, self.noise),
-            'named': gain_between(self._base, self._prefixes[-1], self.noise),
+            'lens': gain_between(self._simulation, self._lens, self.noise),
+            'named': gain_between(self._simulation, self._prefixes[-1], self.noise),
             'local': gain_between(self._prefixes[-1], self._best, self.noise),
         }
 
@@ -176,7 +194,14 @@ class Measured:
             (after.rms, gain_between(before, after, self.noise).value)
             for before, after in zip(self._prefixes, self._prefixes[1:], strict=False)
         ]
-        return mean_causes(self.evidence, self.errors, shares, held_out)
+        causes = mean_causes(self.evidence, self.errors, shares, held_out)
+        if self.medium is None:
+            return causes
+        gain = gain_between(self._simulation, self._base, self.noise)
+        left = 1 - self.medium.share
+        fitted = replace(self.medium, state=self.found.state)
+        return [fitted.cause(self._free_errors(), self._base.rms, gain),
+                *(replace(cause, share=left * cause.share) for cause in causes)]
 
     def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""
@@ -188,23 +213,36 @@ class Measured:
         p_values = significance(eq, evidence.variances)
         found = {name: drop_test(evidence, own, columns)
                  for name, columns, _ in placed_terms(evidence)}
-        return budget(evidence, p_values, found | dict(noise_causes))
+        parts = budget(evidence, p_values, found | dict(noise_causes))
+        return parts if self.medium is None else self.medium.budget(parts)
+
+    def _free_errors(self) -> dict[str, float]:
+        """Return the standard errors of what was free from the start."""
+        rig = _rig_columns(self.found.base, self.free)
+        return {name: float(self.errors[rig + i]) for i, name in enumerate(self.free)}
 
     @property
     def intrinsics(self) -> dict[str, Intrinsic]:
         """Free intrinsics before and after, with errors under the null model."""
-        base = self.found.base
+        if self.medium is not None:
+            return {}
+        base, after = self.found.base, self._free_errors()
         before = standard_errors(base, jackknife=False)
-        rig = base.own - len(self.free) - sum(
-            len(values) for effect, values in base.linear.state.terms if effect.stage != 'noise'
-        )
+        rig = _rig_columns(base, self.free)
         was, now = base.linear.state.lens.parameters, self.found.state.lens.parameters
         return {
             name: Intrinsic(
-                was[name], float(before[rig + i]), now[name], float(self.errors[rig + i])
+                was[name], float(before[rig + i]), now[name], after[name]
             )
             for i, name in enumerate(self.free)
         }
+
+
+def _rig_columns(evidence: Evidence, free: Sequence[str]) -> int:
+    """Return how many of what is shared come before what was free from the start."""
+    return evidence.own - len(free) - sum(
+        len(values) for effect, values in evidence.linear.state.terms if effect.stage != 'noise'
+    )
 
 
 def rms_px(linear: Linearised, whitened: Array) -> float:

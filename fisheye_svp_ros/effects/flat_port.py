@@ -1,4 +1,4 @@
-"""A plane window in front of the lens."""
+"""A plane window in front of the lens, with air or another medium behind it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,11 @@ from fisheye_svp_ros.optics.lens import Lens
 
 @dataclass(frozen=True)
 class FlatPortEffect(Effect):
-    """A window of unknown thickness and given refractive index, square to the axis."""
+    """A window of unknown thickness and given refractive index, square to the axis, in air.
+
+    Where the medium behind it is another one, the port is a part of the lens (`optics.ports`), and
+    a diagnosis names it under the same name (`diagnosis.medium`).
+    """
 
     refractive_index: float = 1.5
 

@@ -19,7 +19,8 @@ from fisheye_svp_ros.io.files import read_yaml, write_text
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, check_lens, field_of_view
+from fisheye_svp_ros.optics.lens import INTRINSICS, PORT, Lens, check_lens, field_of_view
+from fisheye_svp_ros.optics.ports import PORTS, Port
 from fisheye_svp_ros.registry import Registry
 
 C = TypeVar('C', bound=Curve)
@@ -66,6 +67,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     _refuse_unknown(document, _FIELDS, where, {_OLD})
     image = _section(document, 'image', where)
     target = _effects(document, 'target', where)
+    own = _effects(document, 'corrections', where)
     Target.of(target, where)
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
@@ -74,6 +76,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         **_projection(_section(document, 'projection', where), f'{where}: projection'),
         max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
+        port=_port(own.get(PORT), where),
         target=target,
         calibration=_calibration(document.get('calibration'), where),
     )
@@ -84,8 +87,9 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     if given is not None:
         degrees = _number(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
-    for name in (_OLD, 'corrections'):
-        lens = extend_lens(lens, load_effects(_effects(document, name, where), where))
+    own = {name: entry for name, entry in own.items() if name != PORT}
+    for entries in (_effects(document, _OLD, where), own):
+        lens = extend_lens(lens, load_effects(entries, where))
     return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
 
 
@@ -101,7 +105,8 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
     }
     if lens.viewpoint_shift is not None:
         document['viewpoint_shift'] = _shift_to_dict(lens.viewpoint_shift)
-    document |= {'corrections': dict(lens.corrections), 'target': dict(lens.target)}
+    own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
+    document |= {'corrections': own | dict(lens.corrections), 'target': dict(lens.target)}
     if lens.calibration is not None:
         document['calibration'] = dict(lens.calibration)
     return document
@@ -129,6 +134,10 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
     place = f'{where}: viewpoint_shift'
     first, *others = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
     return reduce(ViewpointShift.plus, others, first)
+
+
+def _port(section: Any, where: str) -> Port | None:
+    return None if section is None else _curve(section, PORTS, '', 0, f'{where}: corrections.port')
 
 
 def _shift_to_dict(shift: ViewpointShift) -> Any:

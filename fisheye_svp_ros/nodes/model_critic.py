@@ -220,7 +220,7 @@ def figures(found: Diagnosis) -> dict[str, float]:
 
 def _suffix(unit: str) -> str:
     """Return a unit as the end of a metric's name: nothing, _m2, _per_rad2."""
-    return '' if unit == '1' else '_' + re.sub(r'\W', '', unit.replace('1/', 'per_'))
+    return '' if unit in ('', '1') else '_' + re.sub(r'\W', '', unit.replace('1/', 'per_'))
 
 
 def in_background(work: Callable[[], T]) -> Future[T]:

@@ -12,7 +12,7 @@ angle, which is the one that continues to far points, is taken.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -21,6 +21,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.optics.engines import ported
 from fisheye_svp_ros.optics.engines.results import Incidence as Incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.rays import caustic_range
@@ -52,6 +53,9 @@ class LinearImage:
     @cached_property
     def incidence(self) -> Incidence:
         """Where the points have their ray through the lens."""
+        if self.lens.port is not None:
+            return _shaped(ported.met(self.lens, self._sight, self.limited),
+                           self.points.shape[:-1])
         return incidence(self.lens, self.points, self.limited)
 
     @property
@@ -63,7 +67,22 @@ class LinearImage:
     @property
     def d_shift(self) -> Array:
         """Derivatives (..., 2) by the viewpoint shift, px/m."""
-        return -self.d_point[..., 2]
+        return -self.d_point[..., 2] if self.lens.port is None else self._behind_port[0]
+
+    @property
+    def d_port(self) -> Array:
+        """Derivatives (..., 2, K) by the coefficients of the port."""
+        return self._behind_port[1]
+
+    @cached_property
+    def _sight(self) -> ported.Sight:
+        return ported.sight(self.lens, self.points.reshape(-1, 3))
+
+    @cached_property
+    def _behind_port(self) -> tuple[Array, Array]:
+        shift, port = ported.columns(self.lens, self._sight)
+        shape = (*self.points.shape[:-1], 2)
+        return shift.reshape(shape), port.reshape(*shape, -1)
 
 
 class Rays(NamedTuple):
@@ -86,8 +105,10 @@ def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     limited: also refuse angles past the lens's `max_incidence`; a solver on its way does not.
     Source: Kita, section 2 and figure 2.
     """
-    fields = engines.incidence(lens, points.reshape(-1, 3), limited)
-    shape = points.shape[:-1]
+    return _shaped(engines.incidence(lens, points.reshape(-1, 3), limited), points.shape[:-1])
+
+
+def _shaped(fields: Incidence, shape: tuple[int, ...]) -> Incidence:
     return Incidence._make(field.reshape((*field.shape[:-1], *shape)) for field in fields)
 
 
@@ -133,6 +154,8 @@ def lens_columns(lens: Lens, image: LinearImage, names: Sequence[str]) -> Array:
             by_coefficient = curve.columns(theta)
             for i, name in enumerate(curve.coefficient_names):
                 columns[name] = derivative * by_coefficient[..., i, None]
+    if set(lens.port_names) & set(names):
+        columns |= {name: image.d_port[..., i] for i, name in enumerate(lens.port_names)}
     unknown = [name for name in names if name not in columns]
     if unknown:
         raise LensError(f'lens {lens.name!r} has no parameter {unknown[0]!r}')
@@ -144,7 +167,9 @@ def lens_columns(lens: Lens, image: LinearImage, names: Sequence[str]) -> Array:
 def back_project(lens: Lens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction.
 
-    Image points outside the field of view come back as NaN with valid False.
+    Behind a port the ray is that in the medium, and its origin where, followed back, it passes the
+    camera's origin; theta is that in air.  Image points outside the field of view come back as NaN
+    with valid False.
     """
     mx = (np.asarray(uv[..., 0], dtype=float) - lens.cx) / lens.fx
     my = (np.asarray(uv[..., 1], dtype=float) - lens.cy) / lens.fy
@@ -159,14 +184,23 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     origin = np.zeros_like(direction)
     if lens.viewpoint_shift is not None:
         origin[..., 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
+    if lens.port is not None:
+        at, way = ported.traced(lens, direction.reshape(-1, 3))
+        back = (at.value * way.value).sum(axis=-1, keepdims=True)
+        origin = (at.value - back * way.value).reshape(direction.shape)
+        direction = way.value.reshape(direction.shape)
+        valid &= np.isfinite(direction).all(axis=-1)
     return Rays(np.where(valid[..., None], origin, np.nan), direction, theta, valid)
 
 
 def unique_range(lens: Lens) -> float:
     """Nearest distance from the camera's origin beyond which every point has at most one ray, m.
 
-    It is the outermost point of the caustic that the rays up to `max_incidence` envelop.
+    It is the outermost point of the caustic that the rays up to `max_incidence` envelop; nothing
+    is seen through a port that is not behind it.
     """
+    if lens.port is not None:
+        return max(unique_range(replace(lens, port=None)), lens.port.reach)
     if lens.viewpoint_shift is None:
         return 0.0
     return caustic_range(lens.viewpoint_shift, lens.max_incidence)

@@ -10,20 +10,23 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
+from fisheye_svp_ros.optics.ports import Port
 
 INTRINSICS = ('fx', 'fy', 'cx', 'cy')
+PORT = 'port'  # before the names of a port's coefficients, among those of a lens
 _INSIDE = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
 
 
 @dataclass(frozen=True)
 class Lens:
-    """One fisheye lens on its camera; SVP is the same lens without its viewpoint shift.
+    """One fisheye lens on its camera; SVP is the same lens without shift and port.
 
     fx, fy, cx, cy in px (pixel centres at whole numbers); max_incidence in rad.  viewpoint_shift
-    is all of it, whatever it is made of.  corrections: effects of the lens's own that have no
-    other place in it, by name, as `effects.base.Effect.to_dict` gives them; target: those of the
-    target that they were found on, and its landmarks, see `effects.target`; both are changed by
-    `effects.extension.extend_lens`.  calibration: where a fit came from.
+    is all of it, whatever it is made of, but for what a port brings.  corrections: effects of the
+    lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
+    them; target: those of the target that they were found on, and its landmarks, see
+    `effects.target`; both are changed by `effects.extension.extend_lens`.  calibration: where a
+    fit came from.
     """
 
     name: str
@@ -36,18 +39,27 @@ class Lens:
     image_height: ImageHeight
     max_incidence: float
     viewpoint_shift: ViewpointShift | None = None
+    port: Port | None = None
     corrections: Mapping[str, Any] = field(default_factory=dict)
     target: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, Any] | None = None
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Intrinsics and the coefficients of both curves, by name."""
+        """Intrinsics and the coefficients of both curves and of the port, by name."""
         values: dict[str, float] = {name: getattr(self, name) for name in INTRINSICS}
         for curve in (self.image_height, self.viewpoint_shift):
             if curve is not None:
                 values.update(zip(curve.coefficient_names, curve.coefficients, strict=True))
+        if self.port is not None:
+            values.update(zip(self.port_names, self.port.coefficients, strict=True))
         return values
+
+    @property
+    def port_names(self) -> tuple[str, ...]:
+        """Names of the port's coefficients among the parameters."""
+        names = () if self.port is None else self.port.coefficient_names
+        return tuple(f'{PORT}_{name}' for name in names)
 
     def with_parameters(self, names: Sequence[str], values: Sequence[float]) -> Lens:
         """Return a copy with some parameters changed; `f` changes fx and fy together.
@@ -55,7 +67,9 @@ class Lens:
         Raises LensError for a name this lens does not have.
         """
         changes: dict[str, Any] = {}
-        curves: dict[str, dict[str, float]] = {'image_height': {}, 'viewpoint_shift': {}}
+        curves: dict[str, dict[str, float]] = {
+            'image_height': {}, 'viewpoint_shift': {}, PORT: {}
+        }
         for name, value in zip(names, map(float, values), strict=True):
             if name in INTRINSICS:
                 changes[name] = value
@@ -65,6 +79,8 @@ class Lens:
                 curves['image_height'][name] = value
             elif self.viewpoint_shift and name in self.viewpoint_shift.coefficient_names:
                 curves['viewpoint_shift'][name] = value
+            elif name in self.port_names:
+                curves[PORT][name.removeprefix(f'{PORT}_')] = value
             else:
                 known = ', '.join(self.parameters)
                 raise LensError(f'lens {self.name!r} has no parameter {name!r}; it has {known}')
@@ -74,8 +90,8 @@ class Lens:
         return replace(self, **changes)
 
     def svp(self) -> Lens:
-        """Return the same lens under the single-viewpoint approximation."""
-        return replace(self, viewpoint_shift=None)
+        """Return the same lens under the single-viewpoint approximation, in air."""
+        return replace(self, viewpoint_shift=None, port=None)
 
     def with_shift(self, shift: ViewpointShift) -> Lens:
         """Return the lens with a viewpoint shift added to its own."""
@@ -95,8 +111,8 @@ class Lens:
         for name in ('fx', 'fy', 'width', 'height'):
             if getattr(self, name) <= 0:
                 return f'{name} is {getattr(self, name)}; it must be above 0'
-        wrong = self.image_height.check()
-        return wrong if wrong or self.viewpoint_shift is None else self.viewpoint_shift.check()
+        parts = (self.image_height, self.viewpoint_shift, self.port)
+        return next((wrong for part in parts if part is not None and (wrong := part.check())), '')
 
 
 def curve_limit(lens: Lens) -> float:

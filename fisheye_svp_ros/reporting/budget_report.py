@@ -14,8 +14,6 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
 from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 
-HEADER = ('error', 'SVP causes', 'noise causes', 'limit', 'unit', 'kept', 'nearest range',
-          'largest spread')
 _SHORT = 30.0  # times, from the least to the largest error
 _PEOPLE = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
 _WORDS = {
@@ -27,6 +25,7 @@ _WORDS = {
 class Asked(NamedTuple):
     """What the user asked for: lens; spread, rad; working range, m; quantities with a limit.
 
+    port: whether the lens is behind one, so that the question is that of its calibration in air.
     Where the user states no limit at all, what noise causes is the limit of every quantity.
     """
 
@@ -34,6 +33,18 @@ class Asked(NamedTuple):
     spread: float
     working_range: float
     given: frozenset[str]
+    port: bool = False
+
+    @property
+    def model(self) -> str:
+        """What is used in place of the lens."""
+        return 'the lens in air' if self.port else 'SVP'
+
+    @property
+    def header(self) -> tuple[str, ...]:
+        """The heads of the table's columns."""
+        return ('error', f'{self.model} causes', 'noise causes', 'limit', 'unit', 'kept',
+                'nearest range', 'largest spread')
 
     def judged(self, points: Sequence[Point]) -> list[Point]:
         """Return the points that the answer rests on."""
@@ -41,7 +52,7 @@ class Asked(NamedTuple):
 
 
 def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
-    """Return the table's rows, under HEADER."""
+    """Return the table's rows, under the header."""
     found = []
     for point in asked.judged(points):
         unit, factor = _PEOPLE[UNITS[point.quantity]]
@@ -57,21 +68,22 @@ def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
 
 
 def answer(points: Sequence[Point], asked: Asked) -> str:
-    """Return the answer to whether the viewpoint shift may be neglected, as a sentence."""
+    """Return the answer to whether shift and port may be neglected, as a sentence."""
     where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
              f'{asked.working_range:g} m')
     judged = asked.judged(points)
     broken = [point for point in judged if not point.kept]
     if not broken:
-        return f'Yes: {where} SVP keeps every limit.'
+        return f'Yes: {where} {asked.model} keeps every limit.'
     worst = max(broken, key=lambda point: point.error / point.limit)
     unit, factor = _PEOPLE[UNITS[worst.quantity]]
     limit = 'what you allow' if asked.given else 'what noise causes'
     needed = max(point.nearest_range for point in broken)
-    remedy = (f'it may be neglected from {needed:.2f} m on' if np.isfinite(needed)
+    neglected = 'will do' if asked.port else 'may be neglected'
+    remedy = (f'it {neglected} from {needed:.2f} m on' if np.isfinite(needed)
               else 'no range within the budget helps')
     return (
-        f'No: {where} SVP breaks {len(broken)} of {len(judged)} limits, worst the '
+        f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits, worst the '
         f'{_WORDS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
         f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}.'
     )
@@ -118,7 +130,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
             axis.xaxis.set_major_formatter('{x:g}')
             axis.grid(visible=False)
-        _explain(axes.flat[len(points)])
+        _explain(axes.flat[len(points)], asked.model)
 
 
 def _label(bar: Any, error: Array) -> None:
@@ -140,11 +152,11 @@ def _draw_limit(axis: Any, budget: Budget, point: Point, given: bool) -> None:
     axis.contour(*place, excess, levels=[0], colors=OURS, linewidths=1.8)
 
 
-def _explain(axis: Any) -> None:
+def _explain(axis: Any, model: str) -> None:
     axis.axis('off')
     axis.text(
         0.02, 0.95,
-        'Colour: what SVP causes.\nHatched: more than the limit; SVP will not do.\n'
+        f'Colour: what {model} causes.\nHatched: more than the limit; {model} will not do.\n'
         'Line: the limit is just met.\nStar: where you work.\n'
         'Limits that you do not state are what noise causes.\n\n'
         'Spread: largest incidence angle of the\nlandmarks, which fill a cap about the axis.',

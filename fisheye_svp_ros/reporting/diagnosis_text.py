@@ -84,7 +84,7 @@ def quantity(entry: Mapping[str, Any]) -> str:
     """Return a parameter's value and standard error in the unit that people read."""
     factor, unit = _HUMAN.get(entry['unit'], (1.0, entry['unit']))
     value, error = with_error(factor * entry['value'], factor * entry['stderr'])
-    return f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}'
+    return (f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}').rstrip()
 
 
 def size(diagnosis: Diagnosis, cause: Cause) -> str:

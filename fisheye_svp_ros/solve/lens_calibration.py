@@ -8,17 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, LensError, ObservationError
 from fisheye_svp_ros.optics.camera import back_project, incidence
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import (
     INTRINSICS,
+    PORT,
     Lens,
     check_lens,
     field_of_view,
     monotone_limit,
 )
+from fisheye_svp_ros.optics.ports import Port
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import (
@@ -61,29 +65,71 @@ def calibrate(
     image_size: tuple[int, int],
     free: Sequence[str] | None = None,
     name: str = 'lens',
+    port: Port | None = None,
 ) -> Calibration:
     """Fit a lens to image points of planar or 3-D targets; neither poses nor a start are needed.
 
     model: a name in IMAGE_HEIGHTS; image_size: width, height, px; free: parameters to fit, among
     them f, or fx and fy (fx, fy, cx, cy and the model's coefficients by default); a coefficient of
     a viewpoint shift gives the lens that shift.  What is not freed stays neutral: the centre in
-    the middle of the image, coefficients at 0.
+    the middle of the image, coefficients at 0.  port: what the camera looked through; where it is
+    is fitted too, whatever it says.
     Raises LensError for an impossible model, image size or name; ObservationError for rows of
     several cameras or far outside the image; GeometryError where the views do not determine the
     lens.
     """
-    start = _start_lens(model, image_size, free or (), name)
+    start = replace(_start_lens(model, image_size, free or (), name), port=port)
     names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
+    names += tuple(n for n in placed_names(start) if n not in names)
     _check_names(start, names)
     _check_inside(observations, image_size)
     views, left_out = posable_views(observations)
-    rows, unknowns = 2 * int(views.used.sum()), 6 * len(views.frame) + len(names)
+    _check_rows(observations.source, views, names)
+    adjusted = _from_nothing(start, views, names)
+    return _finished(observations, adjusted, views, left_out)
+
+
+def calibrate_port(
+    observations: Observations, lens: Lens, port: Port, free: Sequence[str] | None = None
+) -> Calibration:
+    """Fit where a port is, to image points that a camera calibrated in air took through it.
+
+    free: parameters to fit in place of those, `port_medium_index` and intrinsics among them if
+    asked for.  Raises as `calibrate` does.
+    """
+    _check_inside(observations, (lens.width, lens.height))
+    lens = replace(lens, port=port)
+    names = placed_names(lens) if free is None else tuple(free)
+    _check_known(lens, names)
+    views, left_out = posable_views(observations)
+    _check_rows(observations.source, views, names)
+    adjusted = _from_places(lens, thinned(views), views, names)
+    return _finished(observations, adjusted, views, left_out)
+
+
+def placed_names(lens: Lens) -> tuple[str, ...]:
+    """Return the parameters of a lens that say where its port is."""
+    return () if lens.port is None else tuple(f'{PORT}_{name}' for name in lens.port.placed)
+
+
+def _check_rows(source: str, views: Views, names: Sequence[str]) -> None:
+    rows, unknowns = _counts(views, names)
     if rows <= unknowns:
         raise GeometryError(
-            f'{observations.source}: {rows // 2} image points in {len(views.frame)} frames do not '
+            f'{source}: {rows // 2} image points in {len(views.frame)} frames do not '
             f'determine {len(names)} lens parameters and the poses; add frames or points'
         )
-    adjusted = _from_nothing(start, views, names)
+
+
+def _counts(views: Views, names: Sequence[str]) -> tuple[int, int]:
+    return 2 * int(views.used.sum()), 6 * len(views.frame) + len(names)
+
+
+def _finished(
+    observations: Observations, adjusted: Adjusted, views: Views, left_out: tuple[int, ...]
+) -> Calibration:
+    """Return the calibration with its covariances, field and figures."""
+    rows, unknowns = _counts(views, adjusted.names)
     sigma = None
     if not sigma_known(observations):
         sigma = noise_sigma(adjusted.cost.sum(), rows, unknowns)
@@ -121,11 +167,15 @@ def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], na
 
 
 def _check_names(lens: Lens, names: tuple[str, ...]) -> None:
+    _check_known(lens, names)
+    if ('f' in names) == ('fx' in names) or ('fx' in names) != ('fy' in names):
+        raise LensError('free must name f, or fx and fy: a calibration starts without them')
+
+
+def _check_known(lens: Lens, names: tuple[str, ...]) -> None:
     lens.with_parameters(names, [1.0] * len(names))
     if len(set(names)) < len(names):
         raise LensError(f'free names a parameter twice: {", ".join(names)}')
-    if ('f' in names) == ('fx' in names) or ('fx' in names) != ('fy' in names):
-        raise LensError('free must name f, or fx and fy: a calibration starts without them')
 
 
 def _check_inside(observations: Observations, image_size: tuple[int, int]) -> None:
@@ -143,17 +193,50 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
     svp_names = names
     if shift is not None:
         svp_names = tuple(name for name in names if name not in shift.coefficient_names)
+    port_names = tuple(name for name in names if name in start.port_names)
+    svp_names = tuple(name for name in svp_names if name not in port_names)
     few = thinned(views)
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
     values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
-    solved = adjust_batch(start.svp(), few, pose, values, svp_names, _START_ITERATIONS)
-    best = solved.state[2][np.argmin(solved.cost)].tolist()
-    adjusted = _settled(start.svp().with_parameters(svp_names, best), views, svp_names)
+    adjusted = _settled(
+        _best_start(start.svp(), few, pose, values, svp_names), views, svp_names
+    )
+    if start.port is not None:
+        adjusted = _behind_port(start, adjusted, few, views, (*svp_names, *port_names))
     if shift is None:
         return adjusted
     lens = _with_corner(replace(adjusted.lens, viewpoint_shift=shift))
     return adjust(lens, views, adjusted.pose, names)
+
+
+def _best_start(
+    lens: Lens, few: Views, pose: Pose, values: Array, names: tuple[str, ...]
+) -> Lens:
+    """Return the lens that fits best of those adjusted from starts (S, V) and (S, K)."""
+    solved = adjust_batch(lens, few, pose, values, names, _START_ITERATIONS)
+    return lens.with_parameters(names, solved.state[2][np.argmin(solved.cost)].tolist())
+
+
+def _behind_port(
+    start: Lens, central: Adjusted, few: Views, views: Views, names: tuple[str, ...]
+) -> Adjusted:
+    """Adjust lens and port from a fit that knows of no port, and from several places of it."""
+    assert start.port is not None
+    air, larger = central.lens, start.port.magnification
+    if larger > 1:
+        # What a port does to the focal length is known, the rest of the curve is begun anew.
+        air = replace(air, fx=air.fx / larger, fy=air.fy / larger, image_height=start.image_height)
+    return _from_places(replace(air, port=start.port), few, views, names)
+
+
+def _from_places(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> Adjusted:
+    """Adjust a lens from several places of its port."""
+    assert lens.port is not None
+    lenses = [replace(lens, port=port) for port in lens.port.starts()]
+    pose = Pose.stack([_posed(one, few).pose for one in lenses])
+    values = np.array([parameter_values(one, names) for one in lenses])
+    return _settled(_best_start(lens, few, pose, values, names), views, names)
 
 
 def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
@@ -186,7 +269,8 @@ def _with_corner(lens: Lens) -> Lens:
 
 def _with_field(adjusted: Adjusted, views: Views) -> tuple[Lens, int]:
     """Return the lens with its `max_incidence` and the number of observations beyond it."""
-    lens = _with_corner(adjusted.lens)
+    held = set(adjusted.names) <= set(adjusted.lens.port_names)
+    lens = adjusted.lens if held else _with_corner(adjusted.lens)
     points = adjusted.pose.into_body(views.points)
     theta = incidence(lens, points, limited=False).theta[views.used]
     seen = min(float(theta.max()), monotone_limit(lens))

@@ -2,7 +2,7 @@
 
 A lens looks at landmarks that are spread evenly over a cap of directions about its axis, all at
 one range, alone (localization) and as a stereo rig (epipolar lines and depth).  Beside every SVP
-error stands what image noise alone causes.
+error stands what image noise alone causes.  For a lens behind a port SVP is the lens in air.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError, ParameterError
-from fisheye_svp_ros.optics.camera import unique_range
+from fisheye_svp_ros.optics.camera import back_project, unique_range
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -74,8 +74,18 @@ class Point(NamedTuple):
 
 
 def widest_spread(lens: Lens) -> float:
-    """Return the largest spread of landmarks that a budget covers, rad."""
-    return float(lens.max_incidence - _EDGE)
+    """Return the largest spread of landmarks that a budget covers, rad.
+
+    Through a port it is that of the narrowest side, in the medium.
+    """
+    if lens.port is None:
+        return float(lens.max_incidence - _EDGE)
+    turn = np.linspace(0, 2 * np.pi, 17)[:-1, None]
+    height, _ = lens.image_height.value_and_slope(np.linspace(0, lens.max_incidence, 181))
+    uv = np.stack([lens.cx + lens.fx * height * np.cos(turn),
+                   lens.cy + lens.fy * height * np.sin(turn)], axis=-1)
+    seen = np.arccos(back_project(lens, uv).direction[..., 2])
+    return float(np.nanmax(seen, axis=1).min() - _EDGE)
 
 
 def nearest_range(lens: Lens) -> float:
@@ -90,7 +100,7 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     for a baseline with which nothing could be measured.
     """
     lens = setup.lens
-    if lens.viewpoint_shift is None:
+    if lens.viewpoint_shift is None and lens.port is None:
         raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it')
     if not (np.isfinite(setup.noise) and setup.noise > 0):
         raise ParameterError(f'noise is {setup.noise} px; it must be above 0')

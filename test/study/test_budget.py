@@ -1,6 +1,7 @@
 """The budget of the SVP error, and the command that tells it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import axis_angle_between, identity
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import rig
@@ -203,3 +205,16 @@ def test_the_readme_says_what_the_budget_says():
     assert 13 < nearest(other, 88) < 14
     position = at_point(other, np.radians(60), 1.0, {})[0]
     assert np.degrees(position.largest_spread) == pytest.approx(67, abs=0.5)
+
+
+def test_a_calibration_in_air_is_not_for_water(tmp_path, capsys):
+    """Behind a flat port nothing is seen beyond the critical angle, and all seems nearer."""
+    wet = replace(LENS, port=FlatGlass(0.03, 1.333), max_incidence=np.radians(85.0))
+    assert np.sin(widest_spread(wet) + np.radians(1.0)) == pytest.approx(
+        np.sin(np.radians(85.0)) / 1.333)
+    table = make_budget(Setup(wet, rig('parallel'), 0.3), spreads=4, ranges=6)
+    far = table.error['position'][0, -1] / table.ranges[-1]
+    assert far == pytest.approx(1 - 1 / 1.333, abs=0.02)
+    save_lens(wet, tmp_path / 'wet.yaml')
+    assert main(['budget', '--lens', str(tmp_path / 'wet.yaml'), '--range', '1']) == 0
+    assert 'the lens in air breaks 5 of 5 limits' in capsys.readouterr().out

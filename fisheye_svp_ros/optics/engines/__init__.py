@@ -1,8 +1,9 @@
 """The engines that the projection and its solvers run on, and which of them does.
 
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
-compile, which only long work pays back: what begins such work says so (`settle`).  Anything else
-runs on NumPy, and gives the same to the last digit whatever was compiled before.
+compile, which only long work pays back: what begins such work says so (`settle`).  A lens behind a
+port is traced by `ported`.  Anything else runs on NumPy, and gives the same to the last digit
+whatever was compiled before.
 FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
 
@@ -15,7 +16,7 @@ from types import ModuleType
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.optics.engines import cache, numpy_engine
+from fisheye_svp_ros.optics.engines import cache, numpy_engine, ported
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -50,12 +51,15 @@ def settle(points: float) -> str:
 
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Return where points (M, 3), m, in the camera frame have their ray through the lens."""
+    if lens.port is not None:
+        return ported.incidence(lens, points, limited)
     return numpy_engine.incidence(lens, points, limited)
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
-    uv, valid = _engine.project(lens, points, limited)
+    engine = _engine if lens.port is None else ported
+    uv, valid = engine.project(lens, points, limited)
     return uv, valid
 
 
@@ -67,7 +71,8 @@ def linearise_views(
     rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
     by the small changes of `pose.Pose.retract`, px/m and px/rad.
     """
-    uv, valid, d_pose = _engine.linearise_views(lens, rotation, position, points, limited)
+    engine = _engine if lens.port is None else ported
+    uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
     return uv, valid, d_pose
 
 
@@ -79,6 +84,8 @@ def pose_equations(
     rotation (S, 3, 3), position (S, 3): cameras in the world.  A point without an image costs
     infinity, unless its weight is 0.
     """
+    if lens.port is not None:
+        return ported.pose_equations(lens, rotation, position, seen)
     return numpy_engine.pose_equations(lens, rotation, position, seen)
 
 
@@ -90,6 +97,8 @@ def localize(
     row (S, N): below 0 for padding; minimum: usable points that a view must have.  Returns also
     how many have not converged, which remain for the solver, and how many targets are flat.
     """
+    if lens.port is not None:
+        return None
     found: tuple[Localization, int, int] | None = _engine.localize(lens, seen, row, minimum, start)
     return found
 
@@ -102,6 +111,8 @@ def adjust_rigs(
     lenses, seen: of the left and right cameras, S * V views; state: rotation (S, V, 3, 3) and
     position (S, V, 3) of the right camera, (S, 3, 3) and (S, 3) of the left one in the right one.
     """
+    if any(lens.port is not None for lens in lenses):
+        return None
     rigs: Rigs | None = _engine.adjust_rigs(lenses, seen, state)
     return rigs
 

@@ -1,0 +1,206 @@
+"""Blind trials of the medium: `python -m benchmark.water --trials 120 --workers 2`.
+
+Cameras calibrated in air (another noise than that of the photographs, so that their lens is a
+little off) photograph a board through a tilted port into a hidden medium, or do not: decoys look
+through a plate with air on both sides, have another focal length or another curve.  Lens and
+table alone are handed to `diagnose`.  Rays are traced here by bisection, as nowhere else in the
+package.  Writes docs/water/trials.json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+KINDS = ('water', 'water', 'water', 'plate', 'focal', 'curve', 'air')
+_HALVINGS = 60
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a trial: what was hidden, and what was named."""
+
+    number: int
+    kind: str
+    free: bool
+    index: float
+    distance: float
+    tilt: float
+    thickness: float
+    noise: float
+    causes: list[str]
+    found: dict[str, list[float]]
+    rms_px: float
+    heldout_rms_px: float
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the trials, write them, print what came of them."""
+    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.water')
+    parser.add_argument('--trials', type=int, default=120)
+    parser.add_argument('--workers', type=int, default=os.cpu_count())
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/water/trials.json'))
+    asked = parser.parse_args(arguments)
+    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
+    outcomes = []
+    with (
+        progress('trials', asked.trials) as advance,
+        ProcessPoolExecutor(asked.workers, multiprocessing.get_context('spawn')) as pool,
+    ):
+        for outcome in pool.map(run_trial, range(asked.trials)):
+            outcomes.append(outcome)
+            advance()
+    lines = ',\n'.join(json.dumps(asdict(one)) for one in outcomes)
+    command = f'python -m benchmark.water --trials {asked.trials}'
+    asked.output.parent.mkdir(parents=True, exist_ok=True)
+    write_text(asked.output, f'{{"command": "{command}", "trials": [\n{lines}\n]}}\n')
+    sys.stdout.write(summary(outcomes))
+
+
+def summary(outcomes: Sequence[Outcome]) -> str:
+    """Return what came of the trials, in lines."""
+    lines = []
+    for kind in dict.fromkeys(KINDS):
+        mine = [one for one in outcomes if one.kind == kind]
+        named = [one for one in mine if 'medium_index' in one.found]
+        lines.append(f'{kind}: {len(mine)} trials, a medium named in {len(named)}')
+        if kind == 'water' and named:
+            off = np.array([one.found['medium_index'][0] / one.index - 1 for one in named])
+            pull = np.array([(one.found['medium_index'][0] - one.index)
+                             / one.found['medium_index'][1] for one in named
+                             if one.found['medium_index'][1] > 0])
+            lines.append(
+                f'  index within 1 %: {np.mean(np.abs(off) < 0.01):.3f}, median error '
+                f'{100 * np.median(np.abs(off)):.3f} %, worst {100 * np.abs(off).max():.2f} %; '
+                f'error over standard error, rms: {np.sqrt(np.mean(pull**2)):.2f}')
+            for name, truth in (('distance', [1e3 * one.distance for one in named]),):
+                error = np.abs(np.array([1e3 * one.found[name][0] for one in named]) - truth)
+                lines.append(f'  {name}: median error {np.median(error):.2f} mm')
+            other = [one for one in named if set(one.causes) - {'flat_port'}]
+            lines.append(f'  other causes beside it: {len(other)}')
+    return '\n'.join(lines) + '\n'
+
+
+def run_trial(number: int) -> Outcome:
+    """Run one trial; the same number always gives the same data."""
+    rng = np.random.default_rng([17, number])
+    kind = KINDS[number % len(KINDS)]
+    free = bool(number // len(KINDS) % 2)
+    lens, noise = _lens(rng), float(rng.choice([0.05, 0.1, 0.2, 0.4]))
+    index = float(rng.uniform(1.32, 1.36)) if kind == 'water' else 1.0
+    distance, thickness = rng.uniform(0.003, 0.09), rng.uniform(0.0, 0.012)
+    tilt = rng.normal(scale=0.03, size=2)
+    true = lens
+    if kind == 'focal':
+        true = replace(lens, fx=1.33 * lens.fx, fy=1.33 * lens.fy)
+    elif kind == 'curve':
+        true = replace(lens, image_height=IMAGE_HEIGHTS['stereographic'](), fx=1.15 * lens.fx,
+                       fy=1.15 * lens.fy)
+    see: Callable[[Array], Array] = lambda points: _central(true, points)  # noqa: E731
+    if kind in ('water', 'plate'):
+        def see(points: Array) -> Array:
+            return _through(true, points, distance, tilt, thickness, index)
+
+    seen = _photographs(true, see, noise, rng)
+    given = _calibrated(lens, rng, free)
+    found = diagnose(seen, given, free_intrinsics=free)
+    port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
+    values = {} if port is None else {
+        name: [entry['value'], entry['stderr']] for name, entry in port.parameters.items()
+    }
+    return Outcome(number, kind, free, index, float(distance), float(np.hypot(*tilt)),
+                   float(thickness), noise, [c.effect for c in found.causes], values,
+                   found.named.rms_px, found.named.heldout_rms_px)
+
+
+def _lens(rng: np.random.Generator) -> Lens:
+    """Return a fisheye lens: half a field of 60 to 85 degrees on 1280 x 960 px."""
+    half = np.radians(rng.uniform(60, 85))
+    curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004),
+                          rng.normal(scale=0.001))
+    f = 800 / float(curve.value_and_slope(np.array(half))[0])
+    return Lens('lens', 1280, 960, f, f * (1 + rng.normal(scale=1e-3)),
+                640 + rng.normal(scale=8), 480 + rng.normal(scale=8), curve, half)
+
+
+def _calibrated(lens: Lens, rng: np.random.Generator, free: bool) -> Lens:
+    """Return the lens as a calibration in air might have found it."""
+    off = 1 + rng.normal(scale=2e-4)
+    block = {'rms_px': 0.2} if free else None
+    return replace(lens, fx=lens.fx * off, fy=lens.fy * off, calibration=block,
+                   cx=lens.cx + rng.normal(scale=0.1), cy=lens.cy + rng.normal(scale=0.1))
+
+
+def _central(lens: Lens, points: Array) -> Array:
+    """Image points (N, 2), px, of points (N, 3), m, through a lens in air."""
+    r = np.linalg.norm(points[:, :2], axis=-1)
+    theta = np.arctan2(r, points[:, 2])
+    height = lens.image_height.value_and_slope(theta)[0] / np.maximum(r, 1e-12)
+    uv = np.array([lens.cx, lens.cy]) + height[:, None] * points[:, :2] * [lens.fx, lens.fy]
+    return np.where((theta < lens.max_incidence)[:, None], uv, np.nan)
+
+
+def _through(
+    lens: Lens, points: Array, distance: float, tilt: Array, thickness: float, index: float
+) -> Array:
+    """The same through a pane whose normal is tilted: bisection in the plane of each ray."""
+    normal = np.array([np.tan(tilt[1]), -np.tan(tilt[0]), 1.0])
+    normal /= np.linalg.norm(normal)
+    z = points @ normal
+    across = points - z[:, None] * normal
+    r = np.linalg.norm(across, axis=-1)
+    low, high = np.zeros_like(r), np.full_like(r, np.pi / 2)
+    for _ in range(_HALVINGS):
+        angle = (low + high) / 2
+        glass, medium = np.arcsin(np.sin(angle) / 1.5), np.arcsin(np.sin(angle) / index)
+        reached = (distance * np.tan(angle) + thickness * np.tan(glass)
+                   + (z - distance - thickness) * np.tan(medium))
+        low, high = np.where(reached < r, angle, low), np.where(reached < r, high, angle)
+    way = across / np.maximum(r, 1e-12)[:, None]
+    ray = np.cos(angle)[:, None] * normal + np.sin(angle)[:, None] * way
+    return np.where((z > distance + thickness)[:, None], _central(lens, ray), np.nan)
+
+
+def _photographs(
+    lens: Lens, see: Callable[[Array], Array], noise: float, rng: np.random.Generator
+) -> Observations:
+    """Return 10 to 24 photographs of a board, 70 % of it in the image at least."""
+    x, y = np.meshgrid(np.arange(11), np.arange(8))
+    size = rng.uniform(0.03, 0.06)
+    board = size * np.stack([x.ravel() - 5.0, y.ravel() - 3.5, 0.0 * x.ravel()], axis=-1)
+    frames, count = [], int(rng.integers(10, 25))
+    while len(frames) < count:
+        angle, azimuth = np.radians(rng.uniform(0, 45)), rng.uniform(0, 2 * np.pi)
+        away = size * 11 * np.exp(rng.uniform(np.log(0.8), np.log(4.0)))
+        place = away * np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
+                                 np.cos(angle)])
+        turn = rotation_from_vector(rng.normal(size=3) * [0.4, 0.4, 1.0])
+        uv = see(Pose(turn, place).transform(board)) + noise * rng.normal(size=(len(board), 2))
+        inside = ((uv > 0) & (uv < [lens.width, lens.height])).all(axis=-1)
+        if inside.mean() > 0.7:
+            frames.append((np.flatnonzero(inside), uv[inside]))
+    frame = np.concatenate([np.full(len(rows), i) for i, (rows, _) in enumerate(frames)])
+    rows = np.concatenate([rows for rows, _ in frames])
+    return make_observations(frame, rows, np.concatenate([uv for _, uv in frames]), board[rows])
+
+
+if __name__ == '__main__':
+    main()

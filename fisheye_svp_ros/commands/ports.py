@@ -1,0 +1,76 @@
+"""`--medium` and `--port`: what a camera looked through, and into."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from fisheye_svp_ros.errors import ParameterError
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.optics.ports import Port
+
+_FORMS = 'flat, flat:5mm:1.49 (glass and its index), dome:60mm, dome:60mm:4mm:1.5 (inner radius)'
+
+
+def add_port_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare --medium and --port."""
+    from fisheye_svp_ros.optics.ports import MEDIA
+
+    parser.add_argument('--medium', metavar='MEDIUM',
+                        help='what was between port and target: ' + ', '.join(MEDIA)
+                        + ' or a refractive index')
+    parser.add_argument('--port', metavar='SPEC',
+                        help=f'what the camera looked through: {_FORMS}; flat by default, its '
+                        'glass counted as air')
+
+
+def port_of(args: argparse.Namespace) -> Port | None:
+    """Return the port that the arguments speak of; None where they do not.
+
+    Raises ParameterError for a medium or port that cannot be.
+    """
+    if args.medium is None and args.port is None:
+        return None
+    from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
+
+    index = _index(args.medium or 'water')
+    kind, *numbers = (args.port or 'flat').split(':')
+    try:
+        if kind == 'flat' and len(numbers) <= 2:
+            port: Port = FlatGlass(0.0, index, **_glass(numbers))
+        elif kind == 'dome' and 1 <= len(numbers) <= 3:
+            port = DomeGlass(_length(numbers[0]), index, **_glass(numbers[1:]))
+        else:
+            raise ValueError
+    except ValueError as cause:
+        raise ParameterError(f'--port {args.port}: it must be of the form {_FORMS}') from cause
+    wrong = port.check()
+    if wrong:
+        raise ParameterError(f'--medium {args.medium or "water"}: {wrong}')
+    return port
+
+
+def _index(medium: str) -> float:
+    from fisheye_svp_ros.optics.ports import MEDIA
+
+    if medium in MEDIA:
+        return MEDIA[medium]
+    try:
+        return float(medium)
+    except ValueError as cause:
+        known = ', '.join(MEDIA)
+        raise ParameterError(
+            f'--medium {medium}: known are {known}, and refractive indices') from cause
+
+
+def _glass(numbers: list[str]) -> dict[str, float]:
+    glass = {'thickness': _length(numbers[0])} if numbers else {}
+    return glass | ({'glass_index': float(numbers[1])} if numbers[1:] else {})
+
+
+def _length(text: str) -> float:
+    """Return a length, m, of a text such as 5mm."""
+    if not text.endswith('mm'):
+        raise ValueError(text)
+    return 1e-3 * float(text.removesuffix('mm'))

@@ -1,0 +1,225 @@
+"""Another medium: a camera that was calibrated in air looks through a flat port into water.
+
+It changes the image by a third, which no linear test from air would find: its place is fitted
+from several starts before the search, the intrinsics held as they were in air, and it is named
+where that explains as well what a free lens curve would need a dozen numbers for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.budget import Component
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.evidence import block_basis, frame_folds, pseudo_inverse
+from fisheye_svp_ros.diagnosis.model import (
+    Data,
+    Linearised,
+    State,
+    chosen_views,
+    fit,
+    flat_rows,
+    start,
+)
+from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
+from fisheye_svp_ros.effects.flat_port import FlatPortEffect
+from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
+from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
+
+PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
+INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
+_UNITS = {INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
+          THICKNESS: 'm'}
+_SUSPECT = 1.0  # px: less than this is no third of the image
+_LARGER = 1.1  # than in air: what looks so much larger may be seen through a flat port
+_FEW = 12  # frames, enough for a start
+_TERMS = 8  # of a free lens curve
+_EXPLAINED = 0.98  # of what a free lens curve explains
+_WORSE = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
+_LIQUIDS = (1.30, 1.56)  # refractive indices of what one photographs through (water to oils)
+_TOLD = 0.02  # standard error above which the index is not told by the data
+
+
+@dataclass(frozen=True)
+class Medium:
+    """A port with another medium behind it, and the simulation in air that it takes the place of.
+
+    state, names: the fit, and what of the port was fitted; air: the simulation as it was, fitted;
+    p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well.
+    """
+
+    state: State
+    names: tuple[str, ...]
+    air: Linearised
+    free: tuple[str, ...]
+    p_value: float
+    share: float
+    alike: bool
+
+    def held_out(self) -> HeldOut:
+        """Predict parts of the frames in turn, in air."""
+        data, state = self.air.data, self.air.state
+        if not self.free:
+            return on_other_data(data, state)
+        part = frame_folds(data.frames)
+        squares, counts = np.zeros(data.frames), np.zeros(data.frames)
+        for fold in range(int(part.max()) + 1):
+            mine = part == fold
+            kept = chosen_views(data, ~mine[data.frame_of])
+            trained = fit(kept, replace(state, pose=state.pose.take(~mine)), self.free)
+            test = chosen_views(data, mine[data.frame_of])
+            near = replace(trained, pose=state.pose.take(mine))
+            squares[mine], counts[mine] = on_other_data(test, near)
+        return HeldOut(squares, counts)
+
+    def cause(self, stderr: dict[str, float], rms: float, gain: Gain) -> Cause:
+        """Return the cause; stderr by name; rms, gain: of held-out frames once it is in."""
+        values = self.state.lens.parameters
+        parameters = {
+            name.removeprefix('port_'): {
+                'value': float(values[name]), 'stderr': stderr.get(name, 0.0),
+                'unit': _UNITS[name],
+            } for name in _UNITS if name in (INDEX, *self.names)
+        }
+        form = f'{FlatPortEffect.name}(medium)'
+        return Cause(
+            FlatPortEffect.name, form, parameters, self.p_value, self.share, True, rms, gain.value,
+            [RadialProfileEffect.name] if self.alike else [], FlatPortEffect.to_separate,
+        )
+
+    def budget(self, parts: Sequence[Component]) -> list[Component]:
+        """Return the variance budget of the simulation in air from that behind the port."""
+        square = float(np.mean(self.air.residual[self.air.used] ** 2)) * self.share
+        square *= float(np.mean(1 / self.air.weight[self.air.weight > 0] ** 2))
+        left = 1 - self.share
+        parts = [p._replace(share=left * p.share, named_share=left * p.named_share) for p in parts]
+        own = Component('named_lens', 'lens', float(np.sqrt(square)), self.share, self.share,
+                        self.p_value)
+        for i, part in enumerate(parts):
+            if part.name == own.name:
+                parts[i] = part._replace(
+                    sd_px=float(np.hypot(part.sd_px, own.sd_px)), share=part.share + own.share,
+                    named_share=part.named_share + own.share, p_value=min(part.p_value, 0.0),
+                )
+                return parts
+        return [own, *parts]
+
+
+def find_medium(
+    data: Data, lens: Lens, base: State, free: Sequence[str], progress: Callable[[str], None]
+) -> Medium | None:
+    """Ask whether the camera looks through a flat port into another medium than air.
+
+    lens: as it was in air; base: the fit of the simulation with `free` intrinsics.
+    """
+    if lens.port is not None or data.cameras > 1:
+        return None
+    air = Linearised(data, base, free)
+    if not (_magnified(air, lens, base) if free else _rms_px(air) > _SUSPECT):
+        return None
+    progress('asking whether the camera looks into another medium')
+    curve = _free_curve(data, base)
+    if not (_magnified(air, lens, curve) or _rms_px(Linearised(data, curve, ())) > _SUSPECT):
+        return None
+    found = _behind_port(data, lens)
+    if found is None:
+        return None
+    state, names = found
+    if not _LIQUIDS[0] <= state.lens.parameters[INDEX] <= _LIQUIDS[1]:
+        return None
+    plain = Linearised(data, replace(base, lens=_held(lens, base.lens)), ())
+    before, after, least = (_cost(fitted) for fitted in (
+        Linearised(data, fit(data, plain.state, ()), ()), Linearised(data, state, ()),
+        Linearised(data, curve, ())))
+    rows = int(air.used.sum())
+    square = min(after, least) / rows
+    merits = (after / square + len(names) * np.log(rows),
+              least / square + (len(INTRINSICS) + _TERMS) * np.log(rows))
+    near = before - after > _EXPLAINED * (before - least) and after < _WORSE * least
+    if not (merits[0] < merits[1] or near):
+        return None
+    mine = _cost(air)
+    p_value = float(stats.chi2.sf((before - after) / square, len(names)))
+    return Medium(state, names, air, tuple(free), p_value, max(0.0, 1 - after / mine),
+                  bool(merits[1] < merits[0]))
+
+
+def _held(lens: Lens, fitted: Lens) -> Lens:
+    """Return the lens of a state with the intrinsics that it had in air."""
+    return replace(fitted, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy,
+                   image_height=lens.image_height)
+
+
+def _behind_port(data: Data, lens: Lens) -> tuple[State, tuple[str, ...]] | None:
+    """Fit the place of a port from several starts; free the index where the data tell it."""
+    chosen = np.linspace(0, data.frames - 1, min(_FEW, data.frames)).astype(int)
+    few = chosen_views(data, np.isin(data.frame_of, chosen))
+    tried: list[tuple[float, State]] = []
+    for port in FlatGlass(0.0, MEDIA['water']).starts():
+        try:
+            state = fit(few, start(few, replace(lens, port=port)), PLACE)
+        except GeometryError:
+            continue  # nothing of a view is seen through a port there
+        tried.append((_cost(Linearised(few, state, PLACE)), state))
+    if not tried or not np.isfinite(min(cost for cost, _ in tried)):
+        return None
+    best = min(tried, key=lambda one: one[0])[1]
+    state = fit(data, start(data, replace(lens, port=best.lens.port)), PLACE)
+    if not np.isfinite(_cost(Linearised(data, state, ()))):
+        return None
+    freed, errors, _ = _freed(data, state, (*PLACE, INDEX))
+    names: tuple[str, ...] = PLACE
+    if errors[-1] < _TOLD:
+        state, names = freed, (*PLACE, INDEX)
+    freed, errors, gain = _freed(data, state, (*names, THICKNESS))
+    # Glass of no thickness is part of the distance.
+    if freed.lens.parameters[THICKNESS] > 0 and gain > np.log(2 * len(data.observations)):
+        state, names = freed, (*names, THICKNESS)
+    return state, names
+
+
+def _freed(data: Data, state: State, names: tuple[str, ...]) -> tuple[State, Array, float]:
+    """Fit named parameters; return their standard errors, and the last one's likelihood ratio."""
+    freed = fit(data, state, names)
+    linear = Linearised(data, freed, names)
+    basis, clean = block_basis(linear.frame_columns), linear.shared_columns
+    flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
+    inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
+    square = _cost(linear) / int(linear.used.sum())
+    gain = (_cost(Linearised(data, state, ())) - _cost(linear)) / square
+    return freed, np.sqrt(np.diag(inverse) * square), gain
+
+
+def _free_curve(data: Data, base: State) -> State:
+    """Return the fit of a lens curve and a centre of any kind, in air."""
+    theta = Linearised(data, base, ()).scene.theta_max
+    known = [t for t in base.terms if t[0].name != RadialProfileEffect.name]
+    effect = RadialProfileEffect(_TERMS, round(theta, 6))
+    free = replace(base, terms=(*known, (effect, np.zeros(_TERMS))))
+    return fit(data, free, INTRINSICS)
+
+
+def _magnified(air: Linearised, lens: Lens, state: State) -> bool:
+    """Whether a fitted lens sees things larger than in air, as a port makes them."""
+    theta = np.array(0.5 * air.scene.theta_max)
+    model = Linearised(air.data, state, ()).model.lens
+    height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
+                     for one in (model, lens))
+    return height > _LARGER * known
+
+
+def _cost(linear: Linearised) -> float:
+    return float((linear.residual**2).sum())
+
+
+def _rms_px(linear: Linearised) -> float:
+    weight: Array = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+    used = weight > 0
+    return float(np.sqrt(2 * np.mean((linear.residual[used] / weight[used]) ** 2)))

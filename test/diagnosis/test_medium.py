@@ -1,0 +1,50 @@
+"""The medium is named where there is one, and nowhere else."""
+
+from dataclasses import replace
+
+import pytest
+from helpers.water import AIR, photographs
+
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.optics.ports import FlatGlass
+from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+
+PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
+CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})
+
+
+def medium_of(found):
+    return next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
+
+
+@pytest.mark.parametrize('lens', [AIR, CALIBRATED], ids=['fixed', 'free'])
+def test_water_is_named_and_measured(lens):
+    seen, other = photographs(AIR, PORT, 12), photographs(AIR, PORT, 5, seed=1)
+    found = diagnose(seen, lens, held_out=other, wanted=Wanted(quick=True))
+    cause = medium_of(found)
+    assert [c.effect for c in found.causes] == ['flat_port'] and found.verdict == 'explained'
+    for name in ('medium_index', 'distance', 'tilt_x', 'tilt_y'):
+        entry = cause.parameters[name]
+        assert abs(entry['value'] - getattr(PORT, name)) < 4 * entry['stderr']
+    assert cause.parameters['medium_index']['value'] == pytest.approx(1.34, rel=0.01)
+    assert found.extended.heldout_rms_px < 0.2 < found.base.heldout_rms_px
+    assert sum(c.share for c in found.components) == pytest.approx(1.0)
+    assert found.lens.port.medium_index == cause.parameters['medium_index']['value']
+    assert found.lens.fx == AIR.fx and found.gain.value > 0.9
+    assert 'air or another medium behind it' in verdict_sentences(found)[0]
+
+
+@pytest.mark.parametrize('true', [
+    replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy),
+    replace(AIR, port=FlatGlass(0.03, 1.0, 0.02, 0.0, 0.01)),
+], ids=['focal length', 'window in air'])
+def test_what_is_no_medium_is_not_called_one(true):
+    found = diagnose(photographs(true, true.port, 10), AIR, wanted=Wanted(quick=True))
+    assert found.causes and medium_of(found) is None
+
+
+def test_a_medium_can_be_ruled_out():
+    found = diagnose(photographs(AIR, PORT, 8), AIR,
+                     wanted=Wanted(left_out=('flat_port',), quick=True))
+    assert found.causes and all(c.effect != 'flat_port' for c in found.causes)
