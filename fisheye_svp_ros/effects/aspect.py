@@ -17,7 +17,6 @@ class AspectEffect(PlaneEffect):
 
     name = 'aspect'
     signature = 'residuals outward along one image axis and inward along the other'
-    confused_with = 'skew turned by 45 degrees, sensor_tilt in few views'
     to_separate = 'views turned about the axis by 45 and 90 degrees'
 
     parameters = (Parameter('relative', '1', 0.01),)

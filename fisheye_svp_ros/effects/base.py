@@ -112,7 +112,6 @@ class Effect(ABC):
     name: ClassVar[str]
     stage: ClassVar[str]
     signature: ClassVar[str]
-    confused_with: ClassVar[str]
     to_separate: ClassVar[str]
 
     @classmethod

@@ -24,7 +24,6 @@ class BoardPoseEffect(Effect):
     signature = (
         'residuals of a whole board that point to the same small motion of it in every view'
     )
-    confused_with = 'landmark_survey, target_shape of several boards'
     to_separate = 'views that show the board together with the others, from several sides'
 
     @classmethod

@@ -18,7 +18,6 @@ class DecenteringEffect(PlaneEffect):
     signature = (
         'residuals that grow with the square of the image height, strongest along one diameter'
     )
-    confused_with = 'sensor_tilt, principal_point'
     to_separate = 'landmarks over the whole field of view, to its edge, on all sides'
 
     parameters = (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))

@@ -20,7 +20,6 @@ class DetectorBiasEffect(Effect):
     name = 'detector_bias'
     stage = 'detector'
     signature = 'residuals that repeat with the fractional part of the image point'
-    confused_with = 'quantisation'
     to_separate = 'another detector, or the same images magnified'
 
     @classmethod

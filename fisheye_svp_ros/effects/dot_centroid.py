@@ -23,7 +23,6 @@ class DotCentroidEffect(Effect):
     name = 'dot_centroid'
     stage = 'image'
     signature = 'residuals across tilted boards that grow with the size of the dot in the image'
-    confused_with = 'radial_profile, viewpoint_shift on near and tilted boards'
     to_separate = 'dots of half the size, or corners instead of dots'
 
     @classmethod

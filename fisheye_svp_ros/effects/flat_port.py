@@ -29,7 +29,6 @@ class FlatPortEffect(Effect):
         'residuals along the radius that grow with the angle and with 1 / range, bounded by the '
         'thickness'
     )
-    confused_with = 'viewpoint_shift, radial_profile at one single range'
     to_separate = 'views beyond 60 degrees at clearly different ranges; look at the housing'
 
     @classmethod

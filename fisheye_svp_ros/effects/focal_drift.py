@@ -21,7 +21,6 @@ class FocalDriftEffect(PlaneEffect):
 
     name = 'focal_drift'
     signature = 'residuals in proportion to the image height that change smoothly with time'
-    confused_with = 'session_step, focal_length'
     to_separate = 'a longer recording with the temperature noted; frames well spread in time'
 
     @classmethod

@@ -15,7 +15,6 @@ class FocalLengthEffect(PlaneEffect):
 
     name = 'focal_length'
     signature = 'residuals along the radius in proportion to the image height'
-    confused_with = 'radial_profile, landmark_scale with known poses'
     to_separate = 'landmarks over the whole field of view; a calibration of this very camera'
 
     parameters = (Parameter('relative', '1', 0.02),)

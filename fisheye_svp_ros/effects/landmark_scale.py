@@ -21,10 +21,6 @@ class LandmarkScaleEffect(Effect):
     name = 'landmark_scale'
     stage = 'target'
     signature = 'residuals as if all landmarks had moved away from the centre of the target'
-    confused_with = (
-        'focal_length with known poses; with unknown poses one camera cannot see a uniform '
-        'scale'
-    )
     to_separate = 'measure one long distance on the target; a rig of known baseline; known poses'
 
     @classmethod

@@ -24,7 +24,6 @@ class LandmarkSurveyEffect(Effect):
     name = 'landmark_survey'
     stage = 'target'
     signature = 'residuals of one landmark that point to the same place in space from every view'
-    confused_with = 'target_shape, wrong_ids'
     to_separate = 'measure the named landmarks again, by other means or from other sides'
 
     @classmethod

@@ -16,7 +16,6 @@ class NoiseVsAngleEffect(NoiseEffect):
 
     name = 'noise_vs_angle'
     signature = 'residuals without a pattern whose scatter grows towards the edge'
-    confused_with = 'any unmodelled pattern near the edge of the field'
     to_separate = 'repeat the same view without moving anything: the scatter stays'
 
     parameters = (Parameter('growth', '1/rad^2', 0.5),)

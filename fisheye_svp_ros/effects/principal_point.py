@@ -18,7 +18,6 @@ class PrincipalPointEffect(Effect):
     name = 'principal_point'
     stage = 'image'
     signature = 'residuals with a constant part over the image that no turn of the camera takes up'
-    confused_with = 'decentering, sensor_tilt; with a narrow field, a turn of the camera'
     to_separate = 'landmarks over the whole field of view; views turned about the axis'
 
     parameters = (Parameter('cx', 'px', 10.0), Parameter('cy', 'px', 10.0))

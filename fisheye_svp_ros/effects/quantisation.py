@@ -16,7 +16,6 @@ class QuantisationEffect(NoiseEffect):
 
     name = 'quantisation'
     signature = 'every image point is a multiple of one step'
-    confused_with = 'detector_bias'
     to_separate = 'store the image points with more digits, or refine to sub-pixel'
 
     parameters = (Parameter('step', 'px', 1.0),)

@@ -23,7 +23,6 @@ class RadialProfileEffect(Effect):
     name = 'radial_profile'
     stage = 'ray'
     signature = 'residuals along the radius that depend on the angle alone, not on the range'
-    confused_with = 'focal_length, viewpoint_shift at one single range'
     to_separate = 'views of the same angles at clearly different ranges'
 
     @classmethod

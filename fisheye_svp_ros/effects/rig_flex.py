@@ -21,7 +21,6 @@ class RigFlexEffect(Effect):
     name = 'rig_flex'
     stage = 'pose'
     signature = 'residuals of one camera against the other that differ from frame to frame'
-    confused_with = 'stereo_time_offset, session_step'
     to_separate = 'a stiffer rig; frames with the rig unloaded and loaded'
 
     @classmethod

@@ -20,7 +20,6 @@ class RollingShutterEffect(Effect):
     signature = (
         'residuals that grow with the distance from the middle row and with the camera speed'
     )
-    confused_with = 'aspect and skew where the motion is always the same, stereo_time_offset'
     to_separate = 'the same scene from a tripod: the residuals vanish when nothing moves'
 
     @classmethod

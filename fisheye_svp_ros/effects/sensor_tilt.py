@@ -18,7 +18,6 @@ class SensorTiltEffect(PlaneEffect):
     signature = (
         'residuals along the radius, outward on one side of the image and inward on the other'
     )
-    confused_with = 'decentering, principal_point'
     to_separate = 'landmarks over the whole field of view, to its edge, on all sides'
 
     parameters = (Parameter('about_x', 'rad', 0.01), Parameter('about_y', 'rad', 0.01))

@@ -27,7 +27,6 @@ class SessionStepEffect(Effect):
     name = 'session_step'
     stage = 'image'
     signature = 'residuals that change at one frame and keep their new pattern'
-    confused_with = 'focal_drift, landmark_survey of landmarks seen in one group'
     to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 
     @classmethod

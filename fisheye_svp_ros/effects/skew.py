@@ -19,7 +19,6 @@ class SkewEffect(PlaneEffect):
         'residuals like a shear of the image: outward along one diagonal, inward along the '
         'other'
     )
-    confused_with = 'aspect turned by 45 degrees'
     to_separate = 'views turned about the axis by 45 and 90 degrees'
 
     parameters = (Parameter('shear', '1', 0.01),)

@@ -18,7 +18,6 @@ class StereoTimeOffsetEffect(Effect):
     name = 'stereo_time_offset'
     stage = 'pose'
     signature = 'residuals of one camera against the other that grow with the speed of the rig'
-    confused_with = 'rig_flex, rolling_shutter'
     to_separate = 'the same scene with the rig at rest; a flash of light seen by both cameras'
 
     @classmethod

@@ -29,9 +29,6 @@ class TargetShapeEffect(Effect):
         'residuals that keep to the board: the same place is off by the same height in every '
         'view'
     )
-    confused_with = (
-        'viewpoint_shift when the board is always met from near and squarely, landmark_survey'
-    )
     to_separate = (
         'turn the board about its normal and tilt it between views; measure its flatness with a '
         'ruler'

@@ -22,7 +22,6 @@ class ViewpointShiftEffect(Effect):
     name = 'viewpoint_shift'
     stage = 'ray'
     signature = 'residuals along the radius that grow with the angle and with 1 / range'
-    confused_with = 'radial_profile at one single range, flat_port, target_shape of a warped board'
     to_separate = (
         'views of the same angles at clearly different ranges, the nearest as near as possible; '
         'a target of known flatness'

@@ -16,7 +16,6 @@ class WrongIdsEffect(NoiseEffect):
 
     name = 'wrong_ids'
     signature = 'a few huge residuals that end where another landmark is predicted'
-    confused_with = 'landmark_survey where one landmark is always mistaken'
     to_separate = 'look at the named image points; match the ids again'
 
     parameters = (Parameter('fraction', '1', 0.02),)
