@@ -1,8 +1,19 @@
 """The errors of this package: one root, one subclass a kind of bad input."""
 
+import re
+
+_LONGEST = 1500  # characters; what is quoted may be a whole file
+_UNPRINTED = re.compile(r'\s*[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\s*')
+
 
 class FisheyeSvpError(Exception):
     """Root of all errors raised on purpose; its text is one line that names the remedy."""
+
+    def __init__(self, text: object = '') -> None:
+        text = str(text)
+        if len(text) > _LONGEST:
+            text = f'{text[:_LONGEST // 2]} ... {text[-_LONGEST // 2:]}'
+        super().__init__(_UNPRINTED.sub(' ', text))
 
 
 class LensError(FisheyeSvpError):

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
@@ -150,13 +150,15 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
 
 def _size_beside(path: Path) -> tuple[int, int] | None:
     """Return the image size that `detect` wrote beside its observations."""
-    import json
+    from fisheye_svp_ros.io.documents import read_json
 
-    try:
-        width, height = json.loads(path.with_suffix('.detect.json').read_text())['image_size']
-    except (OSError, ValueError, KeyError, TypeError):
+    beside = path.with_suffix('.detect.json')
+    if not beside.exists():
         return None
-    return int(width), int(height)
+    match read_json(beside, ObservationError).get('image_size'):
+        case [int(width), int(height)] if width > 0 < height:
+            return width, height
+    raise ObservationError(f'{beside}: image_size is not two whole numbers; give --image-size')
 
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import shutil
 from pathlib import Path
@@ -73,8 +72,11 @@ def run(args: argparse.Namespace) -> None:
 
 def _finished(folder: Path, mine: str) -> bool:
     """Say whether a folder holds the whole table of a sweep."""
+    from fisheye_svp_ros.errors import OutputError
+    from fisheye_svp_ros.io.documents import read_json
+
     summary = folder / _SUMMARY
-    return summary.exists() and json.loads(summary.read_text()).get('fingerprint') == mine
+    return summary.exists() and read_json(summary, OutputError).get('fingerprint') == mine
 
 
 def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
@@ -83,7 +85,7 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
     Return the engine for all of the sweep: the one that it was begun with.
     """
     from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.io.files import read_text, write_text
     from fisheye_svp_ros.optics import engines
 
     mark = parts.folder / _MARK
@@ -94,7 +96,7 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
     if not resume:
         raise OutputError(f'{parts.folder}: an interrupted sweep is there; --resume goes on with '
                           'it, or remove that folder')
-    theirs, _, engine = mark.read_text(encoding='utf-8').partition(' ')
+    theirs, _, engine = read_text(mark, OutputError).partition(' ')
     if theirs != mine:
         raise OutputError(f'{parts.folder}: another sweep was interrupted there; choose another '
                           '-o, or remove that folder')

@@ -20,6 +20,7 @@ from fisheye_svp_ros.detect.photographs import Photograph, Pixels, exif_turned
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
+from fisheye_svp_ros.io.files import read_bytes
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
@@ -130,8 +131,7 @@ def examine(task: _Task) -> Searched:
 def _turned(photograph: Photograph) -> bool:
     data = photograph.data
     if isinstance(data, Path):
-        with data.open('rb') as stream:
-            data = stream.read(65536)
+        data = read_bytes(data, ObservationError)
     return isinstance(data, bytes) and exif_turned(data)
 
 

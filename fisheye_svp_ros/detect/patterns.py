@@ -13,12 +13,13 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.files import read_yaml
+from fisheye_svp_ros.io.documents import read_yaml
 
 _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
-_SIZE = re.compile(r'([0-9]+)x([0-9]+)', re.IGNORECASE)
+_SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
 _LARGEST = 10_000  # points
+_TAGS = 587  # of the family 36h11
 _FURTHEST = 10.0  # m; a larger spacing is a slip of the unit
 
 
@@ -139,8 +140,13 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     if document.get('target_type') != 'aprilgrid':
         raise ParameterError(f'{path}: target_type is {document.get("target_type")!r}; the YAML '
                              'of a Kalibr aprilgrid is needed')
-    columns, rows = (int(_positive(document, name, path)) for name in ('tagCols', 'tagRows'))
-    tag, ratio = (_positive(document, name, path) for name in ('tagSize', 'tagSpacing'))
+    sides = [_positive(document, name, path, _TAGS) for name in ('tagCols', 'tagRows')]
+    columns, rows = map(int, sides)
+    if sides != [columns, rows] or columns * rows > _TAGS:
+        raise ParameterError(f'{path}: tagCols x tagRows is {sides[0]:g} x {sides[1]:g}; whole '
+                             f'numbers, and at most {_TAGS} tags, are needed')
+    tag = _positive(document, 'tagSize', path, _FURTHEST)
+    ratio = _positive(document, 'tagSpacing', path, _FURTHEST)
     # As Kalibr has it: x right, y up, tags and the corners of each from the lower left.
     corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
     tiles = _grid(columns, rows, tag * (1 + ratio))[:, None, :2] + tag * corner
@@ -185,10 +191,11 @@ def _length(spec: str, word: str) -> float:
     return value
 
 
-def _positive(document: dict[str, Any], name: str, path: Path) -> float:
+def _positive(document: dict[str, Any], name: str, path: Path, most: float) -> float:
     value = document.get(name)
-    if isinstance(value, bool) or not isinstance(value, int | float) or value <= 0:
-        raise ParameterError(f'{path}: {name} is {value!r}; a number above 0 is needed')
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value <= most:
+        raise ParameterError(f'{path}: {name} is {value!r}; a number above 0 and up to {most:g} '
+                             'is needed')
     return float(value)
 
 

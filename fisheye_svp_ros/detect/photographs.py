@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.files import read_bytes
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
@@ -60,7 +61,10 @@ class Photograph:
         """Return the image in grey; raise ObservationError, one line, where there is none."""
         if isinstance(self.data, np.ndarray):
             return self.data
-        return decoded(_read(self.data) if isinstance(self.data, Path) else self.data, self.name)
+        data = self.data
+        if isinstance(data, Path):
+            data = read_bytes(data, ObservationError)
+        return decoded(data, self.name)
 
 
 def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
@@ -148,13 +152,6 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
     return np.asarray(cv2.cvtColor(pixels.reshape(shape), grey))
 
 
-def _read(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as cause:
-        raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
-
-
 def _source(path: Path) -> Iterator[Photograph]:
     if not path.exists():
         raise ObservationError(f'{path}: there is no such file or folder; check the path')
@@ -197,6 +194,8 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 
 def _video(path: Path) -> Iterator[Photograph]:
+    if not path.is_file():
+        raise ObservationError(f'{path}: not a regular file; give one')
     video = cv2.VideoCapture(str(path))
     rate = video.get(cv2.CAP_PROP_FPS) or 30.0
     number = 0
@@ -212,14 +211,9 @@ def _video(path: Path) -> Iterator[Photograph]:
 
 def _recording(path: Path) -> Iterator[Photograph]:
     kinds = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
-    topics: set[str] = set()
-
-    def wanted(topic: str, kind: str) -> bool:
-        if kind in kinds:
-            topics.add(topic)
-        return kind in kinds
-
-    for record in Bag(path).records(wanted):
+    bag = Bag(path)
+    topics = {topic for topic, kind in bag.topics() if kind in kinds}
+    for record in bag.records(lambda _, kind: kind in kinds):
         if record.topic.removesuffix(_COMPRESSED) in topics - {record.topic}:
             continue  # the same images once more
         stamp = record.message.header.stamp

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import time
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
@@ -26,9 +26,11 @@ from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.mcap import RawMessage, whole_messages
+from fisheye_svp_ros.io.files import read_text
+from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
 
 _FLUSH_EVERY = 1.0  # s
+_SHOWN = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _FOREVER = QosTime(9223372036, 854775807)  # as rmw has it
 
@@ -139,68 +141,82 @@ class Bag:
             raise BagError(f'{path}: there is no such recording; check the path')
         if self.path.is_dir() and not self._files():
             raise BagError(f'{path}: no .mcap or .db3 file in this folder')
+        if odd := [file for file in self._files() if not file.is_file()]:
+            raise BagError(f'{odd[0]}: not a regular file')
 
     def records(self, wanted: Callable[[str, str], bool]) -> Iterator[Record]:
         """Yield the messages for which `wanted(topic, typename)` holds, in the order of time.
 
-        Of a recording that was cut short everything whole is yielded, and `damage` is set.
-        Raises BagError where nothing can be read.
+        Of a recording that was cut short or damaged everything whole is yielded, and in the end
+        `damage` says so.  Raises BagError where nothing can be read.
         """
         store = _types()
-        for topic, typename, when, data in self._raw(wanted):
+        notes: list[str] = []
+        for topic, typename, when, data in self._raw(notes.append):
+            if typename not in store.fielddefs or not wanted(topic, typename):
+                continue
             try:
                 message = store.deserialize_cdr(data, typename)
             except Exception as cause:
-                self.damage = f'a message on {topic} cannot be read ({cause})'
+                notes.append(f'a message on {topic} cannot be read ({cause})')
                 continue
             yield Record(topic, typename, when, message)
+        if notes:
+            more = f' and {len(notes) - _SHOWN} more' if len(notes) > _SHOWN else ''
+            self.damage = ('it is damaged: only what is whole is read; '
+                           + '; '.join(notes[:_SHOWN]) + more)
+
+    def topics(self) -> set[tuple[str, str]]:
+        """Return what topics there are, and of which types.
+
+        Raises BagError where nothing can be read.
+        """
+        listed = [listed_topics(file) for file in self._files()]
+        if all(topics for topics in listed):
+            return set().union(*listed)
+        return {(message.topic, message.typename) for message in self._raw(lambda _: None)}
 
     def _files(self) -> list[Path]:
-        return sorted([*self.path.glob('*.mcap'), *self.path.glob('*.db3')])
+        """Return the files of the recording, by the numbers in their names."""
+        files = [self.path] if self.path.is_file() else [
+            *self.path.glob('*.mcap'), *self.path.glob('*.db3')]
+        return sorted(files, key=lambda file: [
+            (int(word), '') if word.isdecimal() else (0, word)
+            for word in re.split(r'(\d+)', file.name)])
 
-    def _raw(self, wanted: Callable[[str, str], bool]) -> Iterator[RawMessage]:
-        """Yield messages one by one; from where an index fails on, what is whole."""
-        known, last = _types().fielddefs, -1
-        came: Counter[tuple[str, str]] = Counter()
-        at_last = 0
+    def _raw(self, note: Callable[[str], None]) -> Iterator[RawMessage]:
+        """Yield all messages; raise BagError where nothing is whole."""
+        files, problems, count = self._files(), [], 0
+
+        def say(problem: str) -> None:
+            problems.append(problem)
+            note(problem)
+
+        plain = all(file.suffix != '.db3' for file in files) and not self._is_compressed()
+        sources = [whole_messages(file, say) for file in files] if plain else [self._read(say)]
+        for messages in sources:
+            for message in messages:
+                count += 1
+                yield message
+        if problems and not count:
+            raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
+                           f'({"; ".join(problems[:_SHOWN])})')
+
+    def _read(self, note: Callable[[str], None]) -> Iterator[RawMessage]:
+        """Yield the messages of a recording that has no checksums, or is compressed as files."""
         try:
             with Reader(self.path) as reader:
-                connections = [
-                    c for c in reader.connections
-                    if c.msgtype in known and wanted(c.topic, c.msgtype)
-                ]
-                for connection, when, data in (
-                    reader.messages(connections) if connections else ()
-                ):
-                    at_last = at_last + 1 if when == last else 1
-                    last = when
-                    came[connection.topic, connection.msgtype] += 1
+                for connection, when, data in reader.messages():
                     yield RawMessage(connection.topic, connection.msgtype, when, bytes(data))
-                missing = sum(c.msgcount for c in connections) - sum(came.values())
-                if missing > 0:
-                    self.damage = f'its index is damaged: {missing} messages are not found'
-            return
         except Exception as cause:
-            self.damage = f'it is damaged: only what is whole is read ({cause})'
-        yield from self._whole(wanted, last, at_last)
+            note(f'it cannot be read on ({cause or type(cause).__name__})')
 
-    def _whole(
-        self, wanted: Callable[[str, str], bool], last: int, at_last: int
-    ) -> Iterator[RawMessage]:
-        """Yield what is whole after the first `at_last` messages of the time `last`."""
-        files = [self.path] if self.path.is_file() else self._files()
-        notes: list[str] = []
-        known = _types().fielddefs
-        whole = [m for file in files if file.suffix == '.mcap'
-                 for m in whole_messages(file, notes.append)]
-        if not whole and last < 0:
-            raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
-                           f'({self.damage})')
-        if notes:
-            self.damage = f'it is damaged: only what is whole is read; {"; ".join(notes[:3])}'
-        chosen = sorted((m for m in whole if m.time >= last and m.typename in known
-                         and wanted(m.topic, m.typename)), key=lambda m: m.time)
-        yield from chosen[min(at_last, sum(m.time == last for m in chosen)):]
+    def _is_compressed(self) -> bool:
+        """Whether the messages themselves are compressed, as rosbag2 can do it."""
+        about = self.path / 'metadata.yaml'
+        text = read_text(about, BagError) if about.is_file() else ''
+        found = re.search('compression_mode: *["\']?(message|file)', text, re.IGNORECASE)
+        return found is not None
 
 
 def _profile(offered: Offered) -> Qos:

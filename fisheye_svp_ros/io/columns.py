@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cache
@@ -16,9 +17,14 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError, OutputError
 from fisheye_svp_ros.io.csv_table import CsvTable
-from fisheye_svp_ros.io.files import replacing, write_text
+from fisheye_svp_ros.io.documents import read_json
+from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
+_MOST_CELLS = 100_000_000
+
+_WHOLE = re.compile(r'[+-]?[0-9]{1,18}')
+_NUMBER = re.compile(r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE)
 
 Columns = Mapping[str, Sequence[Any]]
 
@@ -73,10 +79,13 @@ class Parts:
     def _read(self, number: int) -> Columns:
         path = self._path(number)
         try:
-            part: dict[str, list[Any]] = json.loads(path.read_text(encoding='utf-8'))
+            part: dict[str, list[Any]] = read_json(path, OutputError)
             if {*part} != {*self._types} or len({*map(len, part.values())}) != 1:
                 raise ValueError('its columns are others')
-        except (OSError, ValueError, TypeError, AttributeError) as cause:
+            for name, kind in self._types.items():
+                if not all(type(cell) in (kind, type(None)) for cell in part[name]):
+                    raise ValueError(f'{name} holds other values than {kind.__name__}')
+        except (OutputError, ValueError, TypeError) as cause:
             raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
                               'compute it anew') from cause
         return part
@@ -103,20 +112,34 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
     pyarrow, problem = arrow()
     if pyarrow is None:
         raise OutputError(f'{path}: {problem}; give the .csv beside it')
+    data = read_bytes(path, OutputError)
     try:
-        columns: dict[str, list[Any]] = pyarrow.parquet.read_table(path).to_pydict()
-    except (OSError, pyarrow.ArrowException) as cause:
-        raise OutputError(f'{path}: not a table ({str(cause).splitlines()[0]})') from cause
-    return columns
+        file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(data),
+                                           page_checksum_verification=True)
+        if file.metadata.num_rows * file.metadata.num_columns > _MOST_CELLS:
+            raise ValueError(f'more than {_MOST_CELLS} cells')
+        return {name: _plain(pyarrow, file.read([name]).column(name))
+                for name in file.schema_arrow.names}
+    except Exception as cause:  # whatever pyarrow makes of what is damaged
+        raise OutputError(f'{path}: not a table ({cause or type(cause).__name__})') from cause
+
+
+def _plain(pyarrow: Any, column: Any) -> list[Any]:
+    """Return a column of numbers or text; None is an empty cell."""
+    kinds = pyarrow.types
+    if not any(test(column.type) for test in (
+            kinds.is_integer, kinds.is_floating, kinds.is_string, kinds.is_large_string,
+            kinds.is_boolean, kinds.is_null)):
+        raise ValueError(f'a column of {column.type}; numbers and text are read')
+    cells: list[Any] = column.to_pylist()
+    return cells
 
 
 def typed(cells: Sequence[str | None]) -> list[Any]:
     """Return whole numbers or numbers where every cell is one or empty; the text otherwise."""
-    for kind in (int, float):
-        try:
+    for kind, form in ((int, _WHOLE), (float, _NUMBER)):
+        if all(not cell or form.fullmatch(cell) for cell in cells):
             return [kind(cell) if cell else None for cell in cells]
-        except ValueError:
-            continue
     return list(cells)
 
 
@@ -157,7 +180,8 @@ def _to_parquet(
     for part in parts:
         pending.append(pyarrow.table(dict(part), schema=schema))
         if writer is None:
-            writer = pyarrow.parquet.ParquetWriter(path, pending[0].schema)
+            writer = pyarrow.parquet.ParquetWriter(path, pending[0].schema,
+                                                   write_page_checksum=True)
         if sum(map(len, pending)) >= _ROWS:
             table = pyarrow.concat_tables(pending)
             whole = len(table) // _ROWS * _ROWS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.io.files import read_text, write_text
 
 
 class CsvTable:
@@ -25,24 +25,21 @@ class CsvTable:
         self._lines: list[int] = []
         rows = []
         try:
-            with path.open(newline='', encoding='utf-8-sig') as stream:
-                reader = csv.reader(stream)
-                self._header = [name.strip() for name in next(reader, [])]
-                self._check_header(required)
-                for row in reader:
-                    if not row:
-                        continue
-                    if len(row) != len(self._header):
-                        raise ObservationError(
-                            f'{path}, line {reader.line_num}: {len(row)} fields where the header '
-                            f'has {len(self._header)}'
-                        )
-                    rows.append(row)
-                    self._lines.append(reader.line_num)
-        except OSError as cause:
-            raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
-        except (UnicodeDecodeError, csv.Error) as cause:
-            raise ObservationError(f'{path}: not a CSV file in UTF-8 ({cause})') from cause
+            reader = csv.reader(io.StringIO(read_text(path, ObservationError), newline=''))
+            self._header = [name.strip() for name in next(reader, [])]
+            self._check_header(required)
+            for row in reader:
+                if not row:
+                    continue
+                if len(row) != len(self._header):
+                    raise ObservationError(
+                        f'{path}, line {reader.line_num}: {len(row)} fields where the header '
+                        f'has {len(self._header)}'
+                    )
+                rows.append(row)
+                self._lines.append(reader.line_num)
+        except csv.Error as cause:
+            raise ObservationError(f'{path}: not a CSV file ({cause})') from cause
         if not rows:
             raise ObservationError(f'{path}: no row below the header; at least one is needed')
         self._columns = dict(zip(self._header, zip(*rows, strict=True), strict=True))
@@ -62,11 +59,11 @@ class CsvTable:
         """Return columns as finite numbers, (N, len(names))."""
         return np.stack([self._numbers(name) for name in names], axis=-1)
 
-    def whole(self, name: str) -> Index:
-        """Return a column of whole numbers (N,), 0 or above."""
+    def whole(self, name: str, most: int = 2**53) -> Index:
+        """Return a column of whole numbers (N,) from 0 to `most`."""
         values = self._numbers(name)
-        bad = (values != np.floor(values)) | (values < 0) | (values > 2**53)
-        self.refuse(bad, name, 'a whole number from 0 up')
+        bad = (values != np.floor(values)) | (values < 0) | (values > most)
+        self.refuse(bad, name, f'a whole number from 0 to {most}')
         return values.astype(np.int64)
 
     def refuse(self, bad: Sequence[bool] | Mask, name: str, needed: str) -> None:

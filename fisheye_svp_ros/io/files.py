@@ -1,76 +1,108 @@
-"""Files: read YAML with errors that name the file, write so that nothing is left half-written."""
+"""Files: read whole and within bounds, written so that nothing is left half-written."""
 
 from __future__ import annotations
 
 import os
-import re
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
-from typing import Any
-
-import yaml
 
 from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
 
+LARGEST = 1 << 30  # bytes of a table or a photograph
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 as PyYAML reads it, but with 1e-3 as the number that it is in ROS and YAML 1.2."""
-
-
-_Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$'),
-    list('-+0123456789'),
-)
+_PIECE = 1 << 20  # bytes
+_waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
 
 
-def read_yaml(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
-    """Return the mapping a YAML file holds; raise `error`, naming file and line, if it cannot."""
+def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = LARGEST) -> bytes:
+    """Return what a regular file holds; raise `error` for any other, and above `most` bytes."""
     try:
-        document = yaml.load(Path(path).read_text(encoding='utf-8'), _Loader)
-    except OSError as cause:
-        raise error(f'{path}: cannot be read ({cause.strerror}); check the path') from cause
+        # Unlike Path.open, this does not wait for whoever writes into a pipe.
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as stream:
+            found = os.fstat(stream.fileno())
+            if not stat.S_ISREG(found.st_mode):
+                raise error(f'{path}: not a regular file; give one')
+            size, data = found.st_size, bytearray()
+            while size <= most and (piece := stream.read(_PIECE)):
+                data += piece
+                size = max(size, len(data))
+    except (OSError, ValueError) as cause:
+        reason = getattr(cause, 'strerror', None) or cause
+        raise error(f'{path}: cannot be read ({reason}); check the path') from cause
+    if size > most:
+        raise error(f'{path}: above {most / (1 << 20):g} MB, which is more than is read')
+    return bytes(data)
+
+
+def read_text(path: str | Path, error: type[FisheyeSvpError], most: int = LARGEST) -> str:
+    """Return the text of a regular file in UTF-8; raise `error` as `read_bytes` does."""
+    try:
+        return read_bytes(path, error, most).decode('utf-8-sig')
     except UnicodeDecodeError as cause:
-        raise error(f'{path}: not a text file; a YAML file in UTF-8 is expected') from cause
-    except yaml.YAMLError as cause:
-        mark = getattr(cause, 'problem_mark', None)
-        line = f' at line {mark.line + 1}' if mark else ''
-        problem = getattr(cause, 'problem', None) or 'cannot be parsed'
-        raise error(f'{path}: broken YAML{line}: {problem}') from cause
-    if not isinstance(document, dict):
-        raise error(f'{path}: a YAML mapping is expected, found {type(document).__name__}')
-    return document
+        raise error(f'{path}: not a text file; one in UTF-8 is expected') from cause
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside `path`; rename it to `path` when the block succeeds.
 
-    Raises OutputError, naming the path, where it cannot be written.
+    In a block of `together`, when that succeeds.  Raises OutputError, naming the path, where it
+    cannot be written.
     """
-    target = Path(path)
+    target, waiting = Path(path), _waiting.get()
     if target.exists() and not target.is_file():
         raise OutputError(f'{path}: it is there and not a regular file; choose another name')
+    temporary = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(
             prefix=f'.{target.name}.', suffix=target.suffix, dir=target.parent
         )
         os.close(handle)
-    except OSError as cause:
-        raise OutputError(f'{path}: cannot be written ({cause.strerror})') from cause
-    temporary = Path(name)
-    try:
+        temporary = Path(name)
         yield temporary
         temporary.chmod(0o666 & ~_umask())
         with temporary.open('rb') as written:
             os.fsync(written)  # else a power cut leaves the new name with no content
-        temporary.replace(target)
+        if waiting is None:
+            temporary.replace(target)
+        else:
+            waiting[target], temporary = temporary, waiting.pop(target, None)
     except OSError as cause:
         raise OutputError(f'{path}: cannot be written ({cause.strerror or cause})') from cause
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def together() -> Iterator[None]:
+    """Have all files that are written in the block appear when it succeeds, or none of them."""
+    if _waiting.get() is not None:
+        yield
+        return
+    waiting: dict[Path, Path] = {}
+    token = _waiting.set(waiting)
+    try:
+        yield
+        for target, temporary in waiting.items():
+            try:
+                temporary.replace(target)
+            except OSError as cause:
+                raise OutputError(f'{target}: cannot be written ({cause.strerror})') from cause
+    finally:
+        _waiting.reset(token)
+        for temporary in waiting.values():
+            temporary.unlink(missing_ok=True)
+
+
+def written(path: Path) -> Path:
+    """Return where a file is that was written before, if need be in this block of `together`."""
+    return (_waiting.get() or {}).get(path, path)
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -8,9 +8,9 @@ import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.csv_table import CsvTable
-from fisheye_svp_ros.io.files import read_yaml
+from fisheye_svp_ros.io.documents import read_yaml
 from fisheye_svp_ros.io.share import config_path
-from fisheye_svp_ros.scene.landmarks import SPREADS, Landmarks, check_landmarks
+from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK, SPREADS, Landmarks, check_landmarks
 
 
 def environment(spread: str, radius: float, layout: str | Path | None = None) -> Landmarks:
@@ -51,5 +51,5 @@ def load_landmarks(path: str | Path) -> Landmarks:
     Raises ObservationError naming file, line and column.
     """
     table = CsvTable(Path(path), ('landmark', 'x', 'y', 'z'))
-    landmarks = Landmarks(table.whole('landmark'), table.numbers('x', 'y', 'z'))
+    landmarks = Landmarks(table.whole('landmark', MOST_LANDMARK), table.numbers('x', 'y', 'z'))
     return check_landmarks(landmarks, str(path))

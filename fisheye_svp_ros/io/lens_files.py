@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import yaml
 
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.files import read_yaml, write_text
+from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
+from fisheye_svp_ros.io.files import read_text, write_text
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
@@ -27,6 +27,8 @@ C = TypeVar('C', bound=Curve)
 
 _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
            'target', 'calibration', 'provenance'}
+_LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
+_MOST = 1e12  # any number of a lens
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
@@ -35,28 +37,30 @@ def load_lens(path: str | Path) -> Lens:
 
     Raises LensError, naming file and field, for anything impossible.
     """
-    foreign = read_lens_file(path)
-    if foreign is None:
-        return lens_from_dict(read_yaml(path, LensError), str(path))
-    camera = str(path).partition('#')[2] or next(iter(foreign.lenses), '')
-    if camera not in foreign.lenses:
-        raise LensError(f'{path}: no camera {camera!r} in it; it has {", ".join(foreign.lenses)}')
-    return foreign.lenses[camera]
+    text, camera = _read(path)
+    foreign = read_foreign(path, text)
+    if foreign is None and not camera:
+        return lens_from_dict(parse_yaml(text, path, LensError), str(path))
+    lenses = foreign.lenses if foreign else {}
+    camera = camera or next(iter(lenses), '')
+    if camera not in lenses:
+        raise LensError(f'{path}: no camera {camera!r} in it; it has '
+                        + (', '.join(lenses) or 'one without a name'))
+    return lenses[camera]
 
 
 def read_lens_file(path: str | Path) -> Foreign | None:
-    """Return the lenses of a file that another tool wrote; None for any other file."""
-    try:
-        text = Path(str(path).partition('#')[0]).read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError):
-        return None
-    return read_foreign(path, text)
+    """Return the lenses of a file that another tool wrote; None for a lens YAML.
+
+    Raises LensError, naming file and field, for anything impossible.
+    """
+    return read_foreign(path, _read(path)[0])
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:
     """Write a lens YAML that `load_lens` reads back to the same lens."""
     document = lens_to_dict(lens)
-    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=99))
+    write_text(path, dump_yaml(document, default_flow_style=None, width=99))
 
 
 def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
@@ -110,6 +114,12 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
     if lens.calibration is not None:
         document['calibration'] = dict(lens.calibration)
     return document
+
+
+def _read(path: str | Path) -> tuple[str, str]:
+    """Return the text of a file and the camera after its name, as in FILE#cam1."""
+    file, _, camera = str(path).rpartition('#') if '#' in str(path) else (str(path), '', '')
+    return read_text(file, LensError, _LARGEST), camera
 
 
 def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -202,6 +212,8 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
     value = mapping.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise LensError(f'{where}: {name} is {value!r}; a number is needed')
+    if not abs(value) < _MOST:
+        raise LensError(f'{where}: {name} is {value}; a number below {_MOST:g} is needed')
     return float(value)
 
 
@@ -213,9 +225,9 @@ def _pixels(mapping: Mapping[str, Any], name: str, where: str) -> int:
 
 
 def _vector(values: Any, where: str) -> list[float]:
-    if not isinstance(values, list) or not all(isinstance(v, int | float) for v in values):
+    if not isinstance(values, list):
         raise LensError(f'{where} must be a list of numbers, is {values!r}')
-    return [float(value) for value in values]
+    return [_number({'a value': value}, 'a value', where) for value in values]
 
 
 def _refuse_unknown(

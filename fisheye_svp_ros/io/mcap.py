@@ -1,23 +1,30 @@
-"""What is whole in an MCAP file that was cut short or damaged.
+"""The messages of an MCAP file, as far as they are whole: cut short, damaged or neither.
 
-Readers of MCAP trust the index at its end; here every chunk is looked at on its own, and believed
-where its checksum fits.  Source: mcap.dev/spec.
+Readers of MCAP trust the index at its end, which has no checksum in many a file; here the file is
+read from its beginning, and a chunk is believed where its checksum fits.  Source: mcap.dev/spec.
 """
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
+import lz4.frame
+import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Channel, Chunk, Message, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
-_LARGEST = 1 << 30  # bytes of a record that is taken for one
+_MAGIC = b'\x89MCAP0\r\n'
+_HEAD = struct.Struct('<BQ')  # of a record: opcode, length
+_LARGEST = 1 << 28  # bytes of a chunk, decompressed
+
+_Note = Callable[[str], None]
 
 
 class RawMessage(NamedTuple):
@@ -29,77 +36,151 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-def whole_messages(path: Path, note: Callable[[str], None]) -> Iterator[RawMessage]:
-    """Yield every whole message of an MCAP file, in the order of the file.
+def whole_messages(path: Path, note: _Note) -> Iterator[RawMessage]:
+    """Yield every whole message of an MCAP file; by time, within chunks that follow each other.
 
     note: told what is damaged, and where.
     """
+    held: list[RawMessage] = []
+    for batch in _batches(path, note):
+        first = min(message.time for message in batch)
+        yield from (message for message in held if message.time <= first)
+        rest = (message for message in held if message.time > first)
+        held = sorted((*rest, *batch), key=lambda message: message.time)
+    yield from held
+
+
+def listed_topics(path: Path) -> set[tuple[str, str]]:
+    """Return the topics and types that the summary of an MCAP file lists; empty without one."""
+    with path.open('rb') as stream:
+        summary = _summary(stream)
+    if summary is None:
+        return set()
+    return {(channel.topic, schema.name) for channel in summary.channels.values()
+            if (schema := summary.schemas.get(channel.schema_id))}
+
+
+def _batches(path: Path, note: _Note) -> Iterator[list[RawMessage]]:
+    """Yield the messages of each chunk that holds any."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
+    count, promised = 0, None
     with path.open('rb') as stream:
-        for record in _records(stream, note):
-            if isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                channels[record.id] = record.topic, schemas.get(record.schema_id, '')
-            elif isinstance(record, Message) and record.channel_id in channels:
-                yield RawMessage(*channels[record.channel_id], record.log_time, record.data)
+        for records in _groups(stream, path.stat().st_size, note):
+            batch = []
+            for record in records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = record.topic, schemas.get(record.schema_id, '')
+                elif isinstance(record, Statistics):
+                    promised = record.message_count
+                elif record.channel_id in channels:
+                    where = channels[record.channel_id]
+                    batch.append(RawMessage(*where, record.log_time, record.data))
+            count += len(batch)
+            if batch:
+                yield batch
+    if promised not in (None, count):
+        note(f'{promised} messages were written, {count} are found')
 
 
-def _records(stream: IO[bytes], note: Callable[[str], None]) -> Iterator[Any]:
-    place = 0
-    try:
-        for record in StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records:
-            if isinstance(record, Chunk):
-                yield from _contents(record, f'the chunk that ends at byte {stream.tell()}', note)
-            else:
-                yield record
-            place = stream.tell()
-        return
-    except Exception as cause:
-        note(f'from byte {place} on it cannot be followed ({cause or "its end is missing"})')
-    for start in sorted({place, *(s for s in _indexed_chunks(stream) if s > place)}):
-        stream.seek(start)
-        if stream.read(9)[:1] != bytes([Opcode.CHUNK]):
-            continue
-        where = f'the chunk at byte {start}'
-        try:
-            chunk = Chunk.read(ReadDataStream(stream))
-        except Exception as cause:
-            note(f'{where} cannot be read ({cause})')
-            continue
-        yield from _contents(chunk, where, note)
+def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
+    """Yield the records of each chunk, and each record that is in none, as lists."""
+    place, data = len(_MAGIC), True
+    if stream.read(place) != _MAGIC:
+        note('it does not begin as an MCAP file does')
+    while head := stream.read(_HEAD.size):
+        opcode, length = _HEAD.unpack(head.ljust(_HEAD.size, b'\0'))
+        body = stream.read(min(length, size))
+        if len(body) < length or len(head) < _HEAD.size:
+            if opcode == Opcode.CHUNK:
+                yield _contents(body, f'the chunk at byte {place}', note)
+            break
+        if opcode == Opcode.FOOTER:
+            return
+        # What the summary repeats of the data is not looked at.
+        data = data and opcode != Opcode.DATA_END
+        if opcode == Opcode.CHUNK and data:
+            yield _contents(body, f'the chunk at byte {place}', note)
+        elif opcode == Opcode.STATISTICS or data:
+            yield _parsed(opcode, body, f'the record at byte {place}', note)
+        place = stream.tell()
+    note(f'from byte {place} on it cannot be followed')
+    for start in _indexed_chunks(stream):
+        if place < start < size:
+            stream.seek(start)
+            opcode, length = _HEAD.unpack(stream.read(_HEAD.size).ljust(_HEAD.size, b'\0'))
+            if opcode == Opcode.CHUNK:
+                body = stream.read(min(length, size))
+                yield _contents(body, f'the chunk at byte {start}', note)
 
 
 def _indexed_chunks(stream: IO[bytes]) -> list[int]:
     """Return where the index at the end of a file says that chunks start; empty without one."""
-    try:
-        stream.seek(0)
-        summary = make_reader(stream).get_summary()
-    except Exception:
-        return []
+    summary = _summary(stream)
     return sorted(c.chunk_start_offset for c in summary.chunk_indexes) if summary else []
 
 
-def _contents(chunk: Chunk, where: str, note: Callable[[str], None]) -> list[Any]:
+def _summary(stream: IO[bytes]) -> Any:
+    try:
+        stream.seek(0)
+        return make_reader(stream).get_summary()
+    except Exception:  # whatever mcap makes of what is damaged, or no MCAP file at all
+        return None
+
+
+def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
     """Return the records of a chunk; of one that is cut short, where it is not compressed."""
     try:
-        if chunk.compression or len(chunk.data) == chunk.uncompressed_size:
-            return breakup_chunk(chunk, validate_crc=True)
+        chunk = Chunk.read(ReadDataStream(BytesIO(body)))
+        data = _decompressed(chunk)
     except Exception as cause:
-        note(f'{where} is damaged ({cause})')
+        note(f'{where} is damaged ({cause or type(cause).__name__})')
         return []
-    note(f'{where} is cut short')
-    data, records = ReadDataStream(BytesIO(chunk.data)), []
-    kinds: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel}
-    while data.count + 9 <= len(chunk.data):
-        kind, size = data.read1(), data.read8()
-        if data.count + size > len(chunk.data):
-            break
-        if kind == Opcode.MESSAGE:
-            records.append(Message.read(data, size))
-        elif kind in kinds:
-            records.append(kinds[kind].read(data))
-        else:
-            data.read(size)
+    if len(data) < chunk.uncompressed_size and not chunk.compression:
+        note(f'{where} is cut short')
+    elif chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+        note(f'{where} is damaged (its checksum does not fit)')
+        return []
+    records, place = [], 0
+    while place + _HEAD.size <= len(data):
+        opcode, length = _HEAD.unpack_from(data, place)
+        place += _HEAD.size + length
+        if place <= len(data):
+            records += _parsed(opcode, data[place - length:place], where, note)
     return records
+
+
+def _decompressed(chunk: Chunk) -> bytes:
+    """Return the data of a chunk; raise ValueError for more than was announced."""
+    size: int = chunk.uncompressed_size
+    if size > _LARGEST:
+        raise ValueError(f'it has {size} bytes; up to {_LARGEST} are read')
+    if not chunk.compression:
+        return bytes(chunk.data)
+    data: bytes
+    if chunk.compression == 'zstd':
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
+            data = stream.read(size + 1)
+    elif chunk.compression == 'lz4':
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=size + 1)
+    else:
+        raise ValueError(f'compression {chunk.compression!r} is unknown')
+    if len(data) != size:
+        raise ValueError('its size is another than announced')
+    return data
+
+
+def _parsed(opcode: int, body: bytes, where: str, note: _Note) -> list[Any]:
+    """Return the record of a body in a list; empty for one that tells nothing of messages."""
+    stream = ReadDataStream(BytesIO(body))
+    kinds: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,
+                             Opcode.STATISTICS: Statistics}
+    try:
+        if opcode == Opcode.MESSAGE:
+            return [Message.read(stream, len(body))]
+        return [kinds[opcode].read(stream)] if opcode in kinds else []
+    except Exception as cause:
+        note(f'{where} is damaged ({cause or type(cause).__name__})')
+        return []

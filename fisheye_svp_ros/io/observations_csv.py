@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
+from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 REQUIRED = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
@@ -21,7 +22,7 @@ def read(path: str | Path) -> Observations:
     Raises ObservationError, naming file, line and column.
     """
     table = CsvTable(Path(path), REQUIRED)
-    frame, landmark = table.whole('frame'), table.whole('landmark')
+    frame, landmark = table.whole('frame'), table.whole('landmark', MOST_LANDMARK)
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
     camera = np.array([cameras.index(name) for name in names], dtype=np.int64)

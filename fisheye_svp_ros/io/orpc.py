@@ -16,9 +16,13 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.files import read_text
+from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 _CM, _MM = 0.01, 0.001
+_LARGEST = 1 << 24  # bytes
+_SQUARE = 1e-3  # digits of a printed rotation are forgiven
 _TIME = re.compile(r'\d{4}(-\d{2}){5}$')
 
 
@@ -70,13 +74,19 @@ def _description(folder: Path) -> Path:
 def _read_boards(path: Path) -> dict[int, Board]:
     """Read a .dsc and the .tp of the same name, which a single board can do without."""
     corners: dict[int, list[list[float]]] = {}
-    number = -1
+    number, places = -1, set()
     for line, fields in _lines(path):
         if len(fields) == 4:
-            number = int(_numbers(path, line, fields)[0])
+            number = _whole(path, line, fields[0])
+            if number in corners:
+                raise ObservationError(f'{path}, line {line}: board {number} stands there twice')
             corners[number] = []
         elif len(fields) == 6 and corners:
-            corners[number].append(_numbers(path, line, fields)[3:])
+            values = _numbers(path, line, fields)
+            if (corner := (number, *values[:3])) in places:
+                raise ObservationError(f'{path}, line {line}: this corner stands there twice')
+            places.add(corner)
+            corners[number].append(values[3:])
         elif len(fields) != 2:
             raise ObservationError(f'{path}, line {line}: not a board, a tag family or a corner')
     if not any(corners.values()):
@@ -91,7 +101,7 @@ def _read_boards(path: Path) -> dict[int, Board]:
     return boards
 
 
-def _read_board_poses(path: Path, single: bool) -> dict[int, Array]:
+def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
     if single and not path.exists():
         return {0: np.eye(3, 4)}
     numbers: list[float] = []
@@ -99,7 +109,14 @@ def _read_board_poses(path: Path, single: bool) -> dict[int, Array]:
         numbers += _numbers(path, line, fields)
     if not numbers or len(numbers) % 13:
         raise ObservationError(f'{path}: a board number and 3 x 4 numbers are needed for each')
-    return {int(one[0]): one[1:].reshape(3, 4) for one in np.reshape(numbers, (-1, 13))}
+    poses = {one[0]: one[1:].reshape(3, 4) for one in np.reshape(numbers, (-1, 13))}
+    for number, pose in poses.items():
+        turn = pose[:, :3]
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=_SQUARE) or np.linalg.det(turn) < 0:
+            raise ObservationError(f'{path}: the pose of board {number:g} holds no rotation')
+    if 13 * len(poses) < len(numbers):
+        raise ObservationError(f'{path}: a board stands there twice')
+    return poses
 
 
 def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
@@ -109,13 +126,13 @@ def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
         if len(fields) == 1 and ':' in fields[0]:
             name, value = fields[0].split(':', 1)
             if name == 'num_corners':
-                promised = int(_numbers(path, line, [value])[0])
+                promised = _whole(path, line, value)
             continue
         row = _numbers(path, line, fields)
         if len(row) != 5:
             raise ObservationError(f'{path}, line {line}: board, corner, 1, u, v are needed')
-        board = boards.get(int(row[0]))
-        if board is None or not 0 <= row[1] < len(board.corners):
+        board = boards.get(_whole(path, line, fields[0]))
+        if board is None or _whole(path, line, fields[1]) >= len(board.corners):
             raise ObservationError(
                 f'{path}, line {line}: board {row[0]:g}, corner {row[1]:g} is not on the target'
             )
@@ -150,17 +167,20 @@ def _time(file: Path) -> datetime | None:
 
 def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]]]:
     """Return line numbers and fields of the lines that are neither empty nor a comment."""
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-    except OSError as cause:
-        raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
-    except UnicodeDecodeError as cause:
-        raise ObservationError(f'{path}: not a text file') from cause
+    text = read_text(path, ObservationError, _LARGEST)
     return [
         (i, line.split(separator))
-        for i, line in enumerate(lines, 1)
+        for i, line in enumerate(text.splitlines(), 1)
         if line.strip() and not line.startswith('#')
     ]
+
+
+def _whole(path: Path, line: int, field: str) -> int:
+    value = _numbers(path, line, [field])[0]
+    if not (value.is_integer() and 0 <= value <= MOST_LANDMARK):
+        raise ObservationError(f'{path}, line {line}: {field.strip()!r} is not a whole number '
+                               f'from 0 to {MOST_LANDMARK}')
+    return int(value)
 
 
 def _numbers(path: Path, line: int, fields: list[str]) -> list[float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
@@ -13,6 +12,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.documents import read_json
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
 from fisheye_svp_ros.io.results import write_json
 from fisheye_svp_ros.optics.lens import Lens
@@ -64,14 +64,12 @@ class Result(ABC):
 
         Raises ObservationError, naming the file, for one that holds no such result.
         """
+        document = read_json(path, ObservationError)
         try:
-            document = json.loads(Path(path).read_text(encoding='utf-8'))
             if document.pop(_KIND) != cls.__name__:
                 raise ValueError(f'it holds another result than {cls.__name__}')
             found: Self = _built(document, cls)
-        except OSError as cause:
-            raise ObservationError(f'{path}: cannot be read ({cause.strerror})') from cause
-        except (ValueError, KeyError, TypeError, AttributeError) as cause:
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as cause:
             raise ObservationError(f'{path}: not a saved {cls.__name__} ({cause})') from cause
         return found
 

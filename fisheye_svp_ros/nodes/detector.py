@@ -17,6 +17,7 @@ from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, Unread, run
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
@@ -62,6 +63,9 @@ class Detector(BaseNode):
 
     def prepare(self, settings: DetectorSettings) -> Pattern:
         """Return the pattern; raise ParameterError where the text names none."""
+        kind, _, file = settings.board.partition(':')
+        if kind == 'aprilgrid' and settings is not self.settings:
+            allowed(file, self.settings.folder, 'board')
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:

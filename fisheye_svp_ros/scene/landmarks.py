@@ -12,6 +12,7 @@ from fisheye_svp_ros.errors import ObservationError
 
 SPREADS = ('whole', 'inner', 'outer')
 RADII = (2.0, 0.5, 0.2)
+MOST_LANDMARK = 2**32 - 1  # the largest id, as messages hold it
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,15 @@ from typing import Any
 
 import yaml
 
+from fisheye_svp_ros.io.documents import LARGEST_YAML, compose_yaml
+from fisheye_svp_ros.io.files import read_text
 from fisheye_svp_ros.standalone.exceptions import UnknownROSArgsError
 from fisheye_svp_ros.standalone.logging import LoggingSeverity
 from fisheye_svp_ros.standalone.names import Rule
 
 _TRUE = {'Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
 _FALSE = {'N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
+_PATTERN = re.compile(r'(/(\*\*?|\w+))+')
 _INTEGER = re.compile(r'[+-]?(0[xX][0-9a-fA-F]+|[0-9]+)')
 _NOT_FINITE = re.compile(r'([+-]?)\.(inf|Inf|INF|nan|NaN|NAN)')
 
@@ -40,6 +43,8 @@ class Arguments:
 
     def _add(self, node: str, values: dict[str, Any]) -> None:
         name = node if node.startswith('/') else f'/{node}'
+        if not _PATTERN.fullmatch(name):
+            raise ValueError(f'{node!r} names no node; /NAME, /* and /** do')
         self.parameters.setdefault(name, {}).update(values)
 
 
@@ -90,21 +95,20 @@ def _parse_parameter(result: Arguments, text: str) -> None:
     if not (separator and name and value):
         raise UnknownROSArgsError(f'parameter {text!r} is not name:=value')
     try:
-        document = yaml.compose(value, Loader=yaml.SafeLoader)
+        document = compose_yaml(value, f'parameter {text!r}', UnknownROSArgsError)
         result._add(node or '/**', {name: _value(document)})
-    except (ValueError, yaml.YAMLError) as error:
+    except ValueError as error:
         raise UnknownROSArgsError(f'parameter {text!r}: {error}') from error
 
 
 def _read_file(result: Arguments, path: Path) -> None:
-    try:
-        document = yaml.compose(path.read_text(encoding='utf-8'), Loader=yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UnknownROSArgsError(f'cannot read parameter file {path}: {error}') from error
+    where = f'parameter file {path}'
+    text = read_text(path, UnknownROSArgsError, LARGEST_YAML)
+    document = compose_yaml(text, where, UnknownROSArgsError)
     try:
         _read_nodes(result, document, '')
     except ValueError as error:
-        raise UnknownROSArgsError(f'parameter file {path}: {error}') from error
+        raise UnknownROSArgsError(f'{where}: {error}') from error
 
 
 def _read_nodes(result: Arguments, node: yaml.Node | None, path: str) -> None:
@@ -118,10 +122,13 @@ def _read_nodes(result: Arguments, node: yaml.Node | None, path: str) -> None:
 def _flatten(node: yaml.Node, prefix: str) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, value in _items(node):
-        if isinstance(value, yaml.MappingNode):
-            values |= _flatten(value, f'{prefix}{key}.')
-        else:
-            values[f'{prefix}{key}'] = _value(value)
+        name = f'{prefix}{key}'
+        new = (_flatten(value, f'{name}.') if isinstance(value, yaml.MappingNode)
+               else {name: _value(value)})
+        if new.keys() & values.keys():
+            raise ValueError(f'{min(new.keys() & values.keys())!r} stands there twice, the second '
+                             f'time in line {value.start_mark.line + 1}')
+        values |= new
     return values
 
 

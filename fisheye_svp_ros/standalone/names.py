@@ -53,7 +53,8 @@ class Rule:
         left, separator, right = text.partition(':=')
         if not (left and separator and right):
             raise NameValidationException(f'remapping rule {text!r} is not from:=to')
-        found = re.fullmatch(rf'(?:({_TOKEN}):(?!//))?(?:ros(topic|service)://)?(.+)', left)
+        found = re.fullmatch(rf'(?:({_TOKEN}):(?!//))?(?:ros(topic|service)://)?(.+)', left,
+                             re.DOTALL)
         assert found, left  # the last group takes any text
         node, kind, match = found.groups()
         return cls('__node' if match == '__name' else match, right, node, kind)

@@ -5,13 +5,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.nodes import hears_sigint
+from helpers.nodes import hears_sigint, until
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
@@ -261,21 +260,23 @@ class TestCommandLine:
         for name in cli.COMMANDS:
             assert name in run.stdout
 
-    def test_interrupt_is_silent(self, scene):
-        folder, _, _ = scene
-        fifo = folder / 'slow.csv'
-        os.mkfifo(fifo)
-        running = process('localize', fifo, '--lens', folder / 'lens.yaml')
-        writer = None
-        while writer is None and running.poll() is None:
-            try:
-                writer = os.open(fifo, os.O_WRONLY | os.O_NONBLOCK)
-            except OSError:  # the command does not wait for observations yet
-                time.sleep(0.01)
+    def test_interrupt_is_silent(self, tmp_path):
+        (tmp_path / 'a.yaml').write_text(
+            f'synthetic_camera: {{ros__parameters: {{sweep.seed: {list(range(9000))}}}}}')
+        running = process('sweep', tmp_path / 'a.yaml', '-o', tmp_path / 'out')
+        until(lambda: (tmp_path / 'out' / 'parts' / 'sweep.txt').exists())
         running.send_signal(signal.SIGINT)
         out, err = running.communicate(timeout=60)
-        os.close(writer)
         assert (running.returncode, out, err) == (130, '', '')
+
+    @pytest.mark.parametrize('make', [os.mkfifo, lambda path: path.symlink_to('/dev/zero')])
+    @pytest.mark.parametrize('name', ['observations.csv', 'lens.yaml'])
+    def test_what_has_no_end_is_not_read(self, scene, tmp_path, capsys, make, name):
+        given = {path.name: path for path in scene[0].iterdir()}
+        make(tmp_path / name)
+        given[name] = tmp_path / name
+        line = refused(capsys, 'localize', given['observations.csv'], '--lens', given['lens.yaml'])
+        assert f'{tmp_path / name}: not a regular file' in line
 
     def test_broken_pipe_is_silent(self, scene):
         folder, _, _ = scene

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 from time import sleep
 
@@ -153,6 +155,19 @@ class TestTags:
         flat = (pattern.points[points.ids, :2] + 0.04) * 4000 - 0.5
         expected = cv2.perspectiveTransform(flat[None], turn)[0]
         assert np.abs(points.uv - expected).max() < 0.5
+
+    @pytest.mark.parametrize(('name', 'value'), [
+        ('tagCols', '1.5'), ('tagCols', '1000000'), ('tagRows', '600'), ('tagSize', '1e300'),
+        ('tagSize', '.nan'), ('tagSpacing', '-1'),
+    ])
+    def test_an_aprilgrid_that_cannot_be(self, tmp_path: Path, name: str, value: str) -> None:
+        given = {'tagCols': '3', 'tagRows': '2', 'tagSize': '0.1', 'tagSpacing': '0.3',
+                 name: value}
+        path = tmp_path / 'a.yaml'
+        path.write_text('target_type: aprilgrid\n' + ''.join(
+            f'{key}: {text}\n' for key, text in given.items()))
+        with pytest.raises(ParameterError, match=name):
+            parse_pattern(f'aprilgrid:{path}')
 
     def test_aprilgrid(self, tmp_path: Path) -> None:
         path = tmp_path / 'april.yaml'
@@ -372,6 +387,17 @@ class TestCameras:
                     message = make[kind](header, 'png', data)
                 bag.write(topic, kind, bytes(store.serialize_cdr(message, kind)))
         assert sorted(camera for camera, _ in self.cameras(tmp_path / 'bag')) == cameras
+
+
+def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
+    """In a process of its own: the bound holds from before OpenCV is loaded."""
+    path, side = tmp_path / 'a.pgm', 20_000
+    path.write_bytes(b'P5 %d %d 255 ' % (side, side))
+    done = subprocess.run(
+        [sys.executable, '-m', 'fisheye_svp_ros.cli', 'detect', path, '--board',
+         'chessboard:9x6:24mm', '-o', tmp_path / 'a.csv'], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert 'too large, or broken' in done.stderr and 'Traceback' not in done.stderr
 
 
 class TestOrder:

@@ -170,13 +170,27 @@ def test_boofcv() -> None:
     (CAMCHAIN.replace('resolution: [512, 512]', 'resolution: 512', 1), 'cam0: resolution'),
     (CAMCHAIN.replace('omni', 'omega'), "cam1: camera_model is 'omega'"),
     ('%YAML:1.0\n---\nimage_width: 3\nimage_height: 3\n', 'it has none of'),
+    ('<opencv_storage><K>' + '<a>' * 100_000, 'not a whole OpenCV file'),
+    ('<opencv_storage>' + '<a>' * 100_000 + '</a>' * 100_000 + '</opencv_storage>',
+     'it has none of'),
+    ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage></opencv_storage>',
+     'document types are not read'),
+    ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper'),
+    ('<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height></opencv_storage>',
+     'a matrix of 3 x 3'),
+    (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
+    (CAMCHAIN.replace('158.0', '0', 1), 'no numbers of a lens'),
+    (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
     ('{"camera_type": 1}', 'not a whole Basalt'),
+    ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
+    ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
+    ("'LENSMODEL_CAHVORE'" + '-1' * 120_000, 'more than 100000 values'),
     ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}", 'can be read'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
     ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
      'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',
      "distortion_model is 'scara'"),
-])
+], ids=lambda text: text[:30])
 def test_refused_in_one_line(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'lens.yaml'
     path.write_text(text)

@@ -154,7 +154,7 @@ class TestObservationsCsv:
         (f'{HEADER}\n\n', 'no row below the header'),
         (f'{HEADER},u\n{ROWS}', "its header has 'u' twice"),
         (HEADER.replace(',', ';'), "column 'frame' is missing"),
-        (b'\xff\xfe\x00\x01', 'not a CSV file in UTF-8'),
+        (b'\xff\xfe\x00\x01', 'not a text file'),
         (f'{HEADER}\n0,"4,1,2,3,4,5\n', 'fields where the header has 7'),
     ])
     def test_bad_file(self, csv, text, says):
@@ -270,6 +270,9 @@ class TestOrpc:
         (ORPC.replace('0,2,1', '0,1,1'), 'a corner twice'),
         (ORPC.replace('num_corners: 2', 'num_corners: 3'), 'num_corners is 3, but 2'),
         (ORPC[: ORPC.index('0,2,1')], 'num_corners is 2, but 1'),
+        (ORPC.replace('0,2,1', '0,1.5,1'), "line 7: '1.5' is not a whole number"),
+        (ORPC.replace('0,2,1', '0,-2,1'), "line 7: '-2' is not a whole number"),
+        (ORPC.replace('0,2,1', '1e300,2,1'), "line 7: '1e300' is not a whole number"),
         ('', 'num_corners is None, but 0'),
         (b'\xff\x00', 'not a text file'),
     ])
@@ -288,6 +291,10 @@ class TestOrpc:
         (DSC_TWO, '0\n1 0 0 x\n', 'target.tp, line 2'),
         (DSC_TWO, '', 'target.tp: a board number'),
         (DSC_TWO, TP_TWO.replace('0\n1 0', '5\n1 0', 1), 'board 0, corner 1 is not on the target'),
+        (DSC_TWO, TP_TWO.replace('1 0', '1.1 0', 1), 'holds no rotation'),
+        (DSC_TWO, TP_TWO + TP_TWO, 'a board stands there twice'),
+        (DSC + DSC, None, 'board 0 stands there twice'),
+        (DSC + DSC.splitlines()[-1], None, 'this corner stands there twice'),
     ])
     def test_bad_target(self, data, dsc, tp, says):
         with pytest.raises(ObservationError) as caught:

@@ -189,7 +189,7 @@ def test_what_is_whole_after_the_damage_is_read_once_and_the_place_is_named(
     records = list(bag.records(is_tabulated))
     # One chunk holds one result; the scenarios are in the first.
     assert len(records) == 79 and len({(r.topic, stamp_of(r.message)) for r in records}) == 79
-    assert 'is damaged (crc validation failed' in bag.damage and 'byte' in bag.damage
+    assert 'is damaged (its checksum does not fit' in bag.damage and 'byte' in bag.damage
 
 
 def test_reading_takes_little_memory_however_long_the_recording(tmp_path: Path) -> None:

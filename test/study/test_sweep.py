@@ -207,7 +207,7 @@ def test_a_bad_sweep_is_refused_before_anything_runs(
     ('localiser: {ros__parameters: {svp: true}}', 'is no node of a sweep'),
     ('localizer: {ros__parameters: {sweep.radius: [1.0]}}', 'is no parameter of localizer'),
     ('', 'should hold node names'),
-    ('a: [', 'cannot read parameter file'),
+    ('a: [', 'broken YAML at line 2'),
     ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
      '{sweep.style: [parallel]}}', "rig is 'topic'"),
     ('localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '

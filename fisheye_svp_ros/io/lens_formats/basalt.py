@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
@@ -23,8 +24,8 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming the field."""
+    document = parse_json(text, where, LensError)
     try:
-        document = json.loads(text)
         document = document.get('value0', document)
         cameras, sizes = document['intrinsics'], document['resolution']
         lenses, worst = {}, {}
@@ -32,7 +33,7 @@ def read(text: str, where: str) -> Foreign:
             lens, off = _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
             lenses[f'cam{i}'], worst[f'cam{i}'] = lens, off
         rigs = _rigs(document.get('T_imu_cam', []))
-    except (KeyError, TypeError, ValueError) as cause:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole Basalt calibration ({cause!r})') from cause
     return Foreign('basalt', lenses, rigs, worst)
 

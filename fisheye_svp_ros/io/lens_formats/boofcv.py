@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import yaml
-
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 
 
@@ -15,14 +14,14 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming what is missing."""
+    document = parse_yaml(text, where, LensError)
     try:
-        document = yaml.safe_load(text)
         pinhole, distortion = document['pinhole'], document['radial_tangential']
         size = float(pinhole['width']), float(pinhole['height'])
         intrinsics = [float(pinhole[name]) for name in ('fx', 'fy', 'cx', 'cy')]
         curve, limit = radial.omnidirectional(
             float(document['mirror_offset']), [float(k) for k in distortion['radial']])
-    except (KeyError, TypeError, ValueError, yaml.YAMLError) as cause:
+    except (KeyError, TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole BoofCV model ({cause!r})') from cause
     lens, worst = radial.fitted('camera', size, intrinsics, curve, limit, where)
     return Foreign('boofcv', {'camera': lens}, (), {'camera': worst})

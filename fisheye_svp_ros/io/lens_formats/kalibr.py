@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, nearest_rotation
@@ -22,11 +23,9 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming camera and field."""
-    try:
-        document: dict[str, Any] = yaml.safe_load(text)
-        cameras = {name: value for name, value in document.items() if name.startswith('cam')}
-    except (AttributeError, yaml.YAMLError) as cause:
-        raise LensError(f'{where}: broken YAML ({cause})'.splitlines()[0]) from cause
+    document = parse_yaml(text, where, LensError)
+    cameras = {name: radial.section(document, name, where)
+               for name in map(str, document) if name.startswith('cam')}
     lenses, rigs, worst = {}, [], {}
     for name, camera in cameras.items():
         lenses[name], worst[name] = _lens(name, camera, f'{where}: {name}')
@@ -35,7 +34,7 @@ def read(text: str, where: str) -> Foreign:
     return Foreign('kalibr', lenses, tuple(rigs), worst)
 
 
-def _lens(name: str, camera: dict[str, Any], where: str) -> tuple[Lens, float]:
+def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model, distortion = camera.get('camera_model'), camera.get('distortion_model', 'none')
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
@@ -70,11 +69,11 @@ def _rig(rows: Any, where: str) -> Pose:
 def write(lens: Lens) -> str:
     """Return the lens in this form, as the one camera of its chain."""
     near = radial.nearest(lens)
-    return yaml.safe_dump({'cam0': {
+    return dump_yaml({'cam0': {
         'camera_model': 'pinhole',
         'intrinsics': [near.fx, near.fy, near.cx, near.cy],
         'distortion_model': 'equidistant',
         'distortion_coeffs': radial.coefficients(near),
         'resolution': [near.width, near.height],
         'rostopic': f'/{near.name}/image_raw',
-    }}, sort_keys=False, default_flow_style=None)
+    }}, default_flow_style=None)

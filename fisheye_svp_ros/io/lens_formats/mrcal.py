@@ -20,6 +20,7 @@ from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 
 _LINEARITY = re.compile(r'LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)$')
+_MOST_TOKENS = 100_000
 _AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
 _TERMS, _GRID, _TOLERANCE = 3, 400, 0.01
 
@@ -31,12 +32,15 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError for a model that is no fisheye's, or is incomplete."""
+    if sum(map(text.count, ',[({+-*~')) > _MOST_TOKENS:
+        raise LensError(f'{where}: more than {_MOST_TOKENS} values; no .cameramodel has these')
     try:
         document = ast.literal_eval(text.strip())
         model = str(document.get('lensmodel', document.get('lens_model')))
         values = [float(value) for value in document['intrinsics']]
         size = [int(value) for value in document['imagersize']]
-    except (AttributeError, KeyError, SyntaxError, TypeError, ValueError) as cause:
+    except (AttributeError, LookupError, SyntaxError, TypeError, ValueError, MemoryError,
+            RecursionError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole .cameramodel ({cause})'.splitlines()[0]) from cause
     if model == 'LENSMODEL_STEREOGRAPHIC' and len(values) == 4:
         return _read_stereographic(size, values, where)

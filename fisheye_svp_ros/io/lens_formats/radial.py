@@ -17,6 +17,7 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
 
 _GRID = 600
+_LARGEST = 1e12  # any number of a lens
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 
 
@@ -29,13 +30,13 @@ def kannala_brandt(
     Raises LensError, naming `where`, where it is impossible.
     """
     try:
-        width, height = (int(value) for value in size)
-        fx, fy, cx, cy = (float(value) for value in intrinsics)
-        coefficients = [float(value) for value in k]
-        curve = KannalaBrandt(*coefficients)
-    except (TypeError, ValueError) as cause:
+        width, height, fx, fy, cx, cy = map(float, (*size, *intrinsics))
+        curve = KannalaBrandt(*map(float, k))
+    except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
-    lens = Lens(name, width, height, fx, fy, cx, cy, curve, np.nan, shift,
+    if not (width.is_integer() and height.is_integer()):
+        raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
+    lens = Lens(name, int(width), int(height), fx, fy, cx, cy, curve, np.nan, shift,
                 calibration={'source': where})
     wrong = lens.check()
     if wrong:
@@ -51,8 +52,12 @@ def fitted(
 
     limit: angle, rad, up to which the curve grows; no further than the image's corner is fitted.
     """
-    width, height = size
-    fx, fy, cx, cy = (float(value) for value in intrinsics)
+    try:
+        width, height, fx, fy, cx, cy = map(float, (*size, *intrinsics))
+    except (TypeError, ValueError, OverflowError) as cause:
+        raise LensError(f'{where}: size, fx, fy, cx or cy are incomplete') from cause
+    if not (np.isfinite([width, height, cx, cy, limit]).all() and 0 < min(fx, fy) < np.inf):
+        raise LensError(f'{where}: image size or intrinsics are no numbers of a lens')
     corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
     theta = np.linspace(0.0, limit, _GRID)[1:]
     heights = curve(theta)
@@ -64,6 +69,8 @@ def fitted(
     heights = curve(theta)
     powers = theta[:, None] ** np.arange(1, 10, 2)
     scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
+    if not scale > 0:
+        raise LensError(f'{where}: no fisheye curve is near the projection')
     worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
     lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
                           [value / scale for value in rest], where, shift)
@@ -109,13 +116,21 @@ def coefficients(lens: Lens) -> list[float]:
     return list(lens.image_height.coefficients)
 
 
+def section(mapping: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    """Return a mapping in a mapping; raise LensError naming the field."""
+    found = mapping.get(name)
+    if not isinstance(found, dict):
+        raise LensError(f'{where}: {name} is {found!r}; a mapping is needed')
+    return found
+
+
 def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
     """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
     values = mapping.get(name)
     if not isinstance(values, list) or len(values) != count or not all(
-        isinstance(value, int | float) for value in values
+        isinstance(value, int | float) and abs(value) < _LARGEST for value in values
     ):
-        raise LensError(f'{where}: {name} must be a list of {count} numbers, is {values!r}')
+        raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
 
 

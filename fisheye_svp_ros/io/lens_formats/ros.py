@@ -8,13 +8,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import yaml
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import identity
@@ -34,15 +34,15 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
+    document = parse_yaml(text, where, LensError)
     try:
-        document = yaml.safe_load(text)
         k = radial.numbers(document['camera_matrix'], 'data', 9, where)
         size = document['image_width'], document['image_height']
         name = str(document.get('camera_name', 'camera'))
         model = str(document['distortion_model'])
         d = document['distortion_coefficients']['data']
         d = radial.numbers({'data': d}, 'data', len(d), where)
-    except (KeyError, TypeError, yaml.YAMLError) as cause:
+    except (KeyError, TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     lens, worst = lens_of(model, size, (k[0], k[4], k[2], k[5]), tuple(d), name, where)
     return Foreign('ros', {name: lens}, (), {name: worst} if worst else {})
@@ -129,10 +129,10 @@ def write(lens: Lens) -> str:
         return {'rows': rows, 'cols': columns, 'data': data}
 
     k = [near.fx, 0.0, near.cx, 0.0, near.fy, near.cy, 0.0, 0.0, 1.0]
-    return yaml.safe_dump({
+    return dump_yaml({
         'image_width': near.width, 'image_height': near.height, 'camera_name': near.name,
         'camera_matrix': matrix(3, 3, k), 'distortion_model': 'equidistant',
         'distortion_coefficients': matrix(1, 4, radial.coefficients(near)),
         'rectification_matrix': matrix(3, 3, [1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0]),
         'projection_matrix': matrix(3, 4, [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]),
-    }, sort_keys=False, default_flow_style=None)
+    }, default_flow_style=None)

@@ -1,0 +1,51 @@
+"""Tables for scripts, whole and damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.columns import arrow, read_columns, typed, write_columns
+
+COLUMNS = {'n': list(range(50)), 'x': [0.1 * i for i in range(50)], 'name': ['a', None] * 25}
+
+
+def test_a_flipped_bit_of_a_parquet_table_never_changes_a_cell(tmp_path: Path) -> None:
+    if arrow()[0] is None:
+        pytest.skip('pyarrow is not usable')
+    *_, path = write_columns(tmp_path / 'table', COLUMNS)
+    good, rng = path.read_bytes(), np.random.default_rng(3)
+    assert read_columns(path) == COLUMNS
+    refused = 0
+    for place in rng.choice(8 * len(good), 300, replace=False).tolist():
+        bad = bytearray(good)
+        bad[place // 8] ^= 1 << place % 8
+        path.write_bytes(bad)
+        try:
+            found = read_columns(path)
+        except OutputError as error:
+            refused += 1
+            assert str(error).startswith(f'{path}: not a table (')
+        else:
+            assert list(found.values()) == list(COLUMNS.values()), place
+    assert refused > 30
+
+
+def test_other_columns_than_numbers_and_text_are_refused(tmp_path: Path) -> None:
+    pyarrow = arrow()[0]
+    if pyarrow is None:
+        pytest.skip('pyarrow is not usable')
+    pyarrow.parquet.write_table(pyarrow.table({'a': [[1, 2]]}), tmp_path / 'a.parquet')
+    with pytest.raises(OutputError, match='a column of list'):
+        read_columns(tmp_path / 'a.parquet')
+
+
+def test_cells_are_numbers_where_all_are() -> None:
+    assert typed(['1', '', None, '-3']) == [1, None, None, -3]
+    assert typed(['1', '2.5', 'nan'])[:2] == [1.0, 2.5]
+    long = '9' * 5000
+    assert typed(['1', long]) == [1.0, float('inf')]
+    assert typed(['1_000', '2']) == ['1_000', '2']

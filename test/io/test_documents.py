@@ -1,0 +1,104 @@
+"""YAML and JSON that are made to break what reads them: one line, at once."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError, StandaloneError
+from fisheye_svp_ros.io.documents import dump_yaml, parse_json, parse_yaml, read_yaml
+from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.standalone.arguments import parse
+
+BOMB = 'a: &a [1, 1]\n' + ''.join(
+    f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True))
+HOSTILE = {
+    'aliases': (BOMB, 'line 2: there is an alias'),
+    'merged': ('a: &a {b: 1}\nc: {<<: *a}\n', 'line 2: there is an alias'),
+    'twice': ('a: 1\nb: 2\na: 3\n', "line 3: there is the key 'a' a second time"),
+    'twice below': ('a:\n  b: 2\n  "b": 3\n', "line 3: there is the key 'b' a second time"),
+    'digits': ('a: ' + '9' * 5000, 'too many digits'),
+    'deep lists': ('a: ' + '[' * 100_000, 'nested deeper than 50'),
+    'deep dashes': ('- ' * 100_000, 'nested deeper than 50'),
+    'deep mappings': ('{a: ' * 100_000, 'nested deeper than 50'),
+    'many': ('a: [' + '1,' * 200_000 + ']', 'more than 100000 values'),
+    'huge': ('#' * (1 << 22) + '\na: 1', 'above 4 MB'),
+    'a time': ('a: !!timestamp x', 'not what it is tagged as'),
+    'a bool': ('a: !!bool x', 'not what it is tagged as'),
+    'code': ('a: !!python/object/apply:os.system [ls]', 'could not determine a constructor'),
+    'control': ('a: \x01', 'cannot be parsed'),
+    'list key': ('[1]: 2', 'unhashable'),
+}
+
+
+@pytest.mark.parametrize('name', HOSTILE)
+def test_hostile_yaml_is_refused_in_one_line_at_once(name: str, tmp_path: Path) -> None:
+    text, said = HOSTILE[name]
+    path = tmp_path / 'a.yaml'
+    path.write_text(text)
+    begun = time.process_time()
+    with pytest.raises(LensError, match=said) as error:
+        read_yaml(path, LensError)
+    assert time.process_time() - begun < 2.0
+    assert str(error.value).startswith(f'{path}: ') and '\n' not in str(error.value)
+
+
+def test_plain_values_stay() -> None:
+    text = 'name: 2001-99-99\nwhen: 2001-01-01\na: 1e-3\nb: [1, 2.5, yes]\n'
+    assert parse_yaml(text, 'x', LensError) == {
+        'name': '2001-99-99', 'when': '2001-01-01', 'a': 1e-3, 'b': [1, 2.5, True]}
+    shared = [1.0, 2.0]
+    assert parse_yaml(dump_yaml({'a': shared, 'b': shared}), 'x', LensError)['b'] == shared
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' stands there twice"),
+    ('[' * 100_000, 'broken JSON'), ('{"a": ' + '9' * 5000 + '}', 'broken JSON'),
+    ('[1]', 'a JSON object is expected'), ('', 'broken JSON'),
+])
+def test_hostile_json(text: str, said: str) -> None:
+    with pytest.raises(ObservationError, match=said):
+        parse_json(text, 'x', ObservationError)
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    (BOMB, 'an alias'),
+    ('localizer: {ros__parameters: {}}\nlocalizer: {ros__parameters: {}}', 'a second time'),
+    ('localizer:\n  ros__parameters:\n    a.b: 1\n    a: {b: 2}\n', "'a.b' stands there twice"),
+    ('/(*: {ros__parameters: {a: 1}}', 'names no node'),
+    ('/***: {ros__parameters: {a: 1}}', 'names no node'),
+    ('ros__parameters: {a: 1}', 'names no node'),
+])
+def test_hostile_parameter_files(text: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / 'a.yaml'
+    path.write_text(text)
+    with pytest.raises(StandaloneError, match=said) as error:
+        parse(['--ros-args', '--params-file', str(path)])
+    assert str(path) in str(error.value) and '\n' not in str(error.value)
+
+
+def test_a_pattern_on_the_command_line() -> None:
+    with pytest.raises(StandaloneError, match='names no node'):
+        parse(['--ros-args', '-p', '/(*:a:=1'])
+    given = parse(['--ros-args', '-p', '/**/localizer:a:=1', '-p', '/*:b:=2'])
+    assert given.overrides('/x/y/localizer') == {'a': 1}
+    assert given.overrides('/localizer') == {'a': 1, 'b': 2}
+
+
+def test_files_have_bounds(tmp_path: Path) -> None:
+    path = tmp_path / 'a'
+    path.write_bytes(bytes(10))
+    assert read_bytes(path, ParameterError, 10) == bytes(10)
+    with pytest.raises(ParameterError, match='which is more than is read'):
+        read_bytes(path, ParameterError, 9)
+    with pytest.raises(ParameterError, match='Is a directory'):
+        read_bytes(tmp_path, ParameterError)
+    with pytest.raises(ParameterError, match='cannot be read'):
+        read_bytes('a\0b', ParameterError)
+
+
+def test_errors_are_one_line_of_bounded_length() -> None:
+    text = str(LensError('a\n\x1b[31mb ' + 'c' * 10**6 + ' end'))
+    assert text.startswith('a [31mb c') and text.endswith(' end') and len(text) < 2000
