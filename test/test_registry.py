@@ -52,7 +52,6 @@ class Trefoil(Effect):
     name: ClassVar = 'trefoil'
     stage: ClassVar = 'image'
     signature: ClassVar = 'waves around the centre'
-    confused_with: ClassVar = 'none'
     to_separate: ClassVar = 'look at the sensor'
 
     @property
