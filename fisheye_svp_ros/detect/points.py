@@ -68,6 +68,14 @@ def find_points(
     return _checked(index, corners, pattern, reach)
 
 
+def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Exception:
+    """Do what `find_points` does for its arguments; return what it raises."""
+    try:
+        return find_points(*task)
+    except Exception as error:
+        return error
+
+
 def _fitted(pixels: Pixels, start: Array, axes: Array, reach: Array, square: bool) -> Corners:
     """Fit corners; those too soft for their window again at half the size, if there is room."""
     corners = fit_corners(pixels, start, axes, reach, square)

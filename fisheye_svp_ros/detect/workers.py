@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
@@ -23,7 +24,12 @@ class _Worker:
         context = multiprocessing.get_context('spawn')
         self.pipe, theirs = context.Pipe()
         self.process = context.Process(target=_serve, args=(function, theirs), daemon=True)
-        self.process.start()
+        # Ctrl-C is for whoever waits for the work.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self.process.start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
         theirs.close()
         self.number, self.deadline = -1, 0.0
 
@@ -76,6 +82,52 @@ def bounded_map(
     finally:
         for worker in busy:
             worker.stop()
+
+
+class BoundedCalls:
+    """A function in a process of its own, one call at a time, each bounded in time."""
+
+    def __init__(self, function: Callable[[Any], Any], first: Any) -> None:
+        """Start the process; function: importable; first: small, for a call that warms it up."""
+        self._function, self._first = function, first
+        self._replace()
+
+    @property
+    def busy(self) -> bool:
+        """Whether a call is under way, or the process is not ready yet."""
+        return self._busy
+
+    def start(self, item: Any, seconds: float) -> None:
+        """Start a call, which may take so long; none may be under way."""
+        self._worker.give(self._worker.number + 1, item, seconds)
+        self._busy = True
+
+    def result(self) -> Any:
+        """Return the result of a call, Late in its place; None while there is nothing new."""
+        worker, result = self._worker, None
+        if not self._busy:
+            return None
+        try:
+            if worker.pipe.poll():
+                result, self._busy = worker.pipe.recv(), False
+        except (EOFError, OSError):
+            result = Late(False)
+        if result is None and time.monotonic() > worker.deadline:
+            result = Late(True)
+        if isinstance(result, Late):
+            worker.stop()
+            self._replace()
+        # The result of the warming up is nobody's.
+        return None if worker.number == 0 and not isinstance(result, Late) else result
+
+    def stop(self) -> None:
+        """End the process."""
+        self._worker.stop()
+
+    def _replace(self) -> None:
+        self._worker = _Worker(self._function)
+        self._worker.give(0, self._first, _START)
+        self._busy = True
 
 
 def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:

@@ -38,7 +38,7 @@ from fisheye_svp_ros.study.settings import Settings
 RELIABLE = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 INPUT = QoSProfile(depth=1000)
-SENSOR_INPUT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+SENSOR = SENSOR_INPUT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 LATCHED_INPUT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 HEARD_LATER = QoSProfile(depth=100)
 

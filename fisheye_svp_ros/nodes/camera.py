@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.base import LATCHED, SENSOR, BaseNode, Failed, Finished
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -33,36 +34,44 @@ _LONG = 15.0  # s without an answer after which a set is published again
 class CameraTopics:
     """The topics of one camera; name: its namespace, empty for the only camera."""
 
-    def __init__(self, node: CameraNode, name: str) -> None:
+    def __init__(self, node: CameraNode, name: str, photographs: bool) -> None:
         prefix, settings = f'{name}/' if name else '', node.settings
         self._world, self._transforms = settings.world_frame, node.transforms
         self.frame = f'{name}_{settings.camera_frame}' if name else settings.camera_frame
         self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED)
         self._pose = node.announce(PoseStamped, f'{prefix}true_pose')
-        self._points = node.announce(PointCloud2, f'{prefix}image_points', wait=True)
+        self._images = self._points = None
+        if photographs:
+            self._images = node.announce(Image, f'{prefix}image', SENSOR, wait=True)
+        else:
+            self._points = node.announce(PointCloud2, f'{prefix}image_points', wait=True)
 
     def publish(
-        self, stamp: int, seen: Observations, pose: Pose | None, lens: Lens | None
+        self, stamp: int, seen: Observations | Pixels, pose: Pose | None, lens: Lens | None
     ) -> None:
-        """Publish one set: image points, and what is known of pose and lens."""
+        """Publish one set: image points or an image, and what is known of pose and lens."""
         if lens is not None:
             self._info.publish(messages.camera_info_message(lens, stamp, self.frame))
         if pose is not None:
             self._pose.publish(messages.pose_message(pose, stamp, self._world))
             self._transforms.publish(pose, stamp, self._world, f'{self.frame}_true')
-        self._points.publish(
-            messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame)
-        )
+        if self._points is not None and isinstance(seen, Observations):
+            self._points.publish(
+                messages.image_points_message(seen.landmark, seen.uv, stamp, self.frame))
+        if self._images is not None and isinstance(seen, np.ndarray):
+            self._images.publish(messages.image_message(seen, stamp, self.frame))
 
 
 class CameraNode(BaseNode):
     """Publishes sets one after the other, at a rate or in lock-step with those who answer."""
 
     settings: CameraSettings
+    photographs = False  # in place of landmarks and image points
 
     def __init__(self) -> None:
         super().__init__()
-        self._landmarks = self.announce(PointCloud2, 'landmarks', LATCHED)
+        self._landmarks = (
+            None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED))
         self._scenario = self.announce(DiagnosticArray, 'scenario')
         self.transforms = Transforms(self, self.settings.publish_tf)
         self._cameras: dict[str, CameraTopics] = {}
@@ -107,7 +116,7 @@ class CameraNode(BaseNode):
     def camera(self, name: str) -> CameraTopics:
         """Return the topics of a camera."""
         if name not in self._cameras:
-            self._cameras[name] = CameraTopics(self, name)
+            self._cameras[name] = CameraTopics(self, name, self.photographs)
         return self._cameras[name]
 
     def tag(self, stamp: int, values: Mapping[str, Any], text: str = '') -> None:
@@ -116,8 +125,9 @@ class CameraNode(BaseNode):
 
     def publish_landmarks(self, landmarks: Landmarks, stamp: int) -> None:
         """Publish landmarks; stamp 0: they hold for every set."""
-        self._landmarks.publish(messages.landmarks_message(
-            landmarks, stamp, self.settings.world_frame))
+        if self._landmarks is not None:
+            self._landmarks.publish(messages.landmarks_message(
+                landmarks, stamp, self.settings.world_frame))
 
     def _hear_answers_on(self, topic: str) -> None:
         def use(stamp: int, _: Any) -> None:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
-from fisheye_svp_ros.detect.points import find_points
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.detect.points import Points, search
+from fisheye_svp_ros.detect.workers import BoundedCalls, Late
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
@@ -35,6 +38,13 @@ class DetectorSettings(Settings):
         'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`'
     )
     board_frame: str = parameter('board', 'Frame id of the landmarks')
+    longest_search: float = parameter(
+        1.0, 'How long an image may be searched; then it has no board', 's', (0.05, 60.0)
+    )
+    detections: bool = parameter(
+        False, 'Take AprilTags that others found, on `detections`, in place of images; these must '
+        'have been raw, not rectified; apriltag_msgs must be installed', fixed=True
+    )
 
 
 class Detector(BaseNode):
@@ -55,17 +65,35 @@ class Detector(BaseNode):
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
         self._waiting: tuple[int, Unread] | None = None
-        self._counts = {'images overtaken': 0, 'images without board': 0}
+        self._searches: BoundedCalls | None = None
+        self._searched: tuple[int, str] | None = None
+        self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
+        if self.settings.detections:
+            self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
+            self.start()
+            return
         for kind, topic in ((Image, 'image'), (CompressedImage, 'image/compressed')):
             self.collect(kind, topic, partial(_read, kind), self._take, SENSOR_INPUT)
-        self.every(_LOOK, self._work)
         self.start()
+        # A search may take long, and nothing but the end of its process breaks it off.
+        blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
+        self._searches = BoundedCalls(search, blank)
+        self.every(_LOOK, self._work)
+
+    def destroy_node(self) -> None:
+        """End the search, too."""
+        if self._searches is not None:
+            self._searches.stop()
+        super().destroy_node()
 
     def prepare(self, settings: DetectorSettings) -> Pattern:
         """Return the pattern; raise ParameterError where the text names none."""
         kind, _, file = settings.board.partition(':')
         if kind == 'aprilgrid' and settings is not self.settings:
             allowed(file, self.settings.folder, 'board')
+        if settings.detections and kind != 'aprilgrid':
+            raise ParameterError(f'board is {settings.board!r}; with detections it must be an '
+                                 'aprilgrid')
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:
@@ -88,8 +116,19 @@ class Detector(BaseNode):
                 return
         self._waiting = stamp, image
 
+    @property
+    def _detector(self) -> str:
+        name = default_detector(self._pattern)
+        return _QUICK.get(name, name)
+
     def _work(self) -> None:
-        if self._waiting is None:
+        """Publish what a search found; start the next one."""
+        assert self._searches is not None
+        found = self._searches.result()
+        if found is not None and self._searched is not None:
+            self._finish(found, *self._searched)
+            self._searched = None
+        if self._waiting is None or self._searches.busy:
             return
         (stamp, image), self._waiting = self._waiting, None
         try:
@@ -98,15 +137,38 @@ class Detector(BaseNode):
         except ObservationError as error:
             self.drop(image.topic, error)
             return
-        detector = default_detector(self._pattern)
-        found = find_points(pixels, self._pattern, _QUICK.get(detector, detector), self._near)
-        if isinstance(found, str):
-            self._near = None
-            self._counts['images without board'] += 1
+        self._searched = stamp, frame
+        task = pixels, self._pattern, self._detector, self._near
+        self._searches.start(task, self.settings.longest_search)
+
+    def _finish(self, found: Any, stamp: int, frame: str) -> None:
+        if isinstance(found, Points):
+            self._near = found.uv
+            self._points.publish(
+                messages.image_points_message(found.ids, found.uv, stamp, frame))
             return
-        self._near = found.uv
-        self._points.publish(
-            messages.image_points_message(found.ids, found.uv, stamp, frame))
+        self._near = None
+        self._counts['images without board'] += 1
+        self._counts['searches broken off'] += isinstance(found, Late)
+        if isinstance(found, Exception):
+            self.unforeseen(found)
+
+    def _read_tags(self, message: Any, topic: str) -> tuple[str, Index, Array]:
+        """Return the points of tags; libapriltag puts pixel centres at a half."""
+        tags = [tag for tag in message.detections
+                if 0 <= tag.id < self._pattern.columns * self._pattern.rows]
+        if not tags:
+            raise ObservationError(f'{topic}: no tag of the board among {len(message.detections)}')
+        # Both go round a tag from its lower left, against the clock.
+        ids = np.concatenate([4 * tag.id + np.arange(4) for tag in tags])
+        uv = np.array([[corner.x, corner.y] for tag in tags for corner in tag.corners]) - 0.5
+        if not np.isfinite(uv).all():
+            raise ObservationError(f'{topic}: a corner is not a finite number')
+        return str(message.header.frame_id), ids, uv
+
+    def _publish_tags(self, stamp: int, found: tuple[str, Index, Array]) -> None:
+        frame, ids, uv = found
+        self._points.publish(messages.image_points_message(ids, uv, stamp, frame))
 
     def _check_size(self, pixels: Pixels) -> None:
         """Raise ObservationError where images change their size: no lens would fit both."""
@@ -120,6 +182,13 @@ class Detector(BaseNode):
 
 def _read(kind: Any, message: Any, topic: str) -> tuple[str, Pixels]:
     return message.header.frame_id, message_pixels(message, kind.__name__, topic)
+
+
+def _tag_array() -> Any:
+    if find_spec('apriltag_msgs') is None:
+        raise ParameterError('detections is true, but apriltag_msgs is not installed: '
+                             'apt install ros-jazzy-apriltag-msgs')
+    return import_module('apriltag_msgs.msg').AprilTagDetectionArray
 
 
 def main(args: list[str] | None = None) -> int:

@@ -20,7 +20,8 @@ from geometry_msgs.msg import (
     Vector3Stamped,
 )
 from geometry_msgs.msg import Pose as PoseMessage
-from sensor_msgs.msg import CameraInfo, PointCloud2, PointField
+from numpy.typing import NDArray
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Float64, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -86,6 +87,13 @@ def landmarks_message(landmarks: Landmarks, stamp: int, frame: str) -> Any:
 def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> Any:
     """Return image points as PointCloud2: landmark, u, v (px)."""
     return cloud_message(structured(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
+
+
+def image_message(pixels: NDArray[np.uint8], stamp: int, frame: str) -> Any:
+    """Return sensor_msgs/Image, mono8, of a grey image (H, W)."""
+    height, width = pixels.shape
+    return Image(header=header(stamp, frame), height=height, width=width, encoding='mono8',
+                 is_bigendian=0, step=width, data=array('B', pixels.tobytes()))
 
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:

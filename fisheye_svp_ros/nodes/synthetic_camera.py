@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 from rcl_interfaces.msg import ParameterDescriptor
 from visualization_msgs.msg import MarkerArray
 
+from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, sweep_of
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, parameter, sweep_of
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.scenario import (
     Scenario,
     Simulation,
@@ -30,6 +36,17 @@ from fisheye_svp_ros.simulate.scenario import (
 from fisheye_svp_ros.study.settings import SyntheticCameraSettings
 
 _SAY_EVERY = 1.0  # s, how far the sweep is
+
+
+@dataclass(frozen=True)
+class PhotographingSettings(SyntheticCameraSettings):
+    """Parameters of the synthetic camera and of what it photographs."""
+
+    photograph: str = parameter(
+        '', 'Board to photograph, chessboard:COLUMNSxROWS:SIZE, its first inner corner in the '
+        'origin of the world, x right, y down, z away from whoever looks at it: `image` is '
+        'published in place of landmarks and image points. Empty: none', fixed=True
+    )
 
 
 class SweepSet(NamedTuple):
@@ -53,7 +70,8 @@ class SyntheticCamera(CameraNode):
     """Publishes the simulated sets of every scenario of its sweep."""
 
     NAME = 'synthetic_camera'
-    SETTINGS = SyntheticCameraSettings
+    SETTINGS = PhotographingSettings
+    settings: PhotographingSettings
 
     def __init__(self) -> None:
         super().__init__()
@@ -63,11 +81,18 @@ class SyntheticCamera(CameraNode):
         self._markers = self.announce(MarkerArray, 'markers', LATCHED)
         self.start()
 
-    def prepare(self, settings: SyntheticCameraSettings) -> SyntheticCameraSettings:
+    def prepare(self, settings: PhotographingSettings) -> PhotographingSettings:
         """Refuse settings of which a scenario cannot be simulated."""
         super().prepare(settings)
+        if settings.photograph:
+            _printed(settings.photograph)
         check_sweep(settings, self._sweep)
         return settings
+
+    @property
+    def photographs(self) -> bool:  # type: ignore[override]
+        """Whether images are published in place of landmarks and image points."""
+        return bool(self.settings.photograph)
 
     def configure(self, settings: SyntheticCameraSettings) -> None:
         """Start over with new settings."""
@@ -88,10 +113,24 @@ class SyntheticCamera(CameraNode):
         self.tag(stamp, {**place, **scalars(step.scenario)}, text)
         self.publish_landmarks(simulation.landmarks, stamp)
         for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):
-            self.camera(name).publish(stamp, seen, poses.take(step.frame), step.svp_lens)
+            pose = poses.take(step.frame)
+            picture = self._photograph(step, pose) if self.photographs else seen
+            self.camera(name).publish(stamp, picture, pose, step.svp_lens)
         if self._markers.get_subscription_count():
             world = self.settings.world_frame
             self._markers.publish(messages.markers_message(_shapes(step), stamp, world))
+
+    def _photograph(self, step: SweepSet, pose: Pose) -> Pixels:
+        rng = np.random.default_rng([step.scenario.seed, step.number, step.place])
+        printed = _printed(self.settings.photograph)
+        return render(step.simulation.lens, printed, pose, Exposure(), rng)
+
+
+def _printed(board: str) -> Print:
+    pattern = parse_pattern(board)
+    if pattern.kind != 'chessboard':
+        raise ParameterError(f'photograph is {board!r}; only a chessboard can be rendered')
+    return Print(pattern.columns, pattern.rows, pattern.size)
 
 
 def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]:

@@ -4,28 +4,43 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph
-from helpers.photographs import BOARD, PRINTED, photograph, poses, true_corners
+from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, true_corners
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from scipy.stats import chi2
 
-from fisheye_svp_ros.io.decoding import read_image_points, read_landmarks
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
+from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2  # isort: skip
+
+from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.io.decoding import (
+    read_image_points,
+    read_key_values,
+    read_landmarks,
+    read_pose,
+    stamp_of,
+)
+from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.nodes.detector import Detector
-from fisheye_svp_ros.nodes.messages import header
+from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.messages import header, image_message
+from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+from fisheye_svp_ros.pose import quaternion_from_rotation
 
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def raw(pixels: NDArray[np.uint8], stamp: int) -> Any:
-    height, width = pixels.shape
-    return Image(header=header(stamp, 'camera'), height=height, width=width, encoding='mono8',
-                 is_bigendian=0, step=width, data=array('B', pixels.tobytes()))
+    return image_message(pixels, stamp, 'camera')
 
 
 @pytest.fixture
@@ -70,3 +85,97 @@ def test_compressed_and_bad_images(graph: Graph) -> None:
     assert not any(p.header.stamp.nanosec in (6, 7) for p in points[heard:])
     graph.until(lambda: (images.publish(raw(image, 8)),
                          any(p.header.stamp.nanosec == 8 for p in points))[1])
+
+
+def test_a_search_is_bounded_and_the_next_image_is_searched(ros_domain: int) -> None:
+    """Noise of this size takes seconds, as everything in it may be a square."""
+    g = Graph('-p', f'board:={BOARD}', '-p', 'longest_search:=0.2')
+    points, diagnostics = g.hear(PointCloud2, 'image_points'), g.hear(
+        DiagnosticArray, '/diagnostics')
+    node = g.start(Detector)
+    images = g.tell(Image, 'image', SENSOR)
+    good = photograph(poses(1, 4).take(0))
+    g.until(lambda: (images.publish(raw(good, 5)), points)[1])
+    noise = np.random.default_rng(0).integers(0, 256, good.shape, dtype=np.uint8)
+    noise = np.kron(noise, np.ones((3, 3), np.uint8))
+    node._size = None
+    # Nothing else is held up meanwhile: that the executor goes round shows it.
+    g.until(lambda: (images.publish(raw(noise, 6)), node._counts['searches broken off'])[1])
+    node._size = None
+    g.until(lambda: (images.publish(raw(good, 7)),
+                     any(p.header.stamp.nanosec == 7 for p in points))[1])
+    g.until(lambda: any(pair.key == 'searches broken off' and int(pair.value)
+                        for m in diagnostics for pair in m.status[0].values))
+    g.close()
+
+
+def test_from_rendered_images_to_the_true_pose(ros_domain: int, tmp_path: Path) -> None:
+    """Camera, detector and localizer as a user starts them; the error within its covariance."""
+    lens = tmp_path / 'small.yaml'
+    save_lens(LENS, lens)
+    where = poses(2, 4)
+    listed = [float(value) for i in range(2) for value in (
+        *where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))]
+    g = Graph('-p', f'board:={BOARD}', '-p', f'photograph:={BOARD}', '-p', f'lens:={lens}',
+              '-p', f'poses:={listed}', '-p', 'rate:=2.0', '-p', 'sigma_px:=0.04',
+              '-p', 'board_frame:=world', '-p', 'patience:=0.5')
+    images, estimated = g.hear(Image, 'image', SENSOR), g.hear(
+        PoseWithCovarianceStamped, 'localizer/pose')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    for kind in (Detector, Localizer, SyntheticCamera):
+        g.start(kind)
+
+    def known() -> dict[int, dict[str, float]]:
+        read = {stamp_of(m): read_key_values(m) for m in results}
+        return {stamp: {k: float(v) for k, v in values.items()} for stamp, values in
+                read.items() if 'position_error_m' in values}
+
+    g.until(lambda: len(known()) > 2)
+    assert images[0].encoding == 'mono8' and (images[0].width, images[0].height) == (424, 400)
+    assert not g.probe.count_publishers('/synthetic_camera/image_points')
+    for message in estimated:
+        metrics = known().get(stamp_of(message))
+        if metrics is None:
+            continue
+        pose = read_pose(message.pose)
+        truth = min((where.take(i) for i in range(2)),
+                    key=lambda one: float(np.linalg.norm(one.position - pose.position)))
+        error = pose.difference(truth)
+        covariance = np.reshape(message.pose.covariance, (6, 6))
+        assert error @ np.linalg.solve(covariance, error) < chi2.isf(1e-4, 6)
+        assert metrics['position_error_m'] == pytest.approx(np.linalg.norm(error[:3]))
+    g.close()
+
+
+@pytest.mark.parametrize(('parameters', 'reason'), [
+    ((f'board:={BOARD}', 'detections:=true'), 'must be an aprilgrid'),
+    (('detections:=true',), 'apriltag_msgs is not installed'),
+])
+def test_tags_of_others_need_their_messages_and_a_grid(
+    ros_domain: int, parameters: tuple[str, ...], reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('fisheye_svp_ros.nodes.detector.find_spec', lambda name: None)
+    if 'grid' in reason:
+        monkeypatch.setattr('fisheye_svp_ros.nodes.detector._tag_array', lambda: DiagnosticArray)
+    g = Graph(*(word for p in parameters for word in ('-p', p)))
+    with pytest.raises(ParameterError, match=reason):
+        g.start(Detector)
+    g.close()
+
+
+def test_tags_that_others_found(ros_domain: int, tmp_path: Path) -> None:
+    grid = tmp_path / 'grid.yaml'
+    grid.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
+                    'tagSpacing: 0.3\n')
+    g = Graph('-p', f'board:=aprilgrid:{grid}')
+    node = g.start(Detector)
+    corners = [SimpleNamespace(x=10.0 + i, y=20.0) for i in range(4)]
+    tags = [SimpleNamespace(id=number, corners=corners) for number in (2, 99)]
+    message = SimpleNamespace(detections=tags, header=SimpleNamespace(frame_id='camera'))
+    frame, ids, uv = node._read_tags(message, 'detections')
+    assert frame == 'camera' and ids.tolist() == [8, 9, 10, 11]
+    assert uv.tolist() == [[9.5 + i, 19.5] for i in range(4)]
+    with pytest.raises(ObservationError, match='no tag of the board among 1'):
+        message.detections = tags[1:]
+        node._read_tags(message, 'detections')
+    g.close()

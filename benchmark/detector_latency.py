@@ -1,0 +1,127 @@
+"""How long the nodes take from an image to a pose: python -m benchmark.detector_latency.
+
+Rendered images of 848 x 800 px of a board that moves slowly go to a detector and a localizer, each
+a process of its own, all of them on one core; what counts is the time from publishing an image
+until its pose is here.  Leave the machine alone meanwhile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros import standalone
+
+standalone.install()
+
+import rclpy  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from sensor_msgs.msg import Image  # noqa: E402
+
+from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
+from fisheye_svp_ros.io.lens_files import save_lens  # noqa: E402
+from fisheye_svp_ros.nodes.messages import image_message  # noqa: E402
+from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt  # noqa: E402
+from fisheye_svp_ros.optics.lens import Lens  # noqa: E402
+from fisheye_svp_ros.pose import Pose  # noqa: E402
+from fisheye_svp_ros.simulate.board_views import board_views  # noqa: E402
+from fisheye_svp_ros.simulate.render import Exposure, Print, render  # noqa: E402
+
+LENS = Lens('wide', 848, 800, 285.2, 284.9, 424.3, 398.7,
+            KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0), Gennery(e0=0.003))
+BOARD, PRINTED = 'chessboard:9x6:25mm', Print(9, 6, 0.025)
+STEP = 0.002  # m, from image to image
+PACE = 5.0  # images a second
+PATIENCE = 120.0  # s
+
+
+def images(count: int) -> list[Any]:
+    """Return images of a board past which the camera moves."""
+    rng = np.random.default_rng(1)
+    start = board_views(LENS, PRINTED, 1, (0.2, 0.25), rng).take(0)
+    along = start.rotation[:, 0] * STEP
+    poses = [Pose(start.rotation, start.position + i * along) for i in range(count)]
+    return [render(LENS, PRINTED, pose, Exposure(), rng) for pose in poses]
+
+
+def command(node: str, *parameters: str) -> list[str]:
+    """Return what runs a node with parameters."""
+    words = [word for one in parameters for word in ('-p', one)]
+    return [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', node, '--ros-args', *words]
+
+
+def latencies(pictures: list[Any]) -> np.ndarray:
+    """Return the time from each image to its pose, s; NaN where none came."""
+    rclpy.init(args=[])
+    node = rclpy.create_node('clock_keeper')
+    arrived: dict[int, float] = {}
+    node.create_subscription(
+        PoseWithCovarianceStamped, '/localizer/pose',
+        lambda m: arrived.setdefault(stamp_of(m), time.monotonic()), 100)
+    sender = node.create_publisher(
+        Image, '/image', QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    sent: dict[int, float] = {}
+
+    def send(number: int, stamp: int) -> None:
+        message = image_message(pictures[number], stamp, 'camera')
+        sent[stamp] = time.monotonic()
+        sender.publish(message)
+
+    def spin(seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            rclpy.spin_once(node, timeout_sec=0.001)
+
+    end = time.monotonic() + PATIENCE
+    while not arrived:  # until everybody has found everybody
+        if time.monotonic() > end:
+            raise SystemExit('no pose came')
+        send(0, 1 + len(sent))
+        spin(0.5)
+    spin(2.0)
+    sent.clear()
+    for number in range(len(pictures)):
+        send(number, 10_000 + number)
+        spin(1 / PACE)
+    spin(1.0)
+    node.destroy_node()
+    rclpy.shutdown()
+    return np.array([arrived.get(stamp, np.nan) - when for stamp, when in sent.items()])
+
+
+def main() -> None:
+    """Measure, and print one line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--count', type=int, default=40, help='images')
+    count = parser.parse_args().count
+    pictures = images(count)
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    os.environ.setdefault('ROS_DOMAIN_ID', '99')
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    os.environ |= {'OMP_NUM_THREADS': '1', 'OPENBLAS_NUM_THREADS': '1'}
+    with tempfile.TemporaryDirectory() as folder:
+        lens = Path(folder) / 'lens.yaml'
+        save_lens(LENS, lens)
+        nodes = [subprocess.Popen(command('detector', f'board:={BOARD}')),
+                 subprocess.Popen(command('localizer', f'lens:={lens}', 'patience:=0.0'))]
+        try:
+            found = 1e3 * latencies(pictures)
+        finally:
+            for process in nodes:
+                process.terminate()
+    low, middle, high = np.nanpercentile(found, [5, 50, 95])
+    print(f'{count} images of {LENS.width} x {LENS.height} px, {np.isfinite(found).sum()} poses: '
+          f'median {middle:.0f} ms, 5 to 95 %: {low:.0f} to {high:.0f} ms')
+
+
+if __name__ == '__main__':
+    main()
