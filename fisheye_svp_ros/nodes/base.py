@@ -125,9 +125,13 @@ class BaseNode(Node):  # type: ignore[misc]
         Raises FisheyeSvpError where they cannot be used.
         """
         self._warn_of_unknown_parameters()
-        self.configure(self.prepare(self.settings))
+        self.take_up()
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self.guarded(self._adopt))
+
+    def take_up(self) -> None:
+        """Take the parameters as they are into use; raise FisheyeSvpError where that fails."""
+        self.configure(self.prepare(self.settings))
 
     def prepare(self, settings: Any) -> Any:
         """Return what `configure` needs; raise FisheyeSvpError to refuse the settings."""
@@ -230,12 +234,17 @@ class BaseNode(Node):  # type: ignore[misc]
 
         create = functools.partial(self._with_qos, self.create_subscription, kind, topic)
         if qos.durability != DurabilityPolicy.TRANSIENT_LOCAL:
-            create(receive, qos=qos, raw=True)
+            self.subscribe(functools.partial(create, receive, qos=qos, raw=True))
             return
         # Only what is latched comes late; only a volatile subscription hears what is not.
         latched, volatile = twins(receive)
-        create(latched, qos=qos, raw=True)
-        create(volatile, qos=volatile_qos, entity='volatile', raw=True)
+        self.subscribe(functools.partial(create, latched, qos=qos, raw=True))
+        self.subscribe(functools.partial(
+            create, volatile, qos=volatile_qos, entity='volatile', raw=True))
+
+    def subscribe(self, create: Callable[[], Any]) -> None:
+        """Create a subscription."""
+        create()
 
     def listens_to(self, topic: str) -> bool:
         """Say whether there is a subscription of a topic."""

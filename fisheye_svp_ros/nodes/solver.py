@@ -31,9 +31,10 @@ from fisheye_svp_ros.io.decoding import (
 from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT, BaseNode, Unread
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT, Unread
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.join import LIMIT, Pending, StampJoin
+from fisheye_svp_ros.nodes.lifecycle import ManagedNode
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -91,7 +92,7 @@ class _Arrivals:
         return max(self._restarted - before, 1e-3)
 
 
-class SolverNode(BaseNode):
+class SolverNode(ManagedNode):
     """Joins landmarks, image points, true poses and scenario by stamp; `solve` does the rest.
 
     CAMERAS: the namespaces of the cameras, each with its slash; METRICS: all names in results;

@@ -25,6 +25,7 @@ _MODULES = {
     'rclpy.duration': 'clock',
     'rclpy.exceptions': 'exceptions',
     'rclpy.executors': 'executor',
+    'rclpy.lifecycle': 'lifecycle',
     'rclpy.logging': 'logging',
     'rclpy.node': 'node',
     'rclpy.parameter': 'parameters',

@@ -73,6 +73,11 @@ class SolverSettings(Settings):
         span=(1, 10_000)
     )
 
+    lifecycle: bool = parameter(
+        False, 'Be a managed node, of ROS 2 alone: `configure` loads the lens, `activate` listens',
+        fixed=True
+    )
+
     @property
     def solves_svp(self) -> bool:
         """Whether to solve without the viewpoint shift of the lens."""

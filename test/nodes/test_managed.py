@@ -1,0 +1,83 @@
+"""Solvers as managed nodes: nothing before configure, nothing heard before activate."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from helpers.graph import Graph, set_parameter
+
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
+
+from fisheye_svp_ros import standalone
+from fisheye_svp_ros.errors import StandaloneError
+from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.model_critic import ModelCritic
+from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
+from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
+
+SOLVERS = (Localizer, StereoCalibrator, StereoDepth, ModelCritic)
+genuine = pytest.mark.skipif(not standalone.is_genuine(), reason='ROS 2 is not installed here')
+
+
+@pytest.fixture
+def graph(ros_domain: int) -> Iterator[Graph]:
+    one = Graph('-p', 'lifecycle:=true', '-p', 'rate:=20.0', '-p', 'lens:=fish180')
+    yield one
+    one.close()
+
+
+@pytest.mark.skipif(standalone.is_genuine(), reason='of the standalone client')
+def test_standalone_says_what_it_lacks(graph: Graph) -> None:
+    with pytest.raises(StandaloneError, match='leave the parameter lifecycle at false'):
+        graph.start(Localizer)
+
+
+@genuine
+@pytest.mark.parametrize('kind', SOLVERS)
+def test_only_an_active_node_listens(graph: Graph, kind: type) -> None:
+    from rclpy.lifecycle import TransitionCallbackReturn
+
+    node, success = graph.start(kind), TransitionCallbackReturn.SUCCESS
+    topic = f'/{node.cameras[0]}image_points'
+    assert node.trigger_configure() == success
+    assert not graph.probe.count_subscribers(topic)
+    for _ in range(2):
+        assert node.trigger_activate() == success
+        graph.until(lambda: graph.probe.count_subscribers(topic) == 1)
+        assert node.trigger_deactivate() == success
+        graph.until(lambda: not graph.probe.count_subscribers(topic))
+    assert node.trigger_cleanup() == success and node.trigger_shutdown() == success
+
+
+@genuine
+def test_results_come_while_it_is_active(graph: Graph) -> None:
+    results = graph.hear(DiagnosticArray, 'localizer/result')
+    node = graph.start(Localizer)
+    graph.start(SyntheticCamera)
+    node.trigger_configure()
+    graph.idle(0.5)
+    assert not results
+    node.trigger_activate()
+    graph.until(lambda: len(results) > 2)
+    node.trigger_deactivate()
+    graph.idle(0.5)
+    count = len(results)
+    graph.idle(0.5)
+    assert len(results) == count
+
+
+@genuine
+def test_a_lens_that_cannot_be_loaded_leaves_it_unconfigured(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    from rclpy.lifecycle import TransitionCallbackReturn
+
+    graph = Graph('-p', 'lifecycle:=true', '-p', f'lens:={tmp_path / "nosuch.yaml"}')
+    node = graph.start(Localizer)
+    assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
+    assert set_parameter(node, 'lens', 'fish214').successful
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    graph.close()
