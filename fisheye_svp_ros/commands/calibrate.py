@@ -131,11 +131,10 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
     from fisheye_svp_ros.commands.notes import note_left_out, say
 
     _print(result, trust)
-    for name, range_ in trust.shift.items():
+    for name, range_ in trust.doubtful_shift.items():
         low, high = 1e3 * range_.low, 1e3 * range_.high
-        if not range_.settled:
-            say(f'{name} is not settled: from {low:.2f} to {high:.2f} mm over all targets that '
-                'these data admit, whose shape can explain it; ask `fisheye-svp diagnose`')
+        say(f'{name} is not settled: from {low:.2f} to {high:.2f} mm over all targets that '
+            'these data admit, whose shape can explain it; ask `fisheye-svp diagnose`')
     note_left_out(result.left_out)
     if not result.adjusted.converged:
         say('the adjustment has not converged; take the lens for a rough one')
@@ -197,22 +196,29 @@ def _rig(
 def _print(result: Calibration, trust: Trust) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.reporting.tables import noise_text, print_table, with_error
+    from fisheye_svp_ros.reporting.tables import interval, noise_text, print_table, with_error
 
     lens = result.adjusted.lens
     figures = lens.calibration or {}
-    errors = dict(trust.stderr)
+    errors, ranges = dict(trust.stderr), dict(trust.admissible)
     if 'f' in errors:
         errors['fx'] = errors['fy'] = errors['f']
+        ranges['fx'] = ranges['fy'] = ranges['f']
+    open_ones = {name: interval(one.low, one.high) for name, one in ranges.items()
+                 if not one.settled}
     print_table(
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
-        ('parameter', 'value', 'std. error', 'unit'),
+        ('parameter', 'value', 'std. error', 'with any target', 'unit'),
         [
-            (name, *with_error(value, errors.get(name, 0.0)), _UNITS.get(name, '1'))
+            (name, *with_error(value, errors.get(name, 0.0)),
+             open_ones.get(name, ''), _UNITS.get(name, '1'))
             for name, value in lens.parameters.items()
         ],
     )
+    if open_ones:
+        print('  with any target: 95 %, its shape, scale and boards as the data have them and as '
+              'they are said to be')
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}; {noise_text(result.sigma)}')
 
 
@@ -233,7 +239,7 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
         ),
         'covariance': adjusted.covariance.tolist(),
         'stderr': trust.stderr,
-        'admissible': {name: asdict(range_) for name, range_ in trust.shift.items()},
+        'admissible': {name: asdict(range_) for name, range_ in trust.admissible.items()},
     }
 
 

@@ -13,17 +13,18 @@ from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo
 from fisheye_svp_ros.diagnosis.model import fit, prepare, start
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
-SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
+_SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _WIDE = 2.0  # standard errors of an interval
 
 
 @dataclass(frozen=True)
 class Admissible:
-    """A coefficient of a viewpoint shift, m, over all targets that the data admit.
+    """A parameter of a lens over all targets that the data admit.
 
     low, high: of 95 % intervals with the target as it is said to be and with its shape, scale and
-    boards free; settled: whether both intervals agree that it is not zero.
+    boards free; settled: whether the two agree, for a viewpoint shift also that it is not zero.
     """
 
     low: float
@@ -33,10 +34,16 @@ class Admissible:
 
 @dataclass(frozen=True)
 class Trust:
-    """Standard errors of a calibration's parameters, by name, and the range of its shift."""
+    """Standard errors of parameters, the target as it is said to be, and their ranges, by name."""
 
     stderr: dict[str, float]
-    shift: dict[str, Admissible]
+    admissible: dict[str, Admissible]
+
+    @property
+    def doubtful_shift(self) -> dict[str, Admissible]:
+        """The coefficients of a viewpoint shift that a target of another shape can explain."""
+        return {name: range_ for name, range_ in self.admissible.items()
+                if name in _SHIFT_NAMES and not range_.settled}
 
 
 def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust:
@@ -48,14 +55,15 @@ def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust
     evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
     errors = standard_errors(evidence)
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    shift = {
-        name: _over_targets(evidence, i, float(lens.parameters[name]), stderr[name])
-        for i, name in enumerate(names) if name in SHIFT_NAMES
-    }
-    return Trust(stderr, shift)
+    return Trust(stderr, {
+        name: _over_targets(evidence, i, name, float(value), stderr[name])
+        for i, (name, value) in enumerate(zip(names, parameter_values(lens, names), strict=True))
+    })
 
 
-def _over_targets(evidence: Evidence, column: int, value: float, stderr: float) -> Admissible:
+def _over_targets(
+    evidence: Evidence, column: int, name: str, value: float, stderr: float
+) -> Admissible:
     """Return the range of a parameter with the target as it is said to be, and free."""
     columns, prior = [np.arange(evidence.own)], [np.zeros(evidence.own)]
     for form, effect in enumerate(evidence.forms.effects):
@@ -73,6 +81,6 @@ def _over_targets(evidence: Evidence, column: int, value: float, stderr: float) 
     spread = float(np.sqrt(max(inverse[column, column], 0.0)) / scale)
     pairs = ((value, stderr), (moved, spread))
     ends = [middle + sign * _WIDE * error for middle, error in pairs for sign in (-1, 1)]
-    alike = all(end > 0 for end in ends) or all(end < 0 for end in ends)
+    sure = name not in _SHIFT_NAMES or min(ends) > 0 or max(ends) < 0
     near = abs(moved - value) < _WIDE * np.hypot(stderr, spread)
-    return Admissible(min(ends), max(ends), bool(alike and near))
+    return Admissible(min(ends), max(ends), bool(sure and near))

@@ -63,6 +63,12 @@ def with_error(value: float, standard_error: float) -> tuple[str, str]:
     return f'{value:.{decimals}f}', f'{standard_error:.{decimals}f}'
 
 
+def interval(low: float, high: float) -> str:
+    """Return an interval as text, to two digits of its width."""
+    width = 0.1 * (high - low)
+    return ' … '.join(with_error(end, width)[0] for end in (low, high))
+
+
 def noise_text(sigma: float | None) -> str:
     """Say what noise the standard errors rest on: sigma, px, estimated, or None if given."""
     if sigma is None:

@@ -12,6 +12,7 @@ from fisheye_svp_ros.diagnosis.model import fit, prepare, start
 from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
 SIGMA, SHIFT = 0.1, 0.004
 DRAWS = 14
@@ -49,5 +50,18 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     shifted = ViewpointShiftEffect(1).curved(lens(), np.array([1e-6]))
     found = trust(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
     assert set(found.stderr) == {'fx', 'fy', 'cx', 'cy', 'e0'}
-    assert not found.shift['e0'].settled
-    assert found.shift['e0'].low < 0 < found.shift['e0'].high
+    assert not found.admissible['e0'].settled
+    assert found.admissible['e0'].low < 0 < found.admissible['e0'].high
+
+
+def test_ranges_over_targets_hold_the_one_that_was_believed():
+    rng = np.random.default_rng(6)
+    pose, views = scene(rng, frames=16)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    found = trust(table, lens(), ('fx', 'fy', 'cx', 'cy'))
+    for name, value in zip(('fx', 'fy', 'cx', 'cy'), parameter_values(
+            lens(), ('fx', 'fy', 'cx', 'cy')), strict=True):
+        range_ = found.admissible[name]
+        assert range_.low <= value - 1.9 * found.stderr[name]
+        assert range_.high >= value + 1.9 * found.stderr[name]
+    assert found.doubtful_shift == {}

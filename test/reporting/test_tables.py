@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fisheye_svp_ros.reporting.tables import print_table
+from fisheye_svp_ros.reporting.tables import interval, print_table
 
 
 @pytest.mark.parametrize('columns', ['40', '120'])
@@ -19,3 +19,8 @@ def test_numbers_are_never_cut(
     for cell in (*header, *(f'-123456.{i:04}' for i in range(8))):
         assert cell in printed
     assert '…' not in printed
+
+
+def test_an_interval_has_two_digits_of_its_width() -> None:
+    assert interval(355.937, 358.911) == '355.94 … 358.91'
+    assert interval(-0.00022, 0.0003) == '-0.000220 … 0.000300'
