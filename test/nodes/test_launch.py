@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -13,9 +13,13 @@ from helpers.nodes import NodeProcess
 pytest.importorskip('launch_ros')
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from helpers.graph import Graph
+from helpers.photographs import BOARD, LENS, poses
 
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.decoding import read_key_values
+from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.pose import quaternion_from_rotation
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 
@@ -39,6 +43,23 @@ localizer: {ros__parameters: {svp: true}}
 
 
 @pytest.fixture
+def launch(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
+    """Return a function that launches a file of this package."""
+    started: list[NodeProcess] = []
+
+    def start(*words: str) -> NodeProcess:
+        started.append(NodeProcess(['ros2', 'launch', 'fisheye_svp_ros', *words],
+                                   dict(os.environ)))
+        return started[-1]
+
+    yield start
+    for one in started:
+        if one.process.poll() is None:
+            one.process.send_signal(signal.SIGINT)
+            one.process.wait(60)
+
+
+@pytest.fixture
 def graph(ros_domain: int) -> Iterator[Graph]:
     """Return a graph with nothing but a probe."""
     one = Graph()
@@ -48,7 +69,7 @@ def graph(ros_domain: int) -> Iterator[Graph]:
 
 def test_every_launch_file_is_tested() -> None:
     files = {path.name for path in (SHARE / 'launch').glob('*.launch.py')}
-    assert files == {*FILES, 'sweep.launch.py'}
+    assert files == {*FILES, 'sweep.launch.py', 'camera.launch.py'}
 
 
 def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path) -> None:
@@ -125,3 +146,69 @@ def test_a_launch_file_starts_nodes_that_give_results_and_end_cleanly(
     text = '\n'.join(launch.lines)
     assert 'Traceback' not in text and 'has died' not in text
     assert text.count('process has finished cleanly') == text.count('process started with pid')
+
+
+def test_arguments_reach_the_nodes_and_frames_resolve(
+    graph: Graph, launch: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    """Namespace, parameter file, tf2, log level and respawn, as a user composes them."""
+    tf2 = pytest.importorskip('tf2_ros')
+    from rclpy.time import Time
+
+    params = tmp_path / 'mine.yaml'
+    params.write_text('/**: {ros__parameters: {radius: 0.5, world_frame: map, svp: false}}')
+    buffer = tf2.Buffer()
+    tf2.TransformListener(buffer, graph.probe)
+    scenarios = graph.hear(DiagnosticArray, '/robot/scenario')
+    mono = launch('mono.launch.py', 'namespace:=robot', f'params:={params}', 'publish_tf:=true',
+                  'log_level:=debug', 'respawn:=true')
+    pid = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
+    for child in ('camera_optical_frame', 'camera_optical_frame_true'):
+        graph.until(lambda child=child: buffer.can_transform('map', child, Time()))
+    between = buffer.lookup_transform(
+        'camera_optical_frame_true', 'camera_optical_frame', Time()).transform.translation
+    assert max(abs(between.x), abs(between.y), abs(between.z)) < 1e-6
+    assert read_key_values(scenarios[0])['radius'] == '0.5'
+    os.kill(pid, signal.SIGKILL)
+    again = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
+    assert again != pid
+
+
+def test_a_rig_and_its_points_resolve(
+    graph: Graph, launch: Callable[..., NodeProcess]
+) -> None:
+    tf2 = pytest.importorskip('tf2_ros')
+    from rclpy.time import Time
+
+    buffer = tf2.Buffer()
+    tf2.TransformListener(buffer, graph.probe)
+    launch('stereo.launch.py', 'publish_tf:=true', 'svp:=false')
+    for child in ('right_camera_optical_frame', 'left_camera_optical_frame'):
+        graph.until(lambda child=child: buffer.can_transform('world', child, Time()))
+    rig = buffer.lookup_transform(
+        'right_camera_optical_frame', 'left_camera_optical_frame', Time())
+    assert rig.transform.translation.x == pytest.approx(-0.15, abs=1e-6)
+
+
+def test_a_camera_is_localized_with_its_camera_info(
+    graph: Graph, launch: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    """Rendered photographs in place of a live camera; its camera_info beside them."""
+    lens = tmp_path / 'small.yaml'
+    save_lens(LENS, lens)
+    pose = poses(1, 4).take(0)
+    listed = [float(v) for v in (*pose.position, *quaternion_from_rotation(pose.rotation))]
+    results = graph.hear(DiagnosticArray, '/localizer/result')
+    program = SHARE.parents[1] / 'lib' / 'fisheye_svp_ros' / 'synthetic_camera'
+    camera = NodeProcess(
+        [str(program), '--ros-args', '-p', 'rate:=2.0',
+         '-p', f'photograph:={BOARD}', '-p', f'lens:={lens}', '-p', f'poses:={listed}',
+         '-r', '__ns:=/camera'], dict(os.environ))
+    launch('camera.launch.py', 'image:=/camera/image', f'board:={BOARD}')
+    try:
+        graph.until(lambda: any(read_key_values(m).get('rms_px') for m in results), 120)
+        metrics = next(read_key_values(m) for m in results if read_key_values(m).get('rms_px'))
+        # What is left is the viewpoint shift, of which camera_info knows nothing.
+        assert 0.0 < float(metrics['rms_px']) < 3.0 and float(metrics['points']) == 30
+    finally:
+        camera.finish(signal.SIGINT)
