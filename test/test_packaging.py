@@ -70,3 +70,17 @@ def test_readme_names_the_extras(distribution: Any) -> None:
     text = (ROOT / 'README.md').read_text()
     for extra in distribution.extras_require:
         assert f'`{extra}`' in text
+
+
+def test_the_quality_declaration_says_what_a_release_lacks() -> None:
+    path = ROOT / 'docs' / 'release.py'
+    space: dict[str, Any] = {'__file__': str(path), '__name__': 'release'}
+    exec(path.read_text(encoding='utf-8'), space)
+    declared = (ROOT / 'QUALITY_DECLARATION.md').read_text().partition('## What a release')[2]
+    assert sorted(space['findings']()) == sorted(re.findall('^- (.*)$', declared, re.MULTILINE))
+
+
+def test_the_quality_declaration_links_what_is_there() -> None:
+    text = (ROOT / 'QUALITY_DECLARATION.md').read_text()
+    for target in re.findall(r'\]\((docs[^)#]*|LICENSE)\)', text):
+        assert (ROOT / target).exists(), target
