@@ -25,6 +25,7 @@ COMMANDS = {
     'lens': 'a lens shown, checked, converted; also those of other tools',
     'localize': 'a pose a frame, without start values: residuals, covariance',
     'paper': "Kita's tables and figures beside the published ones, and past them",
+    'plan': 'which photographs to take to calibrate a lens: a shot list to print',
     'plot': 'pictures of a recording, a table or a sweep',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'render': 'photographs of a chessboard through a lens, and the truth about them',

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
                         metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
                         + '; kannala_brandt by default')
-    parser.add_argument('--image-size', type=_image_size, metavar='WxH',
+    parser.add_argument('--image-size', type=image_size, metavar='WxH',
                         help='width and height of the image, px; photographs bring their own, and '
                         'so do observations from `detect`')
     parser.add_argument('--free', type=_names, metavar='NAME,...',
@@ -243,7 +243,8 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     }
 
 
-def _image_size(text: str) -> tuple[int, int]:
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height, px, of a text such as 1280x800."""
     width, _, height = text.lower().partition('x')
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise argparse.ArgumentTypeError(f'{text!r} is not of the form 1280x800')

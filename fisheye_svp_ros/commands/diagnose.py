@@ -7,9 +7,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.errors import ParameterError
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
     from fisheye_svp_ros.diagnosis.known_truth import Compared
+    from fisheye_svp_ros.diagnosis.next_question import Next
     from fisheye_svp_ros.diagnosis.points import PointResiduals
     from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
@@ -39,6 +42,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='an effect that is known not to be there: it is not tried')
     parser.add_argument('--quick', action='store_true',
                         help='a first answer: one round, without held-out frames in the choice')
+    parser.add_argument('--next', type=int, default=0, metavar='N', dest='count',
+                        help='say which N photographs to take next: those that settle what the '
+                        'cause may be mistaken for')
+    parser.add_argument('--for', dest='number', metavar='NAME',
+                        help='with --next: those that tell this number best (e0, fx, ...)')
+    parser.add_argument('--room', type=float, nargs=2, metavar='M',
+                        help='with --next: nearest and furthest distance at which the board is '
+                        'sharp; by default a little beyond those that there are')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for report.html and its pictures, diagnosis.json, '
                         'extended_lens.yaml, residuals.csv')
@@ -56,6 +67,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.progress import stages
 
+    if (args.number or args.room) and not args.count:
+        raise ParameterError('--for and --room go with --next N')
     lens = load_lens(lens_path(args.lens))
     free = args.free == 'intrinsics' or lens.calibration is not None
     observations = _read(args.observations, args, lens)
@@ -72,10 +85,20 @@ def run(args: argparse.Namespace) -> None:
         progress('errors where the truth is known')
         names = intrinsic_names(lens) if free else ()
         known = known_errors(diagnosis.before, diagnosis.after, names)
+        wanted = _wanted(args, diagnosis) if args.count else None
         if args.output:
             progress('report')
-            _write(args, diagnosis, known, free)
-    _print(diagnosis, known, args.output)
+            _write(args, diagnosis, known, free, wanted)
+    _print(diagnosis, known, args.output, wanted)
+
+
+def _wanted(args: argparse.Namespace, diagnosis: Diagnosis) -> Next:
+    from fisheye_svp_ros.commands.plan import room_of
+    from fisheye_svp_ros.diagnosis.next_question import next_photographs
+
+    room = None if args.room is None else room_of(args.room)
+    return next_photographs(diagnosis.after, diagnosis.causes, diagnosis.noise_px, args.count,
+                            args.number, room)
 
 
 def _read(path: str, args: argparse.Namespace, lens: Lens) -> Observations:
@@ -89,9 +112,10 @@ def _read(path: str, args: argparse.Namespace, lens: Lens) -> Observations:
 
 
 def _print(
-    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None
+    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None, wanted: Next | None
 ) -> None:
     from fisheye_svp_ros.reporting import diagnosis_text as text
+    from fisheye_svp_ros.reporting import shot_list
     from fisheye_svp_ros.reporting.tables import print_paragraphs, print_table
 
     print_paragraphs(
@@ -106,12 +130,16 @@ def _print(
             f'{diagnosis.base.heldout_rms_px:.4f} px without any cause',
             text.CAUSE_HEADER, text.cause_rows(diagnosis), words=text.CAUSE_WORDS,
         )
+    if wanted:
+        print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
+                    shot_list.rows(wanted), words=shot_list.WORDS)
     if folder:
         print(f'{folder}: report.html, diagnosis.json, {text.EXTENDED}, residuals.csv')
 
 
 def _write(
-    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool
+    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool,
+    wanted: Next | None,
 ) -> None:
     from fisheye_svp_ros.diagnosis.points import point_residuals
     from fisheye_svp_ros.io.lens_files import save_lens
@@ -121,12 +149,15 @@ def _write(
 
     folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
     truth = {name: compared._asdict() for name, compared in known.items()}
-    write_json(folder / 'diagnosis.json', {**diagnosis.to_dict(), 'known_truth': truth})
+    document = {**diagnosis.to_dict(), 'known_truth': truth}
+    if wanted:
+        document['next'] = wanted.to_list()
+    write_json(folder / 'diagnosis.json', document)
     save_lens(diagnosis.lens, folder / EXTENDED)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations.cameras)
     write_report(diagnosis, points, known, Inputs(
         args.observations, args.lens, args.poses, args.held_out, folder, free
-    ))
+    ), wanted)
 
 
 def _write_residuals(path: Path, points: PointResiduals, cameras: Sequence[str]) -> None:

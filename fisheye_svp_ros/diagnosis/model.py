@@ -138,7 +138,7 @@ class Linearised:
     """
 
     def __init__(self, data: Data, state: State, free: Sequence[str]) -> None:
-        self.data, self.state = data, state
+        self.data, self.state, self.free = data, state, tuple(free)
         self.model = ForwardModel(state.lens, state.terms)
         pose = state.view_poses(data)
         self.linear: LinearViews = self.model.linearise(pose, data.views)

@@ -14,10 +14,13 @@ from fisheye_svp_ros.diagnosis.budget import stage_shares
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
+from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting import diagnosis_text as text
+from fisheye_svp_ros.reporting import shot_list
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
 from fisheye_svp_ros.reporting.target_map import BoardMap, board_maps
@@ -60,13 +63,19 @@ class Inputs(NamedTuple):
 
 
 def write_report(
-    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Compared], inputs: Inputs
+    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Compared], inputs: Inputs,
+    wanted: Next | None = None,
 ) -> list[Path]:
     """Write report.html and its pictures into a folder; return the files.
 
+    wanted: the photographs to take next, if they were asked for.
     Raises OutputError where one cannot be written.
     """
     pictures = list(_draw(diagnosis, points, inputs.folder))
+    if wanted is not None:
+        pictures.append(inputs.folder / 'next.png')
+        state = diagnosis.after.state
+        shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'), autoescape=True,
         undefined=jinja2.StrictUndefined, trim_blocks=True,
@@ -75,14 +84,22 @@ def write_report(
         d=diagnosis, inputs=inputs, percent=text.percent, significance=SIGNIFICANCE,
         headline=text.VERDICTS[diagnosis.verdict],
         sentences=text.verdict_sentences(diagnosis, known),
-        pictures={'target': None, 'evidence': None, **{p.stem: _data_uri(p) for p in pictures}},
+        pictures={'target': None, 'evidence': None, 'next': None,
+                  **{p.stem: _data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
-        known=list(text.known_rows(known)), free=_free(inputs),
+        next=_next(wanted), known=list(text.known_rows(known)), free=_free(inputs),
     )
     report = inputs.folder / 'report.html'
     write_text(report, page)
     return [report, *pictures]
+
+
+def _next(wanted: Next | None) -> dict[str, Any]:
+    if wanted is None:
+        return {}
+    return {'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
+            'rows': shot_list.rows(wanted)}
 
 
 def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:

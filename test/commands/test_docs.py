@@ -18,7 +18,7 @@ from helpers.nodes import ROOT
 from fisheye_svp_ros import cli, standalone
 
 PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
-         'whats_wrong.md', 'photographs.md', 'water.md',
+         'whats_wrong.md', 'photographs.md', 'water.md', 'next_photographs.md',
          '../README.md')
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)

@@ -1,0 +1,100 @@
+"""`fisheye-svp plan`: which photographs to take, before the first one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fisheye_svp_ros.errors import ParameterError
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.next_photographs import Room
+    from fisheye_svp_ros.optics.lens import Lens
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('--lens', metavar='LENS',
+                        help='a lens of the same type: a file, or the name of one that comes with '
+                        'the package')
+    parser.add_argument('--fov', type=float, metavar='DEG',
+                        help='in place of a lens: its field of view over the width of the image')
+    parser.add_argument('--image-size', metavar='WxH', help='with --fov: 1280x800')
+    parser.add_argument('--board', required=True, metavar='SPEC',
+                        help='the board: chessboard:9x6:25mm, charuco:..., aprilgrid:FILE, ...')
+    parser.add_argument('--room', type=float, nargs=2, required=True, metavar='M',
+                        help='nearest and furthest distance of the board: where it is sharp, and '
+                        'inside the room')
+    parser.add_argument('--count', type=int, default=12, metavar='N',
+                        help='how many photographs (12)')
+    parser.add_argument('--for', dest='number', metavar='NAME',
+                        help='the number that matters most: e0, fx, cx, k1, ...; by default the '
+                        'lens as a whole')
+    parser.add_argument('--noise', type=float, default=0.1, metavar='PX',
+                        help='noise of u and of v of a corner (0.1)')
+    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+                        help='folder for plan.pdf to print, plan.json, poses.csv (for `render`)')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Choose, print, draw."""
+    import numpy as np
+
+    from fisheye_svp_ros.detect.patterns import parse_pattern
+    from fisheye_svp_ros.diagnosis.plan import plan
+    from fisheye_svp_ros.effects.forward import ForwardModel
+    from fisheye_svp_ros.io.readers import write_poses
+    from fisheye_svp_ros.io.results import write_json
+    from fisheye_svp_ros.reporting import shot_list
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    if args.count < 1 or not args.noise > 0:
+        raise ParameterError('--count and --noise must be above 0')
+    lens, pattern = _lens(args), parse_pattern(args.board)
+    planned = plan(lens, pattern.points, room_of(args.room), args.count, args.number, args.noise)
+    wanted = planned.wanted
+    if args.output:
+        shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
+        write_poses(args.output / 'poses.csv', np.arange(args.count), wanted.shots.camera)
+        write_json(args.output / 'plan.json',
+                   {'photographs': wanted.to_list(), 'stderr': planned.stderr})
+    print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
+                shot_list.HEADER, shot_list.rows(wanted), words=shot_list.WORDS)
+    print('  standard errors to expect: '
+          + ', '.join(f'{name} {error:.2g}' for name, error in planned.stderr.items()))
+    if args.output:
+        print(f'{args.output}: plan.pdf, plan.json, poses.csv')
+
+
+def room_of(given: Sequence[float]) -> Room:
+    """Return the room of --room.  Raises ParameterError for an impossible one."""
+    from fisheye_svp_ros.diagnosis.next_photographs import Room
+
+    near, far = given
+    if not 0 < near < far < float('inf'):
+        raise ParameterError(f'--room {near:g} {far:g}: two distances above 0 are needed, m, the '
+                             'nearer first')
+    return Room(near, far)
+
+
+def _lens(args: argparse.Namespace) -> Lens:
+    import numpy as np
+
+    from fisheye_svp_ros.commands.calibrate import image_size
+    from fisheye_svp_ros.diagnosis.plan import nominal_lens
+    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.share import lens_path
+
+    if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
+        raise ParameterError('which lens is it? Give --lens LENS, or --fov and --image-size')
+    if args.lens is not None:
+        return load_lens(lens_path(args.lens))
+    if not 0 < args.fov < 360:
+        raise ParameterError(f'--fov {args.fov:g}: an angle between 0 and 360 degrees is needed')
+    try:
+        size = image_size(args.image_size)
+    except argparse.ArgumentTypeError as cause:
+        raise ParameterError(f'--image-size {cause}') from cause
+    return nominal_lens(size, float(np.radians(args.fov)))

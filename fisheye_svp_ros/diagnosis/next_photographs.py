@@ -1,0 +1,325 @@
+"""Which photographs to take next: views of a board that tell most of what is in doubt.
+
+Every view that a person can arrange adds information about all that is shared (lens, causes and
+their look-alikes), its own pose taken out.  Views are added greedily and then exchanged, so that
+the doubt shrinks most: the error of some numbers with all others unknown (D_s-optimal design), or
+how far a named cause is from whatever it may be mistaken for.
+Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, sections 10.3 and 12;
+Federov's exchange.  Landmarks' own random errors are left out of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.spatial import KDTree
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.budget import stage_of
+from fisheye_svp_ros.diagnosis.choice import CLASS_SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.evidence import block_basis
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.optics.lens import INTRINSICS
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.simulate.simulation import blank_views
+
+CANDIDATES = 600
+_TRIES = 12_000
+_EDGE, _SPACING = 8.0, 9.0  # px from the edge of the image and between points, to be detected
+_NEIGHBOURS = 4
+_SLANT = np.cos(np.radians(70.0))  # of a board to the ray, beyond which corners are not found
+_EXCHANGES = 4  # rounds
+_FLAT = 0.02  # thickness of a board over its length
+# What a person can set: steps of angles, rad, and distances between near and far
+_STEP, _QUARTER, _TILTS = np.radians(5.0), np.radians(45.0), np.radians([0, 15, 30, 45, 60])
+_DISTANCES = 9
+# Prior standard deviations of intrinsics that nothing is known of, over the focal length
+_WIDE = {'fx': 0.1, 'fy': 0.1, 'cx': 0.1, 'cy': 0.1}
+
+
+class Room(NamedTuple):
+    """Where the board can be: nearest and furthest, m, at which it is sharp; largest tilt, rad."""
+
+    near: float
+    far: float
+    tilt: float = float(np.radians(60.0))
+
+
+class Shots(NamedTuple):
+    """P views of a board.
+
+    camera (P,): in the target frame; distance (P,), m, to the board's middle; angle, azimuth (P,):
+    where in the field that is, azimuth from right over down; tilt (P,) of the board from facing
+    the camera; tilt_axis (P,): about which line, from right over down; roll (P,), rad.
+    """
+
+    camera: Pose
+    distance: Array
+    angle: Array
+    azimuth: Array
+    tilt: Array
+    tilt_axis: Array
+    roll: Array
+
+    def take(self, index: Index) -> Shots:
+        """Return some of the views."""
+        return Shots(self.camera.take(index), *(part[index] for part in self[1:]))
+
+
+@dataclass(frozen=True)
+class Board:
+    """A flat board: landmark numbers (N,), points (N, 3), m, board numbers (N,), facing (3, 3).
+
+    The last is the turn that shows it squarely to a camera before it.
+    """
+
+    landmark: Index
+    points: Array
+    board: Index
+    facing: Array
+
+    @classmethod
+    def seen_in(cls, observations: Observations, pose: Pose) -> Board:
+        """Return the board of a table, its front the side that cameras (S,) saw.
+
+        Raises GeometryError for a target that is not flat.
+        """
+        landmark, first = np.unique(observations.landmark, return_index=True)
+        points = observations.xyz[first]
+        middle = points.mean(axis=0)
+        _, extent, axes = np.linalg.svd(points - middle, full_matrices=False)
+        if extent[2] > _FLAT * extent[0]:
+            raise GeometryError(
+                f'{observations.source}: the target is not one flat board; the next photographs '
+                'can be planned for a flat one only'
+            )
+        normal = axes[2] * np.sign(((middle - pose.position) @ axes[2]).sum() or 1.0)
+        across = np.eye(3)[0] - normal[0] * normal
+        if np.linalg.norm(across) < 0.5:
+            across = np.eye(3)[1] - normal[1] * normal
+        across /= np.linalg.norm(across)
+        facing = np.stack([across, np.cross(normal, across), normal])
+        return cls(landmark, points, observations.board[first], facing)
+
+
+@dataclass(frozen=True)
+class Question:
+    """What is in doubt: columns of the information.
+
+    interest (P,): the numbers; value (P,): of a cause that may be mistaken, None where their
+    errors are to be small; others: columns of each effect that it may be mistaken for; nuisance:
+    of all else that is unknown.
+    """
+
+    interest: Index
+    nuisance: Index
+    value: Array | None = None
+    others: tuple[Index, ...] = ()
+
+    def merit(self, information: Array) -> Array:
+        """Return how well each information (B, K, K) answers; more is better."""
+        if self.value is None:
+            left = _reduced(information, self.interest, self.nuisance)
+            return np.asarray(np.linalg.slogdet(left)[1]) / len(self.interest)
+        merits = []
+        for other in self.others or (self.nuisance[:0],):
+            unknown = np.concatenate([self.nuisance, other])
+            left = _reduced(information, self.interest, unknown)
+            merits.append(np.einsum('i,bij,j->b', self.value, left, self.value))
+        return np.asarray(np.min(merits, axis=0))
+
+    def answer(self, information: Array) -> float:
+        """Return the standard error (the geometric mean of several), or how sure a name is.
+
+        The latter: with which probability it proves needed beside each of its look-alikes.
+        """
+        merit = float(self.merit(information[None])[0])
+        if self.value is None:
+            return float(np.exp(-merit / 2))
+        rank = len(self.interest)
+        return float(stats.ncx2.sf(stats.chi2.isf(CLASS_SIGNIFICANCE, rank), rank, merit))
+
+
+class Design:
+    """What is known, and what every candidate view would add.
+
+    names, units: of the columns, lens parameters and then EFFECT.PARAMETER; values: what they are;
+    known (K, K): information; added (P, K, K): of each of the shots.
+    """
+
+    def __init__(
+        self, linear: Linearised, effects: Sequence[Effect], board: Board, shots: Shots,
+        noise: float, known: bool = True,
+    ) -> None:
+        """Take a fit, and effects that are not in it but may be there; noise: of u and v, px.
+
+        known: whether the views of the fit have been taken, or are there to say what is shared.
+        """
+        state, lens, free = linear.state, linear.state.lens, linear.free
+        terms = [t for t in state.terms if t[0].stage != 'noise']
+        parameters = [(e.name, p, v) for e, values in terms
+                      for p, v in zip(e.parameters, values, strict=True)]
+        parameters += [(e.name, p, 0.0) for e in effects for p in e.parameters]
+        self.names = (*free, *(f'{name}.{p.name}' for name, p, _ in parameters))
+        self.units = (*(_unit(name) for name in free), *(p.unit for _, p, _ in parameters))
+        self.values = np.array([lens.parameters[name] for name in free]
+                               + [value for _, _, value in parameters])
+        wide = [lens.focal * _WIDE[name] if name in _WIDE else 1.0 for name in free]
+        wide += [p.large for _, p, _ in parameters]
+        self.shots, self.board, self.known_views = shots, board, known
+        self.known: Array = np.diag(1 / np.square(wide))
+        if known:
+            used = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+            mean = float(np.sqrt(np.mean(used[used > 0] ** 2)))
+            self.known = self.known + information(linear, effects).sum(axis=0) / (mean * noise)**2
+        views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)
+        count = len(shots.distance)
+        data = Data(linear.data.observations, views, np.arange(count), np.zeros(count, int))
+        posed = replace(state, pose=shots.camera, rig=identity(1), terms=tuple(terms))
+        self.added = information(Linearised(data, posed, free), effects) / noise**2
+
+    def columns(self, name: str) -> Index:
+        """Return the columns of an effect, or of one number, by its name or its last part.
+
+        Raises ParameterError for one that is not among the names.
+        """
+        parts = [(one, one.partition('.')[0], one.rpartition('.')[2]) for one in self.names]
+        found = [i for i, names in enumerate(parts) if name in names]
+        if found:
+            return np.array(found)
+        raise ParameterError(f'{name!r} is no number of this lens and its causes; there are '
+                             + ', '.join(self.names))
+
+    def question(self, name: str, others: Sequence[str] = ()) -> Question:
+        """Ask for the error of a number, or whether an effect is not one of some others."""
+        interest = self.columns(name)
+        groups = tuple(self.columns(other) for other in others)
+        rest = np.setdiff1d(np.arange(len(self.names)), np.concatenate([interest, *groups]))
+        return Question(interest, rest, self.values[interest] if others else None, groups)
+
+    def choose(self, question: Question, count: int) -> tuple[Index, list[float]]:
+        """Return places of chosen shots, best first, and the answer with each one more."""
+        chosen: list[int] = []
+        for _ in range(count):
+            chosen.append(self._best(question, chosen))
+        for _ in range(_EXCHANGES):
+            before = list(chosen)
+            for i in range(count):
+                chosen[i] = self._best(question, chosen[:i] + chosen[i + 1:])
+            if chosen == before:
+                break
+        ordered: list[int] = []
+        for _ in range(count):
+            left = [i for i in chosen if i not in ordered]
+            known = self._with(ordered)
+            ordered.append(left[int(np.argmax(question.merit(known + self.added[left])))])
+        return np.array(ordered), [
+            question.answer(self._with(ordered[:i])) for i in range(count + 1)
+        ]
+
+    def _best(self, question: Question, taken: Sequence[int]) -> int:
+        merit = question.merit(self._with(taken) + self.added)
+        merit[list(taken)] = -np.inf
+        return int(np.argmax(merit))
+
+    def _with(self, taken: Sequence[int]) -> Array:
+        return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
+
+
+def look_alikes(linear: Linearised, names: Sequence[str]) -> list[Effect]:
+    """Return the richest forms of effects of lens or target that are not in a fit."""
+    there = {effect.name for effect, _ in linear.state.terms}
+    found = []
+    for name in names:
+        if name in there or stage_of(name) not in ('lens', 'target'):
+            continue
+        try:
+            forms = CATALOGUE[name].candidates(linear.scene)
+        except Untestable:
+            continue
+        found.append(max(forms, key=lambda form: len(form.parameters)))
+    return found
+
+
+def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Generator) -> Shots:
+    """Return up to CANDIDATES views that can be taken: the board whole, sharp, detectable.
+
+    Raises GeometryError where there is none.
+    """
+    lens, count = state.lens, _TRIES
+    top = int(lens.max_incidence / _STEP)
+    angle = _STEP * np.minimum(np.arccos(rng.uniform(np.cos(lens.max_incidence), 1, count)) / _STEP
+                               + 0.5, top).astype(int)
+    azimuth, axis, roll = (step * rng.integers(0, round(2 * np.pi / step), count)
+                           for step in (np.radians(30.0), _QUARTER, _QUARTER))
+    distance = rng.choice(np.geomspace(room.near, room.far, _DISTANCES), count)
+    tilt = rng.choice(_TILTS[room.tilt + 1e-9 >= _TILTS], count)
+    sight = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
+                      np.cos(angle)], axis=-1)
+    zero = np.zeros(count)
+    towards = rotation_from_vector(
+        angle[:, None] * np.stack([-np.sin(azimuth), np.cos(azimuth), zero], axis=-1))
+    tilted = rotation_from_vector(
+        tilt[:, None] * np.stack([np.cos(axis), np.sin(axis), zero], axis=-1))
+    rolled = rotation_from_vector(roll[:, None] * np.array([0.0, 0.0, 1.0]))
+    turn = towards @ tilted @ rolled @ board.facing
+    place = distance[:, None] * sight - turn @ board.points.mean(axis=0)
+    shots = Shots(Pose(turn, place).inverse(), distance, angle, azimuth, tilt, axis, roll)
+    possible = np.flatnonzero(_detectable(state, board, shots))[:CANDIDATES]
+    if not possible.size:
+        raise GeometryError(
+            f'lens {lens.name!r} does not see the whole board from {room.near:g} to '
+            f'{room.far:g} m; choose another room (--room NEAR FAR) or a smaller board'
+        )
+    return shots.take(possible)
+
+
+def _detectable(state: State, board: Board, shots: Shots) -> Mask:
+    """Whether boards are in the image as a whole, their points far enough apart (P,)."""
+    views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)
+    image = ForwardModel(state.lens, state.terms).predict(shots.camera, views)
+    size = np.array([state.lens.width, state.lens.height])
+    local = shots.camera.into_body(views.points)
+    normal = np.swapaxes(shots.camera.rotation, -1, -2) @ board.facing[2]
+    slant = (local @ normal[..., None])[..., 0] / np.linalg.norm(local, axis=-1)
+    with np.errstate(invalid='ignore'):
+        inside = ((image.uv > _EDGE) & (image.uv < size - _EDGE)).all(axis=(1, 2))
+        many = min(_NEIGHBOURS, len(board.points) - 1)
+        near = np.asarray(KDTree(board.points).query(board.points, many + 1)[1])[:, 1:]
+        apart = np.linalg.norm(image.uv[:, near] - image.uv[:, :, None], axis=-1)
+        found = (apart > _SPACING).all(axis=(1, 2)) & (slant > _SLANT).all(axis=1)
+        return np.asarray(image.valid.all(axis=1) & inside & found)
+
+
+def _unit(name: str) -> str:
+    if name in INTRINSICS:
+        return 'px'
+    return 'rad' if 'tilt' in name else 'm' if name.startswith('port_') else '1'
+
+
+def information(linear: Linearised, effects: Sequence[Effect]) -> Array:
+    """Return what each frame tells of all that is shared (F, K, K), its pose taken out."""
+    columns = np.concatenate(
+        [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1)
+    basis = block_basis(linear.frame_columns)
+    clean = columns - basis @ (np.swapaxes(basis, -1, -2) @ columns)
+    return np.asarray(np.swapaxes(clean, -1, -2) @ clean)
+
+
+def _reduced(information: Array, interest: Index, unknown: Index) -> Array:
+    """Return the information (B, P, P) of some columns with others unknown."""
+    own = information[:, interest[:, None], interest]
+    if not len(unknown):
+        return np.asarray(own)
+    mixed = information[:, unknown[:, None], interest]
+    rest = information[:, unknown[:, None], unknown]
+    return np.asarray(own - np.swapaxes(mixed, -1, -2) @ np.linalg.solve(rest, mixed))

@@ -1,0 +1,147 @@
+"""What the next photographs are to settle: the doubt of a diagnosis, or a number's error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.diagnosis.budget import stage_of
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.model import Linearised
+from fisheye_svp_ros.diagnosis.next_photographs import (
+    Board,
+    Design,
+    Question,
+    Room,
+    Shots,
+    candidate_shots,
+    look_alikes,
+)
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.pose import quaternion_from_rotation
+
+_NEARER, _FURTHER = 0.7, 1.5  # than in the photographs that there are: still sharp, still in reach
+
+
+class Next(NamedTuple):
+    """Wanted photographs, most telling first.
+
+    asked: a number, a cause, or `lens`; others: what the cause may be mistaken for; unit: of the
+    number, '' where certainty or a share is told; answers (N + 1,): before, and with each view
+    more: the number's standard error, the probability that the cause proves needed beside any of
+    the others, or the mean standard error of several numbers over what it is now (over what the
+    first photograph leaves, where there is none yet).
+    """
+
+    asked: str
+    others: tuple[str, ...]
+    unit: str
+    answers: tuple[float, ...]
+    shots: Shots
+    board: Board
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Return what diagnosis.json holds: a mapping a photograph, SI units."""
+        shots, kind = self.shots, 'certainty' if self.others else (
+            'stderr' if self.unit else 'relative_stderr')
+        return [
+            {
+                'asked': self.asked, 'others': list(self.others),
+                **{f'{name}_{"m" if name == "distance" else "rad"}': float(getattr(shots, name)[i])
+                   for name in Shots._fields[1:]},
+                'position': shots.camera.position[i].tolist(),
+                'quaternion': quaternion_from_rotation(shots.camera.rotation[i]).tolist(),
+                f'{kind}_before': self.answers[i], f'{kind}_after': self.answers[i + 1],
+            }
+            for i in range(len(shots.distance))
+        ]
+
+
+def next_photographs(
+    after: Linearised, causes: Sequence[Cause], noise: float, count: int,
+    number: str | None = None, room: Room | None = None,
+) -> Next:
+    """Choose `count` photographs beside those of a fit, of the same board by the same camera.
+
+    number: whose error is to shrink; by default what the causes may be mistaken for, then what
+    the first of them measures, then the lens.  noise: of u and v, px.
+    Raises GeometryError for several cameras and targets that are not one flat board, and
+    ParameterError for an unknown number.
+    """
+    if after.data.cameras > 1:
+        raise GeometryError('the next photographs can be planned for one camera only')
+    pose = after.state.view_poses(after.data)
+    board = Board.seen_in(after.data.observations, pose)
+    if room is None:
+        away = np.linalg.norm(board.points.mean(axis=0) - pose.position, axis=-1)
+        room = Room(_NEARER * float(away.min()), _FURTHER * float(away.max()))
+    asked, others, effects = _asked(after, causes, number)
+    shots = candidate_shots(after.state, board, room, np.random.default_rng(0))
+    design = Design(after, effects, board, shots, noise)
+    others = tuple(o for o in others if any(o == n.partition('.')[0] for n in design.names))
+    question = whole_lens(design) if asked == 'lens' else design.question(asked, others)
+    chosen, answers = design.choose(question, count)
+    return answered(design, asked, others, question, chosen, answers)
+
+
+def answered(
+    design: Design, asked: str, others: tuple[str, ...], question: Question, chosen: Index,
+    answers: Sequence[float],
+) -> Next:
+    """Return chosen views with their answers, in the unit that they are told in."""
+    unit = design.units[question.interest[0]] if len(question.interest) == 1 else ''
+    if not (unit or others):
+        # Before the first photograph of all nothing is known to compare with.
+        first = answers[0 if design.known_views else 1]
+        answers = [answer / first for answer in answers]
+    return Next(asked, others, unit, tuple(answers), design.shots.take(chosen), design.board)
+
+
+def whole_lens(design: Design) -> Question:
+    """Ask for all numbers of the lens itself, causes and what looks like them left open."""
+    interest = np.flatnonzero(['.' not in name for name in design.names])
+    return Question(interest, np.setdiff1d(np.arange(len(design.names)), interest))
+
+
+def _asked(
+    after: Linearised, causes: Sequence[Cause], number: str | None
+) -> tuple[str, tuple[str, ...], list[Effect]]:
+    """Return what is asked for, what it may be mistaken for, and effects to take in."""
+    fitted = {effect.name for effect, _ in after.state.terms}
+    if number is not None:
+        known = {*after.free, *(p.name for e, _ in after.state.terms for p in e.parameters)}
+        return number, (), [] if number in known | fitted else [_holding(after, number)]
+    mine = [c for c in causes if c.effect in fitted and stage_of(c.effect) in ('lens', 'target')]
+    for cause in mine:
+        if cause.indistinguishable_from:
+            alike = tuple(cause.indistinguishable_from)
+            return cause.effect, alike, look_alikes(after, alike)
+    if mine:
+        return mine[0].effect, (), []
+    if after.free:
+        return 'lens', (), []
+    return 'e0', (), [ViewpointShiftEffect(1)]
+
+
+def _holding(after: Linearised, number: str) -> Effect:
+    """Return the simplest form of an effect that has a number by this name, or this name itself.
+
+    Raises ParameterError where there is none.
+    """
+    for name, kind in CATALOGUE.items():
+        if kind.stage == 'noise':
+            continue
+        try:
+            forms = kind.candidates(after.scene)
+        except Untestable:
+            continue
+        for form in forms:
+            if number in (name, *(parameter.name for parameter in form.parameters)):
+                return form
+    raise ParameterError(f'--for {number}: no number of the lens or of an effect has this name')

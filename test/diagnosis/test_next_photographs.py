@@ -1,0 +1,174 @@
+"""The next photographs: information, choice, what a person is told."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.water import AIR, photographs
+
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.next_photographs import (
+    Board,
+    Design,
+    Room,
+    candidate_shots,
+    look_alikes,
+)
+from fisheye_svp_ros.diagnosis.next_question import next_photographs
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import read_poses, write_observations
+from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.reporting.shot_list import instruction, rows
+from fisheye_svp_ros.scene.landmarks import Landmarks
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.simulate.simulation import simulate
+
+ROOM, NOISE = Room(0.25, 1.5), 0.1
+SHIFTED = replace(AIR, viewpoint_shift=Gennery(e0=0.003))
+FREE = intrinsic_names(AIR)
+
+
+def fitted(observations, terms=()):
+    data = prepare(observations)
+    state = replace(start(data, AIR), terms=terms)
+    return Linearised(data, fit(data, state, FREE), FREE)
+
+
+@pytest.fixture(scope='module')
+def linear():
+    return fitted(photographs(SHIFTED, None, 8), ((ViewpointShiftEffect(1), np.zeros(1)),))
+
+
+@pytest.fixture(scope='module')
+def board(linear):
+    return Board.seen_in(linear.data.observations, linear.state.pose)
+
+
+@pytest.fixture(scope='module')
+def shots(linear, board):
+    return candidate_shots(linear.state, board, ROOM, np.random.default_rng(0))
+
+
+def test_a_candidate_is_what_it_says_and_can_be_detected(linear, board, shots):
+    model = ForwardModel(linear.state.lens, linear.state.terms)
+    for i in range(0, len(shots.distance), 25):
+        local = shots.camera.take(i).into_body(board.points)
+        middle = local.mean(axis=0)
+        assert np.linalg.norm(middle) == pytest.approx(shots.distance[i])
+        assert np.arctan2(np.linalg.norm(middle[:2]), middle[2]) == pytest.approx(shots.angle[i])
+        normal = shots.camera.rotation[i].T @ board.facing[2]
+        assert normal @ middle / shots.distance[i] == pytest.approx(np.cos(shots.tilt[i]))
+        uv = model.project(local[None]).uv[0]
+        assert (uv > 8).all() and (uv < [AIR.width - 8, AIR.height - 8]).all()
+
+
+def test_the_side_said_to_be_away_is_away(board, shots):
+    """Of a board tilted in the middle of the image, about the horizontal: its top or bottom."""
+    i = int(np.flatnonzero((shots.tilt > 0) & (shots.tilt_axis == 0)
+                           & (shots.angle < 0.3))[0])
+    local = shots.camera.take(i).into_body(board.points)
+    assert 'bottom away' in instruction(shots, i)[2]
+    bottom, top = local[local[:, 1].argmax()], local[local[:, 1].argmin()]
+    assert np.linalg.norm(bottom) > np.linalg.norm(top)
+
+
+def test_predicted_errors_are_those_of_noisy_refits(linear, board, shots):
+    """Choose, photograph, fit: the error of e0 scatters as was said."""
+    design = Design(linear, (), board, shots, NOISE)
+    chosen, answers = design.choose(design.question('e0'), 3)
+    assert np.all(np.diff(answers) < 0)
+    first, landmarks, pulls = linear.data.observations, Landmarks(board.landmark, board.points), []
+    for seed in range(6):
+        more = simulate(ForwardModel(SHIFTED), landmarks, shots.camera.take(chosen), NOISE,
+                        np.random.default_rng(seed))
+        both = make_observations(*(np.concatenate(pair) for pair in (
+            (first.frame, more.frame + 100), (first.landmark, more.landmark),
+            (first.uv, more.uv), (first.xyz, more.xyz))))
+        again = fitted(both, ((ViewpointShiftEffect(1), np.zeros(1)),))
+        pulls.append((again.state.terms[0][1][0] - 0.003) / answers[-1])
+    assert np.abs(pulls).max() < 4
+
+
+def test_chosen_photographs_tell_more_than_random_ones(linear, board, shots):
+    design = Design(linear, (), board, shots, NOISE)
+    question = design.question('e0')
+    chosen, answers = design.choose(question, 4)
+    assert len(set(chosen.tolist())) == 4
+    rng = np.random.default_rng(0)
+    by_chance = [
+        question.answer(design.known + design.added[taken].sum(axis=0))
+        for taken in rng.choice(len(shots.distance), (20, 4))
+    ]
+    assert answers[4] < min(by_chance) and answers[4] < 0.6 * np.median(by_chance)
+
+
+def test_doubt_between_a_cause_and_its_look_alikes_is_settled(linear, board, shots):
+    effects = look_alikes(linear, ('radial_profile', 'target_shape'))
+    design = Design(linear, effects, board, shots, NOISE)
+    question = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
+    _, answers = design.choose(question, 4)
+    assert answers[0] < answers[-1] and answers[-1] > 0.99
+
+
+def cause(alike):
+    return Cause('viewpoint_shift', 'viewpoint_shift(order=1)', {}, 0.0, 1.0, True, 0.1, 0.5,
+                 alike, '')
+
+
+def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear):
+    doubt = next_photographs(linear, [cause(['radial_profile'])], NOISE, 2, room=ROOM)
+    assert (doubt.asked, doubt.others) == ('viewpoint_shift', ('radial_profile',))
+    assert [len(row) for row in rows(doubt)] == [6, 6] and 'sure' in rows(doubt)[-1][-1]
+    sized = next_photographs(linear, [cause([])], NOISE, 2, room=ROOM)
+    assert (sized.asked, sized.unit) == ('viewpoint_shift', 'm')
+    assert 'mm' in rows(sized)[0][-1]
+    whole = next_photographs(fitted(photographs(AIR, None, 6)), [], NOISE, 2, room=ROOM)
+    assert whole.asked == 'lens' and whole.answers[0] == 1.0 > whole.answers[-1]
+    named = next_photographs(linear, [], NOISE, 1, 'landmark_scale', ROOM)
+    assert named.asked == 'landmark_scale' and named.to_list()[0]['distance_m'] > 0.2
+
+
+def test_what_cannot_be_planned_is_refused(linear, board):
+    with pytest.raises(ParameterError, match='no number of the lens'):
+        next_photographs(linear, [], NOISE, 1, 'colour', ROOM)
+    with pytest.raises(GeometryError, match='does not see the whole board from 50 to 60 m'):
+        candidate_shots(linear.state, board, Room(50.0, 60.0), np.random.default_rng(0))
+    seen = linear.data.observations
+    bent = replace(seen, xyz=seen.xyz + [0, 0, 1] * np.abs(seen.xyz[:, :1]))
+    with pytest.raises(GeometryError, match='not one flat board'):
+        Board.seen_in(bent, linear.state.pose)
+
+
+def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
+    save_lens(AIR, tmp_path / 'lens.yaml')
+    write_observations(tmp_path / 'seen.csv', photographs(SHIFTED, None, 6))
+    command = ['diagnose', str(tmp_path / 'seen.csv'), '--lens', str(tmp_path / 'lens.yaml')]
+    assert main([*command, '--quick', '--next', '2', '--for', 'e0', '--room', '0.2', '1.0', '-o',
+                 str(tmp_path / 'out')]) == 0
+    assert 'photographs to take next, for e0' in capsys.readouterr().out
+    entries = json.loads((tmp_path / 'out/diagnosis.json').read_text())['next']
+    assert len(entries) == 2 and entries[1]['stderr_after'] < entries[0]['stderr_before']
+    assert (tmp_path / 'out/next.png').is_file()
+    assert 'Photographs to take next' in (tmp_path / 'out/report.html').read_text()
+    assert main([*command, '--for', 'e0']) == 2
+
+
+def test_a_plan_before_the_first_photograph(tmp_path, capsys):
+    command = ['plan', '--fov', '170', '--image-size', '640x480', '--board',
+               'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '4']
+    assert main([*command, '--for', 'e0', '-o', str(tmp_path)]) == 0
+    assert 'photographs to take, for e0' in capsys.readouterr().out
+    planned = json.loads((tmp_path / 'plan.json').read_text())
+    assert len(planned['photographs']) == 4 and planned['stderr']['e0'] < 0.002
+    assert (tmp_path / 'plan.pdf').read_bytes().startswith(b'%PDF')
+    assert len(read_poses(tmp_path / 'poses.csv').frame) == 4
+    assert main([*command, '--lens', 'fish180']) == 2
+    assert main(['plan', '--lens', 'fish180', '--board', 'chessboard:9x6:25mm', '--room', '1',
+                 '0.5']) == 2
+    assert '--room 1 0.5' in capsys.readouterr().err
