@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,11 +44,24 @@ def raw(pixels: NDArray[np.uint8], stamp: int) -> Any:
 
 
 @pytest.fixture
-def graph(ros_domain: int) -> Iterator[Graph]:
-    graph = Graph('-p', f'board:={BOARD}')
+def graphs(ros_domain: int) -> Iterator[Callable[..., Graph]]:
+    """Return a function that starts a graph; each argument is a parameter NAME:=VALUE."""
+    started: list[Graph] = []
+
+    def start(*parameters: str) -> Graph:
+        started.append(Graph(*(word for one in parameters for word in ('-p', one))))
+        return started[-1]
+
+    yield start
+    for one in started:
+        one.close()
+
+
+@pytest.fixture
+def graph(graphs: Callable[..., Graph]) -> Graph:
+    graph = graphs(f'board:={BOARD}')
     graph.start(Detector)
-    yield graph
-    graph.close()
+    return graph
 
 
 def test_images_to_points(graph: Graph) -> None:
@@ -87,9 +100,11 @@ def test_compressed_and_bad_images(graph: Graph) -> None:
                          any(p.header.stamp.nanosec == 8 for p in points))[1])
 
 
-def test_a_search_is_bounded_and_the_next_image_is_searched(ros_domain: int) -> None:
+def test_a_search_is_bounded_and_the_next_image_is_searched(
+    graphs: Callable[..., Graph]
+) -> None:
     """Noise of this size takes seconds, as everything in it may be a square."""
-    g = Graph('-p', f'board:={BOARD}', '-p', 'longest_search:=0.2')
+    g = graphs(f'board:={BOARD}', 'longest_search:=0.2')
     points, diagnostics = g.hear(PointCloud2, 'image_points'), g.hear(
         DiagnosticArray, '/diagnostics')
     node = g.start(Detector)
@@ -106,19 +121,19 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(ros_domain: int) -> 
                      any(p.header.stamp.nanosec == 7 for p in points))[1])
     g.until(lambda: any(pair.key == 'searches broken off' and int(pair.value)
                         for m in diagnostics for pair in m.status[0].values))
-    g.close()
 
 
-def test_from_rendered_images_to_the_true_pose(ros_domain: int, tmp_path: Path) -> None:
+def test_from_rendered_images_to_the_true_pose(
+    graphs: Callable[..., Graph], tmp_path: Path
+) -> None:
     """Camera, detector and localizer as a user starts them; the error within its covariance."""
     lens = tmp_path / 'small.yaml'
     save_lens(LENS, lens)
     where = poses(2, 4)
     listed = [float(value) for i in range(2) for value in (
         *where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))]
-    g = Graph('-p', f'board:={BOARD}', '-p', f'photograph:={BOARD}', '-p', f'lens:={lens}',
-              '-p', f'poses:={listed}', '-p', 'rate:=2.0', '-p', 'sigma_px:=0.04',
-              '-p', 'board_frame:=world', '-p', 'patience:=0.5')
+    g = graphs(f'board:={BOARD}', f'photograph:={BOARD}', f'lens:={lens}', f'poses:={listed}',
+               'rate:=2.0', 'sigma_px:=0.04', 'board_frame:=world')
     images, estimated = g.hear(Image, 'image', SENSOR), g.hear(
         PoseWithCovarianceStamped, 'localizer/pose')
     results = g.hear(DiagnosticArray, 'localizer/result')
@@ -144,7 +159,6 @@ def test_from_rendered_images_to_the_true_pose(ros_domain: int, tmp_path: Path) 
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert error @ np.linalg.solve(covariance, error) < chi2.isf(1e-4, 6)
         assert metrics['position_error_m'] == pytest.approx(np.linalg.norm(error[:3]))
-    g.close()
 
 
 @pytest.mark.parametrize(('parameters', 'reason'), [
@@ -152,22 +166,22 @@ def test_from_rendered_images_to_the_true_pose(ros_domain: int, tmp_path: Path) 
     (('detections:=true',), 'apriltag_msgs is not installed'),
 ])
 def test_tags_of_others_need_their_messages_and_a_grid(
-    ros_domain: int, parameters: tuple[str, ...], reason: str, monkeypatch: pytest.MonkeyPatch
+    graphs: Callable[..., Graph], parameters: tuple[str, ...], reason: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector.find_spec', lambda name: None)
     if 'grid' in reason:
         monkeypatch.setattr('fisheye_svp_ros.nodes.detector._tag_array', lambda: DiagnosticArray)
-    g = Graph(*(word for p in parameters for word in ('-p', p)))
+    g = graphs(*parameters)
     with pytest.raises(ParameterError, match=reason):
         g.start(Detector)
-    g.close()
 
 
-def test_tags_that_others_found(ros_domain: int, tmp_path: Path) -> None:
+def test_tags_that_others_found(graphs: Callable[..., Graph], tmp_path: Path) -> None:
     grid = tmp_path / 'grid.yaml'
     grid.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
                     'tagSpacing: 0.3\n')
-    g = Graph('-p', f'board:=aprilgrid:{grid}')
+    g = graphs(f'board:=aprilgrid:{grid}')
     node = g.start(Detector)
     corners = [SimpleNamespace(x=10.0 + i, y=20.0) for i in range(4)]
     tags = [SimpleNamespace(id=number, corners=corners) for number in (2, 99)]
@@ -178,4 +192,3 @@ def test_tags_that_others_found(ros_domain: int, tmp_path: Path) -> None:
     with pytest.raises(ObservationError, match='no tag of the board among 1'):
         message.detections = tags[1:]
         node._read_tags(message, 'detections')
-    g.close()
