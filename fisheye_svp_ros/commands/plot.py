@@ -25,10 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
     from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.reporting.progress import progress
 
-    with progress('drawing'):
-        files = _of_table(args) if _table_in(args.source) else _of_bag(args)
+    files = _of_table(args) if _table_in(args.source) else _of_bag(args)
     if not files:
         raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '
                           'differ are needed, or residuals')
@@ -45,11 +43,13 @@ def _table_in(source: Path) -> Path | None:
 
 def _of_table(args: argparse.Namespace) -> list[Path]:
     from fisheye_svp_ros.io.columns import read_columns
+    from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.sweep_plots import draw_table
 
     path = _table_in(args.source)
     assert path is not None
-    return draw_table(read_columns(path), args.output)
+    with progress('drawing'):
+        return draw_table(read_columns(path), args.output)
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:
@@ -57,18 +57,22 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.recording_residuals import has_residuals, residual_sets
     from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+    from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 
     bag = Bag(args.source)
-    files = draw_table(_main_namespace(tabulate(bag.records(is_tabulated))), args.output)
-    found = residual_sets(bag.records(has_residuals))
+    with progress('reading', 2 * bag.size) as passed:
+        columns = tabulate(bag.records(is_tabulated, passed))
+        found = residual_sets(bag.records(has_residuals, passed))
     if bag.damage:
         say(f'{args.source}: {bag.damage}')
-    if found:
-        files.append(args.output / 'residuals.png')
-        draw_residuals([one.points for one in found],
-                       [one.tags.get('lens', '') for one in found], files[-1])
-        files += _fields(found, args.output / 'residual_fields.png')
+    with progress('drawing'):
+        files = draw_table(_main_namespace(columns), args.output)
+        if found:
+            files.append(args.output / 'residuals.png')
+            draw_residuals([one.points for one in found],
+                           [one.tags.get('lens', '') for one in found], files[-1])
+            files += _fields(found, args.output / 'residual_fields.png')
     return files
 
 

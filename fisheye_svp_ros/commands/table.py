@@ -23,9 +23,11 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.recording_table import STAMP, is_tabulated, tabulate
+    from fisheye_svp_ros.reporting.progress import progress
 
     bag = Bag(args.bag)
-    columns = tabulate(bag.records(is_tabulated))
+    with progress('reading', bag.size) as passed:
+        columns = tabulate(bag.records(is_tabulated, passed))
     rows = len(columns[STAMP])
     if bag.damage:
         say(f'{args.bag}: {bag.damage}')

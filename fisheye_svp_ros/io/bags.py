@@ -144,15 +144,24 @@ class Bag:
         if odd := [file for file in self._files() if not file.is_file()]:
             raise BagError(f'{odd[0]}: not a regular file')
 
-    def records(self, wanted: Callable[[str, str], bool]) -> Iterator[Record]:
+    @property
+    def size(self) -> int:
+        """The size of all its files, bytes."""
+        return sum(file.stat().st_size for file in self._files())
+
+    def records(
+        self, wanted: Callable[[str, str], bool], passed: Callable[[int], None] = lambda _: None
+    ) -> Iterator[Record]:
         """Yield the messages for which `wanted(topic, typename)` holds, in the order of time.
+
+        passed: told how many bytes more have been read, of `size`.
 
         Of a recording that was cut short or damaged everything whole is yielded, and in the end
         `damage` says so.  Raises BagError where nothing can be read.
         """
         store = _types()
         notes: list[str] = []
-        for topic, typename, when, data in self._raw(notes.append):
+        for topic, typename, when, data in self._raw(notes.append, passed):
             if typename not in store.fielddefs or not wanted(topic, typename):
                 continue
             try:
@@ -174,7 +183,11 @@ class Bag:
         listed = [listed_topics(file) for file in self._files()]
         if all(topics for topics in listed):
             return set().union(*listed)
-        return {(message.topic, message.typename) for message in self._raw(lambda _: None)}
+
+        def ignore(_: object) -> None:
+            pass
+
+        return {(message.topic, message.typename) for message in self._raw(ignore, ignore)}
 
     def _files(self) -> list[Path]:
         """Return the files of the recording, by the numbers in their names."""
@@ -184,7 +197,9 @@ class Bag:
             (int(word), '') if word.isdecimal() else (0, word)
             for word in re.split(r'(\d+)', file.name)])
 
-    def _raw(self, note: Callable[[str], None]) -> Iterator[RawMessage]:
+    def _raw(
+        self, note: Callable[[str], None], passed: Callable[[int], None]
+    ) -> Iterator[RawMessage]:
         """Yield all messages; raise BagError where nothing is whole."""
         files, problems, count = self._files(), [], 0
 
@@ -193,10 +208,13 @@ class Bag:
             note(problem)
 
         plain = all(file.suffix != '.db3' for file in files) and not self._is_compressed()
-        sources = [whole_messages(file, say) for file in files] if plain else [self._read(say)]
+        sources = ([whole_messages(file, say, passed) for file in files] if plain else
+                   [self._read(say)])
         for messages in sources:
             for message in messages:
                 count += 1
+                if not plain:
+                    passed(len(message.data))
                 yield message
         if problems and not count:
             raise BagError(f'{self.path}: not a recording, or nothing in it is whole '

@@ -25,6 +25,7 @@ _HEAD = struct.Struct('<BQ')  # of a record: opcode, length
 _LARGEST = 1 << 28  # bytes of a chunk, decompressed
 
 _Note = Callable[[str], None]
+_Passed = Callable[[int], None]
 
 
 class RawMessage(NamedTuple):
@@ -36,13 +37,15 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-def whole_messages(path: Path, note: _Note) -> Iterator[RawMessage]:
+def whole_messages(
+    path: Path, note: _Note, passed: _Passed = lambda _: None
+) -> Iterator[RawMessage]:
     """Yield every whole message of an MCAP file; by time, within chunks that follow each other.
 
-    note: told what is damaged, and where.
+    note: told what is damaged, and where; passed: told how many bytes more have been read.
     """
     held: list[RawMessage] = []
-    for batch in _batches(path, note):
+    for batch in _batches(path, note, passed):
         first = min(message.time for message in batch)
         yield from (message for message in held if message.time <= first)
         rest = (message for message in held if message.time > first)
@@ -60,13 +63,15 @@ def listed_topics(path: Path) -> set[tuple[str, str]]:
             if (schema := summary.schemas.get(channel.schema_id))}
 
 
-def _batches(path: Path, note: _Note) -> Iterator[list[RawMessage]]:
+def _batches(path: Path, note: _Note, passed: _Passed) -> Iterator[list[RawMessage]]:
     """Yield the messages of each chunk that holds any."""
     schemas: dict[int, str] = {}
     channels: dict[int, tuple[str, str]] = {}
-    count, promised = 0, None
+    count, promised, place = 0, None, 0
     with path.open('rb') as stream:
         for records in _groups(stream, path.stat().st_size, note):
+            passed(stream.tell() - place)
+            place = stream.tell()
             batch = []
             for record in records:
                 if isinstance(record, Schema):

@@ -155,6 +155,13 @@ def test_a_chunk_that_is_cut_short_yields_its_whole_messages(tmp_path: Path) -> 
     assert stamps == list(range(len(stamps))) and 20 < len(stamps) < 40
 
 
+def test_who_waits_is_told_how_far_the_reading_is(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 40, flush_each=True)
+    bag, passed = Bag(tmp_path / 'bag'), []
+    assert list(bag.records(is_tabulated, passed.append)) and len(passed) > 40
+    assert 0.5 * bag.size < sum(passed) <= bag.size and min(passed) >= 0
+
+
 def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
     write_results(tmp_path / 'bag', 12, flush_each=True)
     file, = (tmp_path / 'bag').glob('*.mcap')
