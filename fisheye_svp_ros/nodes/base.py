@@ -277,6 +277,8 @@ class BaseNode(Node):  # type: ignore[misc]
         self._candidate = None
         try:
             values = {p.name: p.value for p in parameters}
+            if not values.keys() & {row.name for row in rows(self.SETTINGS)}:
+                return SetParametersResult(successful=True)  # of ROS itself, such as a QoS
             for row in rows(self.SETTINGS):
                 if row.file and isinstance(values.get(row.name), str):
                     allowed(values[row.name], self.settings.folder, row.name)

@@ -121,6 +121,15 @@ def test_a_good_value_is_taken_into_use(start: Callable[..., Any]) -> None:
     assert node.settings.lens == 'fish180' and node.settings.svp == 'true'
 
 
+def test_a_parameter_of_ros_itself_starts_nothing_over(start: Callable[..., Any]) -> None:
+    camera = start('synthetic_camera')
+    steps = camera._steps
+    assert set_parameter(camera, 'use_sim_time', False).successful
+    assert camera._steps is steps
+    assert set_parameter(camera, 'noise_px', 0.1).successful
+    assert camera._steps is not steps
+
+
 @pytest.mark.parametrize(('arguments', 'solves_svp', 'said'), [
     ((), True, 'the lens that scenario names without its viewpoint shift (svp: auto)'),
     (('lens:=fish180',), False, 'the lens fish180 as it stands (svp: auto)'),
