@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench mutation poses test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench mutation poses fuzz test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -61,6 +61,11 @@ bench: .venv-bench/ready
 # What spoilt views do to poses, into docs/reliability.md; ten minutes.
 poses: $(VENV)/ready
 	$(BIN)/python -m benchmark.poses
+
+# Hostile input by the million for every reader, table and callback, into docs/reliability.md;
+# half an hour.
+fuzz: $(VENV)/ready
+	$(BIN)/python -m benchmark.fuzz
 
 # How many of 300 small faults the tests find, into docs/mutation.md; takes an hour or two.
 mutation: $(VENV)/ready

@@ -60,12 +60,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f'fisheye-svp: the Python package {error.name} is not installed, and this needs it',
               file=sys.stderr)
         return _BAD_INPUT
-    except KeyboardInterrupt:
-        return _INTERRUPTED
+    except UnicodeEncodeError as error:
+        print(f'fisheye-svp: {error.object!r:.200} cannot be printed here; set a UTF-8 locale',
+              file=sys.stderr)
+        return _BAD_INPUT
     except BrokenPipeError:
         # Nobody reads on; give the interpreter's own last flush somewhere to go.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return _BROKEN_PIPE
+    except OSError as error:  # of a path that no check has asked for
+        print(f'fisheye-svp: {error.filename or "a file"!r:.200}: {error.strerror or error}',
+              file=sys.stderr)
+        return _BAD_INPUT
+    except KeyboardInterrupt:
+        return _INTERRUPTED
     return 0
 
 

@@ -25,6 +25,7 @@ RECORDINGS = ('.mcap', '.db3')
 # Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
 _PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
 _COMPRESSED = '/compressed'
+_PNG = b'\x89PNG\r\n\x1a\n'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
 _ORIENTATION = re.compile(
     rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL)
@@ -109,6 +110,8 @@ def decoded(data: bytes, name: str) -> Pixels:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
         raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
+    if data[:8] == _PNG and not _whole_chunks(data):
+        raise ObservationError(f'{name}: the PNG ends before its image does; fetch it again')
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as cause:
@@ -118,6 +121,16 @@ def decoded(data: bytes, name: str) -> Pixels:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ObservationError(f'{name}: pixels are {pixels.dtype}; 8 or 16 bit are needed')
     return np.asarray(pixels)
+
+
+def _whole_chunks(data: bytes) -> bool:
+    """Whether the chunks of a PNG are within it; OpenCV makes room for what they announce."""
+    place = len(_PNG)
+    while place + 12 <= len(data):
+        if data[place + 4:place + 8] == b'IEND':
+            return True
+        place += 12 + int.from_bytes(data[place:place + 4], 'big')
+    return False
 
 
 def exif_turned(data: bytes) -> bool:

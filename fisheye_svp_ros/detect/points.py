@@ -16,6 +16,7 @@ from fisheye_svp_ros.detect.photographs import Pixels
 _NEIGHBOURS = 6
 _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
+_SHORTEST, _LONGEST = 24, 32_766  # px, of an image that OpenCV searches
 _LEAST = 4
 _ODD = 6.0  # times the median sigma
 _ROOM = 30.0  # px to the next edge, three times the largest window
@@ -44,6 +45,16 @@ def find_points(
     near (M, 2): image points of the board in the image before; its surroundings are searched
     first, and the rest only where the board is not there any more.
     """
+    height, width = pixels.shape
+    if not _SHORTEST <= min(height, width) <= max(height, width) <= _LONGEST:
+        return f'no board found: the image is {width} x {height} px'
+    try:
+        return _found(pixels, pattern, detector, near)
+    except cv2.error as cause:
+        return f'no board found: {cause.err}'
+
+
+def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) -> Points | str:
     grey, finder = _eight_bit(pixels), DETECTORS[detector][1]
     found = _near(grey, pattern, finder, near) if near is not None else None
     found = found or finder(grey, pattern)

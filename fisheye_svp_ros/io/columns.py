@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import cache
@@ -22,6 +23,7 @@ from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000
+_NAMES = b'fisheye_svp_ros: CRC of the names'  # the foot of a Parquet file has no checksum
 
 _WHOLE = re.compile(r'[+-]?[0-9]{1,18}')
 _NUMBER = re.compile(r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE)
@@ -94,6 +96,10 @@ class Parts:
         return self.folder / f'{number:09}.json'
 
 
+def _checksum(names: Sequence[str]) -> bytes:
+    return b'%08x' % zlib.crc32('\0'.join(names).encode())
+
+
 def as_numbers(cells: Sequence[float | None]) -> Array:
     """Return a column of numbers (N,), NaN = empty."""
     return np.array([np.nan if cell is None else cell for cell in cells], dtype=float)
@@ -116,10 +122,16 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(data),
                                            page_checksum_verification=True)
-        if file.metadata.num_rows * file.metadata.num_columns > _MOST_CELLS:
+        about, names = file.metadata, file.schema_arrow.names
+        if about.num_rows * about.num_columns > _MOST_CELLS:
             raise ValueError(f'more than {_MOST_CELLS} cells')
-        return {name: _plain(pyarrow, file.read([name]).column(name))
-                for name in file.schema_arrow.names}
+        if (about.metadata or {}).get(_NAMES, _checksum(names)) != _checksum(names):
+            raise ValueError('the names of its columns are not those that were written')
+        columns = {name: _plain(pyarrow, file.read([name]).column(name)) for name in names}
+        rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
+        if {about.num_rows, rows, *map(len, columns.values())} != {rows}:
+            raise ValueError('its columns do not have the rows that were written')
+        return columns
     except Exception as cause:  # whatever pyarrow makes of what is damaged
         raise OutputError(f'{path}: not a table ({cause or type(cause).__name__})') from cause
 
@@ -180,8 +192,9 @@ def _to_parquet(
     for part in parts:
         pending.append(pyarrow.table(dict(part), schema=schema))
         if writer is None:
-            writer = pyarrow.parquet.ParquetWriter(path, pending[0].schema,
-                                                   write_page_checksum=True)
+            names = pending[0].schema.names
+            schema = pending[0].schema.with_metadata({_NAMES: _checksum(names)})
+            writer = pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True)
         if sum(map(len, pending)) >= _ROWS:
             table = pyarrow.concat_tables(pending)
             whole = len(table) // _ROWS * _ROWS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,7 @@ class CsvTable:
                 raise ObservationError(
                     f'{self.path}: column {name!r} is missing from its header; needed are {wanted}'
                 )
-        twice = [name for name in self._header if name and self._header.count(name) > 1]
+        twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:
             raise ObservationError(f'{self.path}: its header has {twice[0]!r} twice')
 

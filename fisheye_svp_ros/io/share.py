@@ -42,9 +42,16 @@ def sweep_path(name: str) -> Path:
 def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
     given, named = Path(name), config_path(f'{folder}/{name}.yaml')
     # FILE#cam1 names one of the lenses of a file.
-    if given.suffix in ('.yaml', '.yml') or Path(name.partition('#')[0]).is_file():
+    if given.suffix in ('.yaml', '.yml') or _is_file(Path(name.partition('#')[0])):
         return given
-    if not named.is_file():
+    if not _is_file(named):
         known = ', '.join(sorted(path.stem for path in named.parent.glob('*.yaml')))
         raise error(f'{name!r} is neither a file nor among the {folder} of this package: {known}')
     return named
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # a name that no file can have
+        return False

@@ -46,6 +46,7 @@ _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                QoSPolicyKind.DURABILITY)
 _KINDS_OF_ERRORS = 100  # that are told from each other
+_SHORTEST = 12  # bytes: the head of CDR and a stamp
 _TWINS = 100  # messages of which one of two subscriptions may be ahead of the other
 
 S = TypeVar('S', bound=Settings)
@@ -77,6 +78,8 @@ class Unread(NamedTuple):
     @property
     def stamp(self) -> int:
         """The stamp of its header, which every message starts with that a node listens to, ns."""
+        if len(self.data) < _SHORTEST:
+            raise ObservationError(f'{self.topic}: {len(self.data)} bytes are no message')
         order = '<' if self.data[1] & 1 else '>'
         sec, nanosec = struct.unpack_from(f'{order}iI', self.data, 4)
         return nanoseconds(sec, nanosec, self.topic)

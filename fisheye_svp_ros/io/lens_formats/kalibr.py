@@ -35,7 +35,7 @@ def read(text: str, where: str) -> Foreign:
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
-    model, distortion = camera.get('camera_model'), camera.get('distortion_model', 'none')
+    model, distortion = str(camera.get('camera_model')), camera.get('distortion_model', 'none')
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
     *own, fx, fy, cx, cy = radial.numbers(camera, 'intrinsics', _INTRINSICS[model], where)

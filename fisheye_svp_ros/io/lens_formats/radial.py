@@ -34,6 +34,8 @@ def kannala_brandt(
         curve = KannalaBrandt(*map(float, k))
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
+    if not all(abs(value) < _LARGEST for value in curve.coefficients):
+        raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no lens has these')
     if not (width.is_integer() and height.is_integer()):
         raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
     lens = Lens(name, int(width), int(height), fx, fy, cx, cy, curve, np.nan, shift,
