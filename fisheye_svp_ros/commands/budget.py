@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fisheye_svp_ros.io.files import together
+
 # Limits by quantity: option, unit, factor from the unit to SI.
 _LIMITS = {
     'position': ('--max-position', 'MM', 1e-3, 'position error of a localized camera'),
@@ -73,8 +75,9 @@ def run(args: argparse.Namespace) -> None:
     )
     print(f'  {answer(points, asked)}')
     if args.output:
-        draw(args.output / 'budget.png', budget, points, asked)
-        write_json(args.output / 'budget.json', document(budget, points, asked))
+        with together():
+            draw(args.output / 'budget.png', budget, points, asked)
+            write_json(args.output / 'budget.json', document(budget, points, asked))
 
 
 def _limits(args: argparse.Namespace) -> dict[str, float | None]:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
@@ -81,9 +82,10 @@ def run(args: argparse.Namespace) -> None:
         trusts[camera] = _trusted(table, results[camera])
     # Written before a word is printed: nobody may be reading.
     if args.output:
-        for camera, result in results.items():
-            path = args.output / f'{camera}.yaml' if camera else args.output
-            _write(result, trusts[camera], path)
+        with together():
+            for camera, result in results.items():
+                path = args.output / f'{camera}.yaml' if camera else args.output
+                _write(result, trusts[camera], path)
     for number, (camera, result) in enumerate(results.items()):
         sigmas = observations.sigma[observations.camera == number]
         _report(result, trusts[camera], args.model, sigmas)

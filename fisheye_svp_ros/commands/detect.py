@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from fisheye_svp_ros.io.files import together
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
 
@@ -37,8 +39,9 @@ def run(args: argparse.Namespace) -> None:
     detection = search(args.photographs, args)
     _print(detection, args.board)
     if args.output:
-        write_observations(args.output, detection.observations)
-        write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))
+        with together():
+            write_observations(args.output, detection.observations)
+            write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))
     if args.overlays:
         from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -88,7 +89,8 @@ def run(args: argparse.Namespace) -> None:
         wanted = _wanted(args, diagnosis) if args.count else None
         if args.output:
             progress('report')
-            _write(args, diagnosis, known, free, wanted)
+            with together():
+                _write(args, diagnosis, known, free, wanted)
     _print(diagnosis, known, args.output, wanted)
 
 

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.io.files import together
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.solve.measured import MeasuredPoses
@@ -49,7 +51,8 @@ def run(args: argparse.Namespace) -> None:
         note_left_out(measured.left_out)
         note_doubtful(measured.views.frame.tolist(), measured.reasons)
         if args.output:
-            _write(args.output / name, model, measured)
+            with together():
+                _write(args.output / name, model, measured)
 
 
 def _print(measured: MeasuredPoses, source: str) -> None:

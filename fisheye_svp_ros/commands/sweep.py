@@ -8,6 +8,8 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.io.files import together, written
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.columns import Parts
     from fisheye_svp_ros.study.sweep import Plan
@@ -64,9 +66,10 @@ def run(args: argparse.Namespace) -> None:
         if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
             raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are gone; '
                               '--resume computes them anew')
-        parts.join(args.output / 'sweep')
+        with together():
+            parts.join(args.output / 'sweep')
+            _report(path, args.output, plan, mine)
         note_formats()
-        _report(path, args.output, plan, mine)
     shutil.rmtree(parts.folder, ignore_errors=True)
 
 
@@ -131,7 +134,7 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     from fisheye_svp_ros.study.summary import summarise
     from fisheye_svp_ros.study.sweep import column_types
 
-    table = read_columns(folder / 'sweep.csv')
+    table = read_columns(written(folder / 'sweep.csv'))
     metrics = [name for name, kind in column_types(plan).items()
                if kind is float and '.' in name]
     found = {name: summarise(as_numbers(table[name])) for name in metrics}

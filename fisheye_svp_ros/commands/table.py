@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from fisheye_svp_ros.io.files import together
+
 _SHOWN = 40  # rows for people
 
 
@@ -39,11 +41,13 @@ def run(args: argparse.Namespace) -> None:
         from fisheye_svp_ros.io.columns import write_columns
         from fisheye_svp_ros.io.results import write_json
 
-        write_columns(args.output / 'table', columns)
+        with together():
+            write_columns(args.output / 'table', columns)
+            write_json(args.output / 'table.json', {
+                'bag': str(args.bag), 'rows': rows, 'columns': list(columns),
+                'damage': bag.damage,
+            })
         note_formats()
-        write_json(args.output / 'table.json', {
-            'bag': str(args.bag), 'rows': rows, 'columns': list(columns), 'damage': bag.damage,
-        })
 
 
 def _print(bag: str, columns: dict[str, list[Any]]) -> None:

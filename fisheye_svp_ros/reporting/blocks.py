@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import jinja2
 
-from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.io.files import write_text, written
 
 
 class Heading(NamedTuple):
@@ -58,14 +58,14 @@ def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )
     pictures = {
-        block.file: base64.b64encode((folder / block.file).read_bytes()).decode('ascii')
+        block.file: base64.b64encode(written(folder / block.file).read_bytes()).decode('ascii')
         for block in blocks if isinstance(block, Picture)
     }
-    written = []
+    pages = []
     for suffix in ('md', 'html'):
         page = environment.get_template(f'blocks.{suffix}').render(
             blocks=blocks, title=blocks[0], pictures=pictures
         )
         write_text(folder / f'{name}.{suffix}', page)
-        written.append(folder / f'{name}.{suffix}')
-    return written
+        pages.append(folder / f'{name}.{suffix}')
+    return pages

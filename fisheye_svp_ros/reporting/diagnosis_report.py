@@ -18,7 +18,7 @@ from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.io.files import write_text, written
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting import shot_list
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
@@ -128,7 +128,7 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
 
 
 def _data_uri(path: Path) -> str:
-    return 'data:image/png;base64,' + base64.b64encode(path.read_bytes()).decode('ascii')
+    return 'data:image/png;base64,' + base64.b64encode(written(path).read_bytes()).decode('ascii')
 
 
 def _free(inputs: Inputs) -> str:

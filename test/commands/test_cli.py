@@ -269,6 +269,11 @@ class TestCommandLine:
         out, err = running.communicate(timeout=60)
         assert (running.returncode, out, err) == (130, '', '')
 
+    def test_a_name_that_no_file_can_have(self, scene, capsys):
+        for name in ('a' * 5000, 'a' * 5000 + '.yaml', 'a/' * 3000):
+            assert refused(capsys, 'localize', name, '--lens', scene[0] / 'lens.yaml')
+            assert refused(capsys, 'localize', scene[0] / 'observations.csv', '--lens', name)
+
     @pytest.mark.parametrize('make', [os.mkfifo, lambda path: path.symlink_to('/dev/zero')])
     @pytest.mark.parametrize('name', ['observations.csv', 'lens.yaml'])
     def test_what_has_no_end_is_not_read(self, scene, tmp_path, capsys, make, name):

@@ -22,7 +22,12 @@ from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.detect.detection import Detection, detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.detect.photographs import exif_turned, find_photographs, message_pixels
+from fisheye_svp_ros.detect.photographs import (
+    decoded,
+    exif_turned,
+    find_photographs,
+    message_pixels,
+)
 from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
@@ -387,6 +392,19 @@ class TestCameras:
                     message = make[kind](header, 'png', data)
                 bag.write(topic, kind, bytes(store.serialize_cdr(message, kind)))
         assert sorted(camera for camera, _ in self.cameras(tmp_path / 'bag')) == cameras
+
+
+@pytest.mark.parametrize('shape', [(1, 3072), (48, 8), (40_000, 30), (1, 1)])
+def test_an_image_that_opencv_does_not_search_has_no_board(shape: tuple[int, int]) -> None:
+    found = find_points(np.zeros(shape, np.uint8), parse_pattern('chessboard:9x6:25mm'), 'quick')
+    assert isinstance(found, str) and 'no board found' in found
+
+
+def test_a_png_that_announces_more_than_it_holds(tmp_path: Path) -> None:
+    data = bytearray(cv2.imencode('.png', np.zeros((48, 64), np.uint8))[1].tobytes())
+    data[33:37] = b'\xcf\xff\xff\xf0'  # the length of its data; OpenCV 5 makes room for it
+    with pytest.raises(ObservationError, match='the PNG ends before its image does'):
+        decoded(bytes(data), 'x')
 
 
 def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:

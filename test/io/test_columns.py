@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -49,3 +50,21 @@ def test_cells_are_numbers_where_all_are() -> None:
     long = '9' * 5000
     assert typed(['1', long]) == [1.0, float('inf')]
     assert typed(['1_000', '2']) == ['1_000', '2']
+
+
+def test_a_header_of_any_length_is_looked_at_once(tmp_path: Path) -> None:
+    names = ','.join(f'c{i}' for i in range(40_000))
+    (tmp_path / 'a.csv').write_text(f'{names},c7\n')
+    begun = time.process_time()
+    with pytest.raises(OutputError, match="its header has 'c7' twice"):
+        read_columns(tmp_path / 'a.csv')
+    assert time.process_time() - begun < 1.0
+
+
+def test_parquet_columns_are_those_that_were_written(tmp_path: Path) -> None:
+    if arrow()[0] is None:
+        pytest.skip('pyarrow is not usable')
+    *_, path = write_columns(tmp_path / 'table', {'first': [1, 2], 'other': [0.5, 1.5]})
+    path.write_bytes(path.read_bytes().replace(b'other', b'ether'))
+    with pytest.raises(OutputError, match='not a table'):
+        read_columns(path)

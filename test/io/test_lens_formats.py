@@ -180,6 +180,8 @@ def test_boofcv() -> None:
      'a matrix of 3 x 3'),
     (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
     (CAMCHAIN.replace('158.0', '0', 1), 'no numbers of a lens'),
+    (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r"camera_model is"),
+    (CAMCHAIN.replace('0.00020293673', '1e300'), 'must be a list of 4 finite numbers'),
     (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
     ('{"camera_type": 1}', 'not a whole Basalt'),
     ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),

@@ -19,12 +19,13 @@ from rclpy.exceptions import ParameterException  # isort: skip
 from sensor_msgs.msg import PointCloud2, PointField  # isort: skip
 from std_srvs.srv import Trigger  # isort: skip
 
-from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import access, base, messages
+from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.model_critic import ModelCritic
@@ -149,6 +150,25 @@ def test_a_hostile_message_is_refused_with_a_reason_and_counted(
     assert reason in attack.diagnostics[-1].status[0].message
     attack.solves(8)
     assert attack.counts()['internal errors'] == '0'
+
+
+def test_less_than_a_stamp_is_refused_and_counted(graph: Callable[..., Graph]) -> None:
+    node = graph('lens:=fish214').start(Localizer)
+    for data in (b'', bytes(3), bytes(11)):
+        with pytest.raises(ObservationError, match='bytes are no message'):
+            _ = base.Unread('image_points', PointCloud2, data, messages.header).stamp
+    assert node._failures == 0
+
+
+def test_a_board_file_is_named_below_the_folder_alone(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    (tmp_path / 'target.yaml').write_text(
+        'target_type: aprilgrid\ntagCols: 3\ntagRows: 2\ntagSize: 0.1\ntagSpacing: 0.3\n')
+    node = graph(f'folder:={tmp_path}').start(Detector)
+    assert set_parameter(node, 'board', f'aprilgrid:{tmp_path}/target.yaml').successful
+    result = set_parameter(node, 'board', 'aprilgrid:/etc/passwd')
+    assert not result.successful and 'is not below' in result.reason
 
 
 def test_what_nobody_thought_of_is_told_once_counted_and_survived(

@@ -1,0 +1,147 @@
+"""What commands write: all of it or none, whatever happens to disk and process."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.nodes import ROOT
+from helpers.targets import plane, poses_around
+
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.files import together, write_text, written
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.simulate.simulation import simulate
+
+SWEEP = 'synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3], noise_px: 0.2}}\n'
+COMMANDS = {
+    'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
+    'calibrate': ('calibrate', '{obs}', '--image-size', '1536x1536', '--model', 'equidistant',
+                  '-o', '{out}/new.yaml'),
+    'sweep': ('sweep', '{sweep}', '-o', '{out}'),
+}
+
+
+@pytest.fixture(scope='module')
+def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Return input files by name."""
+    folder, rng = tmp_path_factory.mktemp('given'), np.random.default_rng(4)
+    paths = {name: folder / f'{name}{suffix}' for name, suffix in (
+        ('obs', '.csv'), ('lens', '.yaml'), ('sweep', '.yaml'))}
+    lens = load_lens(lens_path('fish214')).svp()
+    write_observations(paths['obs'], simulate(
+        ForwardModel(lens), plane(), poses_around(plane(), 5, rng, widest=0.5), 0.1, rng))
+    save_lens(lens, paths['lens'])
+    paths['sweep'].write_text(SWEEP)
+    return paths
+
+
+def words(name: str, given: dict[str, Path], out: Path) -> list[str]:
+    return [word.format(out=out, **given) for word in COMMANDS[name]]
+
+
+@contextmanager
+def full_at(size: int) -> Iterator[None]:
+    """Have no file grow beyond a size, in bytes."""
+    old = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, old[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, old)
+
+
+def results(folder: Path) -> list[str]:
+    """Return the names of all files but the parts of a sweep, which are kept for --resume."""
+    return sorted(path.name for path in folder.rglob('*')
+                  if path.is_file() and path.parent.name != 'parts')
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+@pytest.mark.parametrize('size', [0, 700, 4000])
+def test_on_a_full_disk_there_is_one_line_and_no_file(
+    name: str, size: int, given: dict[str, Path], tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / 'out'
+    with full_at(size):
+        code = main(words(name, given, out))
+    err = [line for line in capsys.readouterr().err.splitlines() if ': note: ' not in line]
+    if code:
+        assert code == 2 and len(err) == 1
+        assert 'cannot be written (' in err[0] and 'File too large' in err[0]
+        assert not results(out)
+    else:
+        assert not err and results(out)
+
+
+@pytest.mark.parametrize('number', [errno.EACCES, errno.EROFS, errno.ENOSPC, errno.EDQUOT])
+def test_where_nothing_can_be_written_there_is_one_line(
+    number: int, given: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr('tempfile.mkstemp', fail)
+    assert main(words('localize', given, tmp_path / 'out')) == 2
+    assert f'cannot be written ({os.strerror(number)})' in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_set_of_files_appears_together(tmp_path: Path) -> None:
+    one, two = tmp_path / 'a' / 'one', tmp_path / 'two'
+    write_text(two, 'old')
+    with pytest.raises(ZeroDivisionError), together():
+        write_text(one, 'new')
+        write_text(two, 'new')
+        assert not one.exists() and written(one).read_text() == 'new'
+        raise ZeroDivisionError
+    assert results(tmp_path) == ['two'] and two.read_text() == 'old'
+    with pytest.raises(OutputError, match='cannot be written'), together():
+        write_text(one, 'new')
+        with full_at(2):
+            write_text(two, 'new')
+    assert results(tmp_path) == ['two'] and two.read_text() == 'old'
+    with together():
+        write_text(one, 'new')
+        write_text(one, 'newer')
+        write_text(two, 'new')
+    assert (one.read_text(), two.read_text()) == ('newer', 'new')
+    assert results(tmp_path) == ['one', 'two'] and written(one) == one
+
+
+def test_a_command_that_is_killed_leaves_all_or_nothing(
+    given: dict[str, Path], tmp_path: Path
+) -> None:
+    def start(number: int) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
+            [sys.executable, '-m', 'fisheye_svp_ros.cli',
+             *words('localize', given, tmp_path / str(number))], cwd=ROOT,
+            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    begun = time.monotonic()
+    assert start(0).wait() == 0
+    whole, length = results(tmp_path / '0'), time.monotonic() - begun
+    assert 'localize.json' in whole
+    for number, part in enumerate((0.5, 0.9, 0.97), start=1):
+        process = start(number)
+        time.sleep(part * length)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        left = [name for name in results(tmp_path / str(number)) if not name.startswith('.')]
+        assert left in ([], whole)
