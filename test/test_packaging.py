@@ -20,7 +20,7 @@ ROSDEP = {
     'opencv-python-headless': 'python3-opencv', 'rosbags': 'python3-rosbags-pip',
     'setuptools': 'python3-setuptools', 'pyarrow': None, 'mcap': None,
     'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
-    'psutil': 'python3-psutil', 'mpmath': None,
+    'hypothesis': 'python3-hypothesis', 'psutil': 'python3-psutil', 'mpmath': None,
 }
 
 
