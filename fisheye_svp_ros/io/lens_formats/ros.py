@@ -58,6 +58,17 @@ def lens_of(
     size: width, height; intrinsics: fx, fy, cx, cy; d: as sensor_msgs/CameraInfo has it.
     Raises LensError, naming `where`, for a model that no lens here comes near to.
     """
+    try:
+        with np.errstate(all='ignore'):
+            return _lens_of(model, size, intrinsics, d, name, where)
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
+        raise LensError(f'{where}: its numbers make no lens ({cause})') from cause
+
+
+def _lens_of(
+    model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
+    name: str, where: str,
+) -> tuple[Lens, float]:
     if model in _EQUIDISTANT:
         if len(d) != 4:
             raise LensError(f'{where}: {model} has {len(d)} coefficients; k1 to k4 are needed')
@@ -72,7 +83,7 @@ def lens_of(
     k1, k2, p1, p2, k3, k4, k5, k6 = (*d, *[0.0] * 8)[:8]
     lens, worst = _perspective(
         name, size, intrinsics, ((k1, k2, k3), (k4, k5, k6)), (p1, p2), where)
-    if worst > _TOLERANCE:
+    if not worst <= _TOLERANCE:
         raise LensError(f'{where}: no lens here comes nearer than {worst:.2g} px to this {model}; '
                         'calibrate it anew, as equidistant')
     return lens, worst
