@@ -79,8 +79,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 advance()
         found, name = {'cameras': cameras, 'summary': summary(cameras)}, 'simulated'
     asked.output.mkdir(parents=True, exist_ok=True)
-    write_text(asked.output / f'{name}.json', json.dumps(found, indent=1) + '\n')
+    lines = ',\n'.join(f'{json.dumps(key)}: {_lines(value)}' for key, value in found.items())
+    write_text(asked.output / f'{name}.json', f'{{{lines}}}\n')
     sys.stdout.write(json.dumps(found.get('summary', found), indent=1) + '\n')
+
+
+def _lines(value: Any) -> str:
+    """Return JSON with one entry of a list a line."""
+    if isinstance(value, list):
+        return '[\n' + ',\n'.join(map(json.dumps, value)) + ']'
+    return json.dumps(value)
 
 
 def camera(number: int) -> dict[str, Any]:
@@ -215,7 +223,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     each, everything = each / square, each.sum(axis=0) / square
     prior = np.diag(1e-9 * np.diag(everything))
     order: list[int] = []
-    for _ in range(40):
+    for _ in range(len(each)):
         merit = question.merit(prior + each[order].sum(axis=0) + each)
         merit[order] = -np.inf
         order.append(int(np.argmax(merit)))
@@ -226,7 +234,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     rng, all_frames = np.random.default_rng(0), np.arange(len(each))
     random = [rng.permutation(len(each)) for _ in range(200)]
     goal = 1.5 * error(all_frames)
-    counts = (5, 10, 20, 40)
+    counts = (3, 5, 10)
     return {
         'frames': len(each), 'stderr_all_m': error(all_frames), 'goal_m': goal,
         'chosen': needed(error, np.array(order), goal),

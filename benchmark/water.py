@@ -46,6 +46,7 @@ class Outcome:
     tilt: float
     thickness: float
     noise: float
+    rough: bool
     causes: list[str]
     found: dict[str, list[float]]
     rms_px: float
@@ -78,32 +79,37 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def summary(outcomes: Sequence[Outcome]) -> str:
     """Return what came of the trials, in lines."""
     lines = []
-    for kind in dict.fromkeys(KINDS):
-        mine = [one for one in outcomes if one.kind == kind]
-        named = [one for one in mine if 'medium_index' in one.found]
-        lines.append(f'{kind}: {len(mine)} trials, a medium named in {len(named)}')
-        if kind == 'water' and named:
-            off = np.array([one.found['medium_index'][0] / one.index - 1 for one in named])
-            pull = np.array([(one.found['medium_index'][0] - one.index)
-                             / one.found['medium_index'][1] for one in named
-                             if one.found['medium_index'][1] > 0])
-            lines.append(
-                f'  index within 1 %: {np.mean(np.abs(off) < 0.01):.3f}, median error '
-                f'{100 * np.median(np.abs(off)):.3f} %, worst {100 * np.abs(off).max():.2f} %; '
-                f'error over standard error, rms: {np.sqrt(np.mean(pull**2)):.2f}')
-            for name, truth in (('distance', [1e3 * one.distance for one in named]),):
-                error = np.abs(np.array([1e3 * one.found[name][0] for one in named]) - truth)
-                lines.append(f'  {name}: median error {np.median(error):.2f} mm')
-            other = [one for one in named if set(one.causes) - {'flat_port'}]
-            lines.append(f'  other causes beside it: {len(other)}')
+    for rough in (False, True):
+        for kind in dict.fromkeys(KINDS):
+            mine = [one for one in outcomes if (one.kind, one.rough) == (kind, rough)]
+            named = [one for one in mine if 'medium_index' in one.found]
+            lines.append(f'{kind}{", with errors of board and frames" if rough else ""}: '
+                         f'{len(mine)} trials, a medium named in {len(named)}')
+            if kind == 'water' and named:
+                lines += _accuracy(named)
     return '\n'.join(lines) + '\n'
+
+
+def _accuracy(named: Sequence[Outcome]) -> list[str]:
+    found = np.array([one.found['medium_index'] for one in named])
+    index = np.array([one.index for one in named])
+    off, told = found[:, 0] / index - 1, found[:, 1] > 0
+    pull = (found[told, 0] - index[told]) / found[told, 1]
+    away = [1e3 * abs(one.found['distance'][0] - one.distance) for one in named]
+    other = sum(bool(set(one.causes) - {'flat_port'}) for one in named)
+    return [
+        f'  index within 1 %: {np.mean(np.abs(off) < 0.01):.3f}, median error '
+        f'{100 * np.median(np.abs(off)):.3f} %, worst {100 * np.abs(off).max():.2f} %; '
+        f'error over standard error, rms: {np.sqrt(np.mean(pull**2)):.2f}',
+        f'  distance: median error {np.median(away):.2f} mm; other causes beside it: {other}',
+    ]
 
 
 def run_trial(number: int) -> Outcome:
     """Run one trial; the same number always gives the same data."""
     rng = np.random.default_rng([17, number])
     kind = KINDS[number % len(KINDS)]
-    free = bool(number // len(KINDS) % 2)
+    free, rough = bool(number // len(KINDS) % 2), bool(number // len(KINDS) // 2 % 2)
     lens, noise = _lens(rng), float(rng.choice([0.05, 0.1, 0.2, 0.4]))
     index = float(rng.uniform(1.32, 1.36)) if kind == 'water' else 1.0
     distance, thickness = rng.uniform(0.003, 0.09), rng.uniform(0.0, 0.012)
@@ -119,15 +125,15 @@ def run_trial(number: int) -> Outcome:
         def see(points: Array) -> Array:
             return _through(true, points, distance, tilt, thickness, index)
 
-    seen = _photographs(true, see, noise, rng)
-    given = _calibrated(lens, rng, free)
+    seen = _photographs(true, see, noise, rough, rng)
+    given = _calibrated(lens, rng, free, rough)
     found = diagnose(seen, given, free_intrinsics=free)
     port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
     values = {} if port is None else {
         name: [entry['value'], entry['stderr']] for name, entry in port.parameters.items()
     }
     return Outcome(number, kind, free, index, float(distance), float(np.hypot(*tilt)),
-                   float(thickness), noise, [c.effect for c in found.causes], values,
+                   float(thickness), noise, rough, [c.effect for c in found.causes], values,
                    found.named.rms_px, found.named.heldout_rms_px)
 
 
@@ -141,12 +147,14 @@ def _lens(rng: np.random.Generator) -> Lens:
                 640 + rng.normal(scale=8), 480 + rng.normal(scale=8), curve, half)
 
 
-def _calibrated(lens: Lens, rng: np.random.Generator, free: bool) -> Lens:
+def _calibrated(lens: Lens, rng: np.random.Generator, free: bool, rough: bool) -> Lens:
     """Return the lens as a calibration in air might have found it."""
-    off = 1 + rng.normal(scale=2e-4)
+    worse = 5.0 if rough else 1.0
+    off = 1 + worse * rng.normal(scale=2e-4)
     block = {'rms_px': 0.2} if free else None
     return replace(lens, fx=lens.fx * off, fy=lens.fy * off, calibration=block,
-                   cx=lens.cx + rng.normal(scale=0.1), cy=lens.cy + rng.normal(scale=0.1))
+                   cx=lens.cx + worse * rng.normal(scale=0.1),
+                   cy=lens.cy + worse * rng.normal(scale=0.1))
 
 
 def _central(lens: Lens, points: Array) -> Array:
@@ -180,12 +188,21 @@ def _through(
 
 
 def _photographs(
-    lens: Lens, see: Callable[[Array], Array], noise: float, rng: np.random.Generator
+    lens: Lens, see: Callable[[Array], Array], noise: float, rough: bool,
+    rng: np.random.Generator,
 ) -> Observations:
-    """Return 10 to 24 photographs of a board, 70 % of it in the image at least."""
+    """Return 10 to 24 photographs of a board, 70 % of it in the image at least.
+
+    rough: the board is bent and its points are off, each photograph has a smooth error of its own,
+    one point in a hundred is far off.
+    """
     x, y = np.meshgrid(np.arange(11), np.arange(8))
     size = rng.uniform(0.03, 0.06)
     board = size * np.stack([x.ravel() - 5.0, y.ravel() - 3.5, 0.0 * x.ravel()], axis=-1)
+    shape = board
+    if rough:
+        bend = 2e-3 * (board[:, 0] / (5 * size)) ** 2
+        shape = board + 1e-4 * rng.normal(size=board.shape) + bend[:, None] * [0.0, 0.0, 1.0]
     frames, count = [], int(rng.integers(10, 25))
     while len(frames) < count:
         angle, azimuth = np.radians(rng.uniform(0, 45)), rng.uniform(0, 2 * np.pi)
@@ -193,7 +210,12 @@ def _photographs(
         place = away * np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
                                  np.cos(angle)])
         turn = rotation_from_vector(rng.normal(size=3) * [0.4, 0.4, 1.0])
-        uv = see(Pose(turn, place).transform(board)) + noise * rng.normal(size=(len(board), 2))
+        uv = see(Pose(turn, place).transform(shape)) + noise * rng.normal(size=(len(board), 2))
+        if rough:
+            wave, phase = rng.uniform(-0.01, 0.01, (2, 2)), rng.uniform(0, 2 * np.pi, 2)
+            uv = uv + 0.15 * np.cos(np.nan_to_num(uv) @ wave + phase)
+            far = rng.uniform(size=len(uv)) < 0.01
+            uv[far] += rng.normal(scale=20.0, size=(int(far.sum()), 2))
         inside = ((uv > 0) & (uv < [lens.width, lens.height])).all(axis=-1)
         if inside.mean() > 0.7:
             frames.append((np.flatnonzero(inside), uv[inside]))

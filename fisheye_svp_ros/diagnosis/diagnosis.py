@@ -31,6 +31,7 @@ from fisheye_svp_ros.diagnosis.refit import Local
 from fisheye_svp_ros.diagnosis.search import Found, search
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
 from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
+from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.optics.lens import Lens
@@ -43,7 +44,10 @@ _STEP_OVER_NOISE = 0.1
 
 @dataclass
 class Diagnosis:
-    """The answer; `before` and `after` are the linearised states for whoever draws them."""
+    """The answer; `before` and `after` are the linearised states for whoever draws them.
+
+    errors: of poses and image points by the extended lens.
+    """
 
     verdict: str
     noise_px: float
@@ -64,6 +68,7 @@ class Diagnosis:
     intrinsics: dict[str, Intrinsic]
     lens: Lens
     local: Local
+    errors: ModelError
     before: Linearised
     after: Linearised
 
@@ -90,6 +95,7 @@ class Diagnosis:
             'untestable': [{'effect': e, 'why': why} for e, why in self.untestable.items()],
             'gain': self.gain._asdict(),
             'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
+            'uncertainty': self.errors.summary(self.after),
             'trace': [asdict(step) for step in self.trace],
         }
 
@@ -177,6 +183,7 @@ def _judged(
         intrinsics=measured.intrinsics,
         lens=extended_lens(lens, found.state, observations),
         local=measured.local,
+        errors=ModelError.of(evidence),
         before=measured.before,
         after=evidence.linear,
     )

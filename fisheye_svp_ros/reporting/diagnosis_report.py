@@ -24,6 +24,7 @@ from fisheye_svp_ros.reporting import shot_list
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
 from fisheye_svp_ros.reporting.target_map import BoardMap, board_maps
+from fisheye_svp_ros.reporting.uncertainty_plot import draw_uncertainty
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
@@ -72,6 +73,8 @@ def write_report(
     Raises OutputError where one cannot be written.
     """
     pictures = list(_draw(diagnosis, points, inputs.folder))
+    pictures.append(inputs.folder / 'uncertainty.png')
+    draw_uncertainty(pictures[-1], diagnosis)
     if wanted is not None:
         pictures.append(inputs.folder / 'next.png')
         state = diagnosis.after.state
@@ -88,7 +91,8 @@ def write_report(
                   **{p.stem: _data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
-        next=_next(wanted), known=list(text.known_rows(known)), free=_free(inputs),
+        next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
+        known=list(text.known_rows(known)), free=_free(inputs),
     )
     report = inputs.folder / 'report.html'
     write_text(report, page)

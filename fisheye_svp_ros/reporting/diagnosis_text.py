@@ -49,6 +49,11 @@ _MEASURES = {
     'axis_error_rad': ('error of the viewing axis', 180 / math.pi, 'deg'),
     'depth_error_m': ('stereo error', 1e3, 'mm'),
 }
+_UNCERTAIN = {
+    'image_px': ('an image point, u or v', 1.0, 'px'),
+    'position_m': ('position from one frame', 1e3, 'mm'),
+    'rotation_rad': ('orientation from one frame', 180 / math.pi, 'deg'),
+}
 COMPONENTS = {
     'named_lens': 'lens, by name', 'named_target': 'target, by name',
     'named_frame': 'frames, by name',
@@ -246,6 +251,14 @@ def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]
 
 BUDGET_HEADER = ('part', 'stage', 'sd px', 'share', 'p')
 BUDGET_WORDS = ('part', 'stage')
+
+
+def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
+    """Yield what noise, parameters and remaining misfit make uncertain, and all together."""
+    for name, parts in diagnosis.errors.summary(diagnosis.after).items():
+        label, factor, unit = _UNCERTAIN[name]
+        sizes = (*parts.values(), math.hypot(*parts.values()))
+        yield label, *(f'{factor * value:.3g}' for value in sizes), unit
 
 
 def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:

@@ -170,7 +170,7 @@ class TestFiles:
             assert word in page
         pictures = {path.stem for path in output.glob('*.png')}
         assert pictures == {'field', 'theta', 'range', 'landmark', 'frame', 'phase', 'histogram',
-                            'evidence'}
+                            'evidence', 'uncertainty'}
         assert all(path.read_bytes().startswith(b'\x89PNG') for path in output.glob('*.png'))
         assert not [path for path in output.iterdir() if path.name.startswith('.')]
 
