@@ -90,7 +90,7 @@ class _Node:
             self._executor.spin_once(timeout_sec=0)
 
 
-def _seeds() -> dict[str, list[bytes]]:
+def seeds() -> dict[str, list[bytes]]:
     """Return valid messages by type name, CDR."""
     from sensor_msgs.msg import CompressedImage, Image
 
@@ -117,7 +117,7 @@ def _seeds() -> dict[str, list[bytes]]:
     return {kind: [serialize(one) for one in several] for kind, several in made.items()}
 
 
-def _spoilt(data: bytes, rng: Random) -> bytes:
+def spoilt(data: bytes, rng: Random) -> bytes:
     """Return a message with faults where its fields are, or anywhere."""
     chance = rng.random()
     if chance < 0.4 and len(data) > 60:
@@ -131,7 +131,8 @@ def _spoilt(data: bytes, rng: Random) -> bytes:
     return mutated(data, rng, binary=True)
 
 
-def _tags(rng: Random) -> bytes:
+def tags(rng: Random) -> bytes:
+    """Return a scenario with two odd values, CDR."""
     from fisheye_svp_ros.nodes import messages
     from fisheye_svp_ros.standalone.messages import serialize
 
@@ -146,7 +147,7 @@ def _callbacks(name: str, folder: Path) -> Trial:
     from fisheye_svp_ros import standalone
 
     standalone.install()
-    one, seeds = _Node(name, folder), _seeds()
+    one, valid = _Node(name, folder), seeds()
     good = _Good(one) if name == 'localizer' else None
     table = {row.name: row for row in rows(type(one.node).SETTINGS) if not row.fixed}
     count = 0
@@ -161,9 +162,9 @@ def _callbacks(name: str, folder: Path) -> Trial:
             topic = rng.choice(list(one.heard)) if one.heard else ''
             if topic:
                 kind = one.heard[topic][0].__name__
-                data = rng.choice(seeds[kind])
+                data = rng.choice(valid[kind])
                 scenario = kind == 'DiagnosticArray' and rng.random() < 0.5
-                one.hear(topic, _tags(rng) if scenario else _spoilt(data, rng))
+                one.hear(topic, tags(rng) if scenario else spoilt(data, rng))
         if one.refused:
             raise one.refused[0]
         if good is not None and count % _GOOD_EVERY == 0:

@@ -177,17 +177,22 @@ def _rig(
     """Calibrate, print and write the rig between two calibrated cameras."""
     import numpy as np
 
+    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.io.rig_files import save_rig
     from fisheye_svp_ros.scene.observations import stereo_views
-    from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
+    from fisheye_svp_ros.solve.measured import sigma_known
+    from fisheye_svp_ros.study.solutions import calibrated
 
     left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
     seen = [set(table.frame.tolist()) for table in (
         observations.take(observations.camera == observations.cameras.index(name))
         for name in names)]
     both = observations.take(np.isin(observations.frame, sorted(seen[0] & seen[1])))
-    fitted = calibrate_stereo(left, right, *stereo_views(both))
+    found = calibrated((left, right), *stereo_views(both))
+    fitted, reason = found.solution, found.reasons[0]
+    if reason and sigma_known(both):
+        say(f'rig: {reason}')
     place = 1000 * fitted.rig.position[0]
     print(f'rig: camera {names[0]} in {names[1]} at {place[0]:.3f}, {place[1]:.3f}, '
           f'{place[2]:.3f} mm, from {len(both.frames)} frames')

@@ -22,6 +22,7 @@ from fisheye_svp_ros.nodes.solver import (
 )
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import STEREO
+from fisheye_svp_ros.solve.reliability import doubt_of_pairs
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
 from fisheye_svp_ros.study.settings import StereoDepthSettings
@@ -64,7 +65,8 @@ class StereoDepth(SolverNode):
         seen = np.isfinite(points[:, 0])
         cloud = structured(LANDMARKS, ids[seen], *points[seen].T)
         self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
-        self.publish_result(stamp, found.metrics)
+        doubt = doubt_of_pairs(models, rig.take(None), uv, ids, self.settings.sigma_px)
+        self.publish_result(stamp, found.metrics, doubt)
         if self._markers.get_subscription_count():
             pose: Pose | None = items.get('left/true_pose')
             frame = left.frame if pose is None else landmarks.frame

@@ -13,12 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize, residuals
+from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 
 _ALARM = 1e-4  # probability that a clean view fails the test of its misfit
 _STANDS_OUT = 3.8  # a residual beside the root mean square of all, which starts a search
@@ -107,6 +108,33 @@ def _examined(
                 f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
                 reasons[i])
     return Examined(result, gross, tuple(reasons), None)
+
+
+def doubt_of_pairs(
+    models: tuple[ForwardModel, ForwardModel], rig: Pose, uv: tuple[Array, Array], landmark: Index,
+    sigma: float,
+) -> str:
+    """Say why stereo depth should not be relied on; '' where nothing speaks against it.
+
+    models, uv (N, 2), px: left, right; rig: left camera in the right one; landmark (N,); sigma:
+    noise of u and of v, px.  The least reprojection error of a pair has one degree of freedom.
+    """
+    best = triangulate_optimally(*models, rig, *uv, sigma)
+    behind = int((~best.valid).sum())
+    if behind > (1 - _AGREE) * len(landmark):
+        return (f'the rays of {behind} of {len(landmark)} landmarks do not meet in front of both '
+                'cameras: left and right, rig or ids may be wrong')
+    cost = np.square(np.stack([best.left_residual, best.right_residual])).sum(axis=(0, -1))
+    cost, ids = cost[best.valid] / sigma**2, landmark[best.valid]
+    gross = cost > _GROSS**2
+    fails = misfit_fails(cost.sum(), np.asarray(len(cost)))
+    if not gross.any() and not fails:
+        return ''
+    rest = cost[~gross]
+    if len(rest) >= _AGREE * len(cost) and not misfit_fails(rest.sum(), np.asarray(len(rest))):
+        off = np.sqrt(cost[gross]) * sigma
+        return f'pairs that do not match: {_named(ids[gross], off)}'
+    return misfit_reason(float(cost.sum()) / len(cost), len(cost))
 
 
 def misfit_fails(cost: Array, freedom: Array) -> Mask:
@@ -226,9 +254,15 @@ def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
     worst = np.argsort(-size, kind='stable')[:gross.sum()]
     if not len(worst):
         return ''
-    names = ', '.join(f'{view.landmark[0, i]} ({size[i]:.3g} px)' for i in worst[:_NAMED])
-    more = f' and {len(worst) - _NAMED} more' if len(worst) > _NAMED else ''
-    return f'gross errors left out: landmark{"s" if len(worst) > 1 else ""} {names}{more}'
+    return f'gross errors left out: {_named(view.landmark[0, worst], size[worst])}'
+
+
+def _named(landmark: Index, size: Array) -> str:
+    """Return landmarks by name, each with its residual, px; the first of many."""
+    names = ', '.join(f'{one} ({px:.3g} px)'
+                      for one, px in zip(landmark[:_NAMED], size[:_NAMED], strict=True))
+    more = f' and {len(landmark) - _NAMED} more' if len(landmark) > _NAMED else ''
+    return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
 
 
 def _noisy_reason(sigma: float) -> str:

@@ -266,9 +266,9 @@ class Writer:
         dds_topic = participant.topic(topic, typename, service=user_data is not None)
         self.entity = DataWriter(participant.entity, dds_topic, _dds_qos(qos, typename, user_data))
 
-    def write(self, message: messages.Message) -> bool:
-        """Send a message; False where a subscriber was too slow for it."""
-        return self._write(messages.serialize(message))
+    def write(self, message: messages.Message | bytes) -> bool:
+        """Send a message, or its CDR; False where a subscriber was too slow for it."""
+        return self._write(message if isinstance(message, bytes) else messages.serialize(message))
 
     def write_call(self, header: Header, message: messages.Message) -> None:
         """Send a request or a reply."""

@@ -26,9 +26,9 @@ class Publisher:
         self.topic_name = topic
         self.lost = 0
 
-    def publish(self, msg: Message) -> None:
-        """Send a message to all subscribers."""
-        if not isinstance(msg, self.msg_type):
+    def publish(self, msg: Message | bytes) -> None:
+        """Send a message, or one that is serialized already, to all subscribers."""
+        if not isinstance(msg, self.msg_type | bytes):
             raise TypeError(f'Expected {self.msg_type.TYPENAME}, got {type(msg).__name__}')
         if not self._alive().write(msg):
             self.lost += 1

@@ -7,11 +7,13 @@ from benchmark.poses import CASES, SCENES, SIGMA, UNTESTABLE, lost_minima, spoil
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured import localize_measured
-from fisheye_svp_ros.solve.reliability import examine
+from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
 from fisheye_svp_ros.study.solutions import localized
 
 
@@ -104,3 +106,41 @@ def test_landmarks_in_millimetres_are_said():
     _, views, _ = spoilt('millimetres', 'board', 1, np.random.default_rng(9))
     checked = examine(ForwardModel(lens.svp()), views, localize(ForwardModel(lens.svp()), views))
     assert 'are they in metres?' in checked.reasons[0]
+
+
+class TestStereoDepth:
+    def pairs(self, seed: int, noise: float = SIGMA):
+        model, rng = ForwardModel(load_lens(lens_path('fish180'))), np.random.default_rng(seed)
+        d = np.stack([rng.uniform(-1, 1, 40), rng.uniform(-1, 1, 40), np.ones(40)], axis=-1)
+        points, left = d * rng.uniform(0.5, 3.0, (40, 1)), rig('parallel')
+        uv = [project(model.lens, seen).uv + noise * rng.normal(size=(40, 2))
+              for seen in (left.into_body(points), points)]
+        return (model, model), left, uv
+
+    def doubt(self, models, left, uv, sigma=SIGMA):
+        return doubt_of_pairs(models, left, tuple(uv), np.arange(40), sigma)
+
+    def test_clean_pairs_pass(self):
+        assert [self.doubt(*self.pairs(seed)) for seed in range(40)] == [''] * 40
+
+    def test_pairs_that_do_not_match_are_named(self):
+        models, left, uv = self.pairs(3)
+        uv[0][[7, 20], 1] += [30.0, -12.0]
+        text = self.doubt(models, left, uv)
+        assert text.startswith('pairs that do not match: landmarks 7 (') and ', 20 (' in text
+
+    @pytest.mark.parametrize('spoil', ['swap', 'turn', 'half', 'noise', 'ids'])
+    def test_what_is_wrong_with_all_of_them_is_said(self, spoil):
+        models, left, uv = self.pairs(5)
+        sigma = SIGMA
+        if spoil == 'swap':
+            uv = uv[::-1]
+        elif spoil == 'turn':
+            left = left.retract(np.array([0, 0, 0, 0.02, 0, 0]))
+        elif spoil == 'half':
+            uv = [part / 2 for part in uv]
+        elif spoil == 'ids':
+            uv[0] = np.roll(uv[0], 1, axis=0)
+        else:
+            sigma /= 3
+        assert 'may be wrong' in self.doubt(models, left, uv, sigma)
