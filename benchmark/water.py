@@ -120,10 +120,12 @@ def run_trial(number: int) -> Outcome:
     elif kind == 'curve':
         true = replace(lens, image_height=IMAGE_HEIGHTS['stereographic'](), fx=1.15 * lens.fx,
                        fy=1.15 * lens.fy)
-    see: Callable[[Array], Array] = lambda points: _central(true, points)  # noqa: E731
-    if kind in ('water', 'plate'):
-        def see(points: Array) -> Array:
+    refracted = kind in ('water', 'plate')
+
+    def see(points: Array) -> Array:
+        if refracted:
             return _through(true, points, distance, tilt, thickness, index)
+        return _central(true, points)
 
     seen = _photographs(true, see, noise, rough, rng)
     given = _calibrated(lens, rng, free, rough)

@@ -138,8 +138,8 @@ def _over_time(scene: Scene) -> Array:
 def focal_drift(rng: Rng, scene: Scene) -> Form:
     """The focal length follows a smooth curve in time."""
     t = _over_time(scene)
-    curve = rng.normal() * t + rng.normal() * np.sin(np.pi * rng.uniform(0.8, 2) * t
-                                                      + rng.uniform(0, 2 * np.pi))
+    curve = rng.normal() * t + rng.normal() * np.sin(
+        np.pi * rng.uniform(0.8, 2) * t + rng.uniform(0, 2 * np.pi))
     curve = ((curve - curve.mean()) / curve.std())[scene.frame]
     return lambda a: Departure(focal=(1 + a * curve)[:, None] * np.ones(2))
 

@@ -58,7 +58,8 @@ _EMPTY = 'structure_needs_at_least_one_member'
 Convert = Callable[[Any], Any]
 
 _BAD_STRINGS = 100  # of one message that are mended
-codecs.register_error('mark', lambda e: ('?' * (e.end - e.start), e.end))  # type: ignore[attr-defined]
+codecs.register_error(
+    'mark', lambda e: ('?' * (e.end - e.start), e.end))  # type: ignore[attr-defined]
 
 
 class UnknownFieldError(StandaloneError, AttributeError):

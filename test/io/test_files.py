@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,9 @@ from fisheye_svp_ros.io.files import replacing, write_text
 
 
 @pytest.mark.parametrize('make', [os.mkfifo, Path.mkdir])
-def test_what_is_no_regular_file_is_not_replaced(make, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_what_is_no_regular_file_is_not_replaced(
+    make: Callable[[Path], None], tmp_path: Path
+) -> None:
     make(tmp_path / 'there')
     with pytest.raises(OutputError, match='not a regular file'):
         write_text(tmp_path / 'there', 'text')
