@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.components import component_traces
-from fisheye_svp_ros.diagnosis.evidence import Evidence, swept
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, swept
 from fisheye_svp_ros.diagnosis.mixed import factored
-from fisheye_svp_ros.diagnosis.prediction import placed_terms
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -44,7 +43,7 @@ def stage_of(effect: str) -> str:
     return _OF_STAGE.get(CATALOGUE[effect].stage, 'lens')
 
 
-def cause_squares(evidence: Evidence) -> dict[str, float]:
+def cause_squares(evidence: Evidence, causes: Sequence[Placed]) -> dict[str, float]:
     """Return the mean squared displacement of each cause, px^2, poses and intrinsics taken out.
 
     What two causes do together is shared between them, so that the sum is what all of them do.
@@ -53,14 +52,14 @@ def cause_squares(evidence: Evidence) -> dict[str, float]:
     f = factored(
         evidence.full.trimmed(nothing < GONE), nothing, evidence.variances.weight
     )
-    terms = placed_terms(evidence)
-    first = evidence.own - sum(len(values) for _, _, values in terms)
-    left = swept(f.information, np.arange(first))[: evidence.own, : evidence.own]
     every = np.zeros(evidence.own)
-    for _, columns, values in terms:
+    named = [np.zeros(0, dtype=np.int64), *(columns for _, columns, _ in causes)]
+    rest = np.setdiff1d(np.arange(evidence.own), np.concatenate(named))
+    left = swept(f.information, rest)[: evidence.own, : evidence.own]
+    for _, columns, values in causes:
         every[columns] = values * evidence.scale[columns]
     parts = every * (left @ every) * _px2(evidence)
-    return {name: max(float(parts[columns].sum()), 0.0) for name, columns, _ in terms}
+    return {e.name: max(float(parts[columns].sum()), 0.0) for e, columns, _ in causes}
 
 
 def _px2(evidence: Evidence) -> float:
@@ -70,21 +69,23 @@ def _px2(evidence: Evidence) -> float:
 
 
 def budget(
-    evidence: Evidence, p_values: Mapping[str, float], causes: Mapping[str, float]
+    evidence: Evidence, named: Sequence[Placed], p_values: Mapping[str, float],
+    causes: Mapping[str, float],
 ) -> list[Component]:
     """Return all parts: of the catalogue (p-values by name), random components, noise.
 
-    p_values: of the random components that are there; causes: p-values of the named effects.
+    named: the effects that were found; causes: their p-values; p_values: of the random components
+    that are there.
     """
     px, variances = _px2(evidence), evidence.variances
     traces = component_traces(evidence.full, evidence.variances)
-    squares = cause_squares(evidence)
+    squares = cause_squares(evidence, named)
     parts: list[tuple[str, str, float, bool, float]] = []
     for stage in STAGES[:3]:
-        named = [name for name in squares if stage_of(name) == stage]
-        if named:
-            size = sum(squares[name] for name in named)
-            parts.append((f'named_{stage}', stage, size, True, min(causes[n] for n in named)))
+        there = [name for name in squares if stage_of(name) == stage]
+        if there:
+            size = sum(squares[name] for name in there)
+            parts.append((f'named_{stage}', stage, size, True, min(causes[n] for n in there)))
     for i, name in enumerate(NAMES):
         if traces.get(name, 0.0) > 0:
             size = float(variances.tau[i] ** 2 * traces[name]) * px
@@ -93,8 +94,8 @@ def budget(
     parts.append(('noise', 'noise', variances.sigma**2 * freedom * px, False, 0.0))
     total = sum(size for _, _, size, _, _ in parts)
     return [
-        Component(name, stage, float(np.sqrt(size / 2)), size / total, named * size / total, p)
-        for name, stage, size, named, p in parts
+        Component(name, stage, float(np.sqrt(size / 2)), size / total, known * size / total, p)
+        for name, stage, size, known, p in parts
     ]
 
 

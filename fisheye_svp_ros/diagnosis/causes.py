@@ -16,9 +16,8 @@ from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     candidates,
 )
-from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse, swept
-from fisheye_svp_ros.diagnosis.prediction import placed_terms
-from fisheye_svp_ros.diagnosis.search import drop_test, restored
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse, swept
+from fisheye_svp_ros.diagnosis.search import drop_test
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
@@ -48,7 +47,7 @@ class Cause:
 def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
 
-    From the information of the null model; where estimates without each part of the frames
+    From the information of the null model; where estimates without each of the frames
     scatter by more than that allows, from that scatter (jackknife).
     NaN where the data leave a parameter open.
     """
@@ -56,8 +55,8 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     scale = evidence.scale[: evidence.own]
     variance, open_ = _variances(evidence.information[np.ix_(own, own)])
     errors = np.sqrt(variance) / scale
-    if jackknife and len(evidence.folds) > 2:
-        estimates = np.array([_step(f.information, own) for f in evidence.folds]) / scale
+    if jackknife and evidence.linear.data.frames > 2:
+        estimates = np.array([_step(part, own) for part in evidence.in_turn]) / scale
         count = len(estimates)
         squares = (count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(axis=0)
         limit = stats.chi2.ppf(_GUARD, count - 1) / (count - 1)
@@ -81,22 +80,20 @@ def _variances(information: Array) -> tuple[Array, Array]:
 
 
 def mean_causes(
-    evidence: Evidence, errors: Array, shares: dict[str, float],
+    evidence: Evidence, found: Sequence[Placed], errors: Array, shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],
 ) -> list[Cause]:
     """Return the causes that move predictions; held_out: rms and gain once each is in."""
     causes = []
-    placed = placed_terms(evidence)
-    terms = {effect.name: effect for effect, _ in evidence.linear.state.terms}
-    for (name, columns, values), (rms, gain) in zip(placed, held_out, strict=True):
-        effect = terms[name]
+    for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
+        name = effect.name
         parameters = {
             p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
             for p, v, e in zip(effect.parameters, values, errors[columns], strict=True)
         }
         included = np.arange(evidence.own)
         causes.append(Cause(
-            name, effect.key, parameters, drop_test(evidence, included, columns),
+            name, effect.key, parameters, drop_test(evidence, included, columns).p_value,
             shares[name], _survives(evidence, columns), rms, gain,
             _look_alikes(evidence, name, columns), effect.to_separate,
         ))
@@ -106,13 +103,11 @@ def mean_causes(
 def _survives(evidence: Evidence, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
     factor = evidence.forms.names()
-    for _, other, _ in placed_terms(evidence):
-        if np.array_equal(other, columns):
-            continue
-        rest = np.setdiff1d(np.arange(evidence.own), np.concatenate([other, columns]))
-        information = restored(evidence, np.concatenate([other, columns]))
-        score = evidence.score(swept(information, rest), columns)
-        if evidence.confident(score, rest, columns).p_value * factor > SIGNIFICANCE:
+    for _, other, _ in evidence.terms:
+        included = np.setdiff1d(np.arange(evidence.own), other)
+        if not np.array_equal(other, columns) and (
+            drop_test(evidence, included, columns).p_value * factor > SIGNIFICANCE
+        ):
             return False
     return True
 
@@ -122,12 +117,12 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
     if name == LandmarkSurveyEffect.name:
         return []
     rest = np.setdiff1d(np.arange(evidence.own), columns)
-    information = restored(evidence, columns)
+    information = evidence.restored(evidence.information, rest)
     left = swept(information, rest)
     strength = evidence.score(left, columns).statistic
     known = {effect.name for effect, _ in evidence.linear.state.terms}
     same: list[str] = []
-    for other in candidates(evidence, rest, information=information):
+    for other in candidates(evidence, rest):
         if other.effect.name in known or other.effect.name in same:
             continue
         if other.score.statistic < CLASS_STRENGTH * strength:

@@ -18,7 +18,7 @@ CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
 _BETTER = 6.0  # by so much another effect must describe the data better to take a cause's place
 _ABSURD = 30.0  # times what would be a large value of a parameter
-_HELD_OUT = 1.0  # standard errors by which held-out frames must be predicted better
+_HELD_OUT = 1.5  # standard errors by which held-out frames must be predicted better
 
 
 @dataclass(frozen=True)
@@ -65,11 +65,9 @@ class Step:
     why: str
 
 
-def candidates(
-    evidence: Evidence, included: Index, information: Array | None = None
-) -> list[Candidate]:
-    """Return all forms, best merit first; information: in place of the evidence's own."""
-    left = swept(evidence.information if information is None else information, included)
+def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
+    """Return all forms, best merit first."""
+    left = swept(evidence.restored(evidence.information, included), included)
     found = []
     for form, effect in enumerate(evidence.forms.effects):
         columns = evidence.columns_of(form)
@@ -116,16 +114,17 @@ def held_out_gain(
 ) -> HeldOutGain:
     """Return what columns add to the log predictive density of frames left out in turn.
 
-    Of log p(all) - log p(all but a part); a wide normal prior keeps what a part does not tell.
+    Of log p(all) - log p(all but one); a wide normal prior keeps what the others do not tell.
     """
     prior = np.diag([1 / p.large**2 for p in effect.parameters]) / np.outer(
         evidence.scale[columns], evidence.scale[columns]
     )
-    everything = _marginal(evidence.information, included, columns, prior)
-    variance = evidence.variances.sigma**2
-    gains = np.array([
-        everything - _marginal(f.information / variance, included, columns, prior)
-        for f in evidence.folds
+    everything, parts = (
+        evidence.restored(information, included)
+        for information in (evidence.information, evidence.in_turn)
+    )
+    gains = _marginal(everything, included, columns, prior) - np.array([
+        _marginal(part, included, columns, prior) for part in parts
     ])
     count = len(gains)
     stderr = float(gains.std(ddof=1) * np.sqrt(count)) if count > 1 else np.inf

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
@@ -22,8 +22,9 @@ _CALLED, _CALLED_LATE = 0.3, 0.01
 _LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
 _SHARE = 0.02
 _CHANCE = 0.05
+_HARDLY = 0.3  # standard error of log tau^2
 _WARM = 6  # steps from the variances of a similar state
-_DOUBTFUL = (6.0, 100.0)  # likelihood ratios between which the other variances are found anew
+_DOUBTFUL = (2.7, 25.0)  # likelihood ratios between which the other variances are found anew
 
 
 def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
@@ -40,12 +41,10 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
                         for i, n in enumerate(NAMES)])
         now = Variances(1.0, lam, first.weight)
         now, _ = estimate(eq, now)
-        asked = NAMES
     else:
-        # A similar state has similar variances; only what was not asked before is asked now.
         now, _ = estimate(eq, before, _WARM)
-        asked = ('image_finest',) if first.lam[NAMES.index('image_finest')] < GONE else ()
-    missing = [n for n in asked if not now.alive[NAMES.index(n)]]
+    # What the data do not call for beside large misfits they may call for beside smaller ones.
+    missing = [n for n in NAMES if not now.alive[NAMES.index(n)]]
     p = score_components(eq, now, missing) if missing else {}
     lam = now.lam.copy()
     for name in missing:
@@ -53,19 +52,29 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
             lam[NAMES.index(name)] = first.lam[NAMES.index(name)]
     if (lam < GONE).sum() > now.alive.sum():
         now, _ = estimate(eq, Variances(now.sigma, lam, now.weight))
-    return now if before is not None else _without_chance(eq, now)
+    return _without_chance(eq, now)
 
 
 def _without_chance(eq: Equations, now: Variances) -> Variances:
-    """Switch off what may as well be chance: a variance hardly known makes every test unsure."""
-    found = significance(eq, now)
-    lam = now.lam.copy()
-    for name, p in found.items():
-        if p > _CHANCE:
-            lam[NAMES.index(name)] = GONE
-    if (lam < GONE).sum() < now.alive.sum():
-        now, _ = estimate(eq, replace(now, lam=lam), _WARM)
+    """Switch off what may as well be chance: a variance hardly known makes every test unsure.
+
+    One at a time: two that do the same are each dispensable, but not both.
+    """
+    while doubtful := _hardly_known(now):
+        found = significance(eq, now, doubtful)
+        doubtful = [name for name in doubtful if found[name] > _CHANCE]
+        if not doubtful:
+            break
+        now, _ = estimate(eq, without(now, max(doubtful, key=found.__getitem__)), _WARM)
     return now
+
+
+def _hardly_known(now: Variances) -> list[str]:
+    """Return the components whose variance is not known well enough to be beyond doubt."""
+    assert now.covariance is not None
+    spread = np.sqrt(np.diag(now.covariance)[:-1])
+    return [name for name, there, sd in zip(NAMES, now.alive, spread, strict=True)
+            if there and sd > _HARDLY]
 
 
 def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[str, float]:
@@ -132,22 +141,24 @@ def _products(
     return own, ge, b.er[block, column][:, rest].T, b.ex[block, column].T
 
 
-def significance(eq: Equations, now: Variances) -> dict[str, float]:
-    """Return p-values of the components that are there, each by leaving it out.
+def significance(
+    eq: Equations, now: Variances, names: Sequence[str] = NAMES
+) -> dict[str, float]:
+    """Return p-values of those of some components that are there, each by leaving it out.
 
     Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
     JASA 82 (1987)); the other variances follow.
     """
     full = _deviance(eq, now)
     found = {}
-    for name, there in zip(NAMES, now.alive, strict=True):
-        if not there:
+    for name in names:
+        if not now.alive[NAMES.index(name)]:
             continue
         rest = without(now, name)
         ratio = _deviance(eq, rest) - full
         # The other variances only ever take up a part of it.
         if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
-            rest, _ = estimate(eq, rest, steps=2)
+            rest, _ = estimate(eq, rest, steps=1)
             ratio = _deviance(eq, rest) - full
         found[name] = float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
     return found

@@ -200,4 +200,6 @@ def extended_lens(lens: Lens, state: State, observations: Observations) -> Lens:
     # A fitted height curve may turn a little earlier than the one the lens came with.
     limit = min(lens.max_incidence, state.lens.image_height.limit * (1 - 1e-6))
     fitted = replace(state.lens, calibration=lens.calibration, max_incidence=limit)
-    return extend_lens(fitted, state.terms, observations)
+    # What happened to one recording is no part of the lens.
+    lasting = [term for term in state.terms if not term[0].of_recording]
+    return extend_lens(fitted, lasting, observations)

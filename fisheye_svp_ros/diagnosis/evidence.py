@@ -7,7 +7,7 @@ information matrix of everything fixed, the forms of the catalogue among it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -18,13 +18,17 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
 from fisheye_svp_ros.diagnosis.components import find_variances
 from fisheye_svp_ros.diagnosis.fields import mean_fields
-from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored, less_frames
+from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
 from fisheye_svp_ros.diagnosis.random_effects import Design, design
-from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.reml import Variances, start_variances
+from fisheye_svp_ros.effects.base import Effect
 
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
-FOLDS = 5
+
+
+Placed = tuple[Effect, Index, Array]  # an effect, its columns among what is shared, its values
 
 
 class Score(NamedTuple):
@@ -56,6 +60,13 @@ class Evidence:
     border: Array
     probes: dict[str, Index]
 
+    def around(
+        self, data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
+    ) -> Evidence:
+        """Return the evidence around another state of the same data, the variances as they are."""
+        bare = _multiplied(data, state, free, left_out, finest)
+        return replace(bare, variances=self.variances)
+
     @cached_property
     def equations(self) -> Equations:
         """The equations of the components that are there."""
@@ -72,17 +83,15 @@ class Evidence:
         return self.factored.information / self.variances.sigma**2
 
     @cached_property
-    def folds(self) -> list[Factored]:
-        """The equations without each part of the frames, factored."""
+    def left_out(self) -> LeftOut:
+        """Each frame seen from all the others."""
         alive = self.design.kept(self.variances.alive)
-        found = []
-        part = frame_folds(self.linear.data.frames)
-        for fold in range(int(part.max()) + 1):
-            out = np.flatnonzero(part == fold)
-            own = equations(alive, self.linear.frame_columns, self.border, self.full, out)
-            eq = less_frames(self.equations, own.trimmed(self.variances.alive), out)
-            found.append(factored(eq, self.variances.lam, self.variances.weight))
-        return found
+        return left_out_in_turn(self.factored, alive, self.linear.frame_columns, self.border)
+
+    @cached_property
+    def in_turn(self) -> Array:
+        """Information (F, X + 1, X + 1) of all frames but one."""
+        return self.information - self.left_out.information / self.variances.sigma**2
 
     @cached_property
     def untestable(self) -> dict[str, str]:
@@ -94,6 +103,29 @@ class Evidence:
             ranks[effect.name] = max(rank, ranks.get(effect.name, 0))
         taken = 'what it would do is taken up by what is free already'
         return self.forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
+
+    @property
+    def terms(self) -> list[Placed]:
+        """Each effect in the model, its columns among what is shared, and its values."""
+        terms = [t for t in self.linear.state.terms if t[0].stage != 'noise']
+        start = self.own - sum(len(values) for _, values in terms)
+        placed = []
+        for effect, values in terms:
+            placed.append((effect, np.arange(start, start + len(values)), values))
+            start += len(values)
+        return placed
+
+    def restored(self, information: Array, kept: Index) -> Array:
+        """Return information (..., X + 1, X + 1) as if only these of the effects were fitted."""
+        way = np.zeros(information.shape[-1])
+        for _, columns, values in self.terms:
+            gone = ~np.isin(columns, kept)
+            way[columns[gone]] = (values * self.scale[columns])[gone]
+        found = information.copy()
+        found[..., -1] += information @ way
+        found[..., -1, :] = found[..., -1]
+        found[..., -1, -1] += found[..., -1] @ way
+        return found
 
     def columns_of(self, form: int) -> Index:
         """Return the border's columns of a form."""
@@ -139,11 +171,6 @@ class Evidence:
         return float(np.clip(2 / max(spread, 1e-9), 2.0, 1e6))
 
 
-def frame_folds(frames: int) -> Index:
-    """Return the part (F,) that each frame belongs to."""
-    return np.arange(frames) % min(FOLDS, frames)
-
-
 def gather_evidence(
     data: Data, state: State, free: Sequence[str], before: Variances | None = None,
     left_out: Sequence[str] = (), finest: bool = False,
@@ -152,6 +179,17 @@ def gather_evidence(
 
     before: variances to start from; left_out: effects; finest: with the finest image field.
     """
+    bare = _multiplied(data, state, free, left_out, finest)
+    own = np.arange(bare.own)
+    free_ones = np.concatenate([own, bare.own + bare.forms.generic])
+    basis = identifiable(bare.linear.frame_columns, bare.border[..., :-1], free_ones)
+    return replace(bare, variances=find_variances(bare.full.bordered(basis), before))
+
+
+def _multiplied(
+    data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
+) -> Evidence:
+    """Return the evidence around a state before any variance is known."""
     linear = Linearised(data, state, free)
     forms = forms_of(linear, left_out)
     fields = mean_fields(linear)
@@ -162,14 +200,12 @@ def gather_evidence(
     random = design(linear, finest)
     full = equations(random, linear.frame_columns, border)
     own = linear.shared_columns.shape[-1]
-    free_ones = np.concatenate([np.arange(own), own + forms.generic])
-    basis = identifiable(linear.frame_columns, border[..., :-1], free_ones)
-    variances = find_variances(full.bordered(basis), before)
     probes, at = {}, own + forms.columns.shape[-1]
     for name, field in fields.items():
         probes[name] = np.arange(at, at + field.shape[-1])
         at += field.shape[-1]
-    return Evidence(linear, forms, random, full, variances, own, scale, border, probes)
+    nothing = start_variances(full)
+    return Evidence(linear, forms, random, full, nothing, own, scale, border, probes)
 
 
 def identifiable(pose: Array, columns: Array, chosen: Index) -> Array:

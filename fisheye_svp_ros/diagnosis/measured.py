@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, fit, prepare, start_poses
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit, prepare, start_poses
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
     Gain,
@@ -28,7 +28,6 @@ from fisheye_svp_ros.diagnosis.prediction import (
     frames_in_turn,
     gain_between,
     on_other_data,
-    placed_terms,
     without_causes,
 )
 from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
@@ -69,21 +68,26 @@ class Measured:
         self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
         self.evidence = found.evidence
         self.noise = noise_px(found.evidence)
-        self.names = [e.name for e, _ in found.state.terms if e.stage != 'noise']
+        self.names = [effect.name for effect, _, _ in found.causes]
         self.local: Local = local_offsets(found.fitted)
         self.test: Data | None = None
         self.test_gross: Gross | None = None
         if held_out is not None:
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
-            solved = start_poses(test, found.state)
-            self.test, self.test_gross = find_gross_errors(test, solved)
-            self.test_pose = start_poses(self.test, found.state).pose
+            solved = start_poses(test, self._there(test, found.state))
+            self.test, self.test_gross = find_gross_errors(test, self._there(test, solved))
+            self.test_pose = start_poses(self.test, self._there(test, found.state)).pose
 
     @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
         return standard_errors(self.evidence, not self.quick)
+
+    def _there(self, test: Data, state: State) -> State:
+        """Return the state without what other frames had that the test has not."""
+        t, known = (data.observations.t for data in (test, self.evidence.linear.data))
+        return replace(state, terms=tuple(e for e in state.terms if e[0].holds_for(t, known)))
 
     def held_out(self, without: Sequence[str] = (), local: bool = False) -> HeldOut:
         """Predict held-out frames without some causes, with or without local offsets."""
@@ -95,7 +99,8 @@ class Measured:
             state = without_causes(self.evidence, without, self.free)
         else:
             state = self.found.state
-        near = replace(state, pose=self.test_pose, rig=self.found.state.rig)
+        state = replace(self._there(self.test, state), pose=self.test_pose)
+        near = replace(state, rig=self.found.state.rig)
         return on_other_data(self.test, near, self.local if local else None)
 
     @cached_property
@@ -186,7 +191,7 @@ class Measured:
 
     def causes(self, components: Sequence[Component]) -> list[Cause]:
         """Return the causes that move predictions, with what each adds."""
-        squares = cause_squares(self.evidence)
+        squares = cause_squares(self.evidence, self.found.causes)
         named = sum(c.share for c in components if c.named_share)
         total = sum(squares.values())
         shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
@@ -194,7 +199,7 @@ class Measured:
             (after.rms, gain_between(before, after, self.noise).value)
             for before, after in zip(self._prefixes, self._prefixes[1:], strict=False)
         ]
-        causes = mean_causes(self.evidence, self.errors, shares, held_out)
+        causes = mean_causes(self.evidence, self.found.causes, self.errors, shares, held_out)
         if self.medium is None:
             return causes
         gain = gain_between(self._simulation, self._base, self.noise)
@@ -211,9 +216,9 @@ class Measured:
             identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
         )
         p_values = significance(eq, evidence.variances)
-        found = {name: drop_test(evidence, own, columns)
-                 for name, columns, _ in placed_terms(evidence)}
-        parts = budget(evidence, p_values, found | dict(noise_causes))
+        found = {effect.name: drop_test(evidence, own, columns).p_value
+                 for effect, columns, _ in self.found.causes}
+        parts = budget(evidence, self.found.causes, p_values, found | dict(noise_causes))
         return parts if self.medium is None else self.medium.budget(parts)
 
     def _free_errors(self) -> dict[str, float]:

@@ -16,7 +16,7 @@ from scipy import stats
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.evidence import block_basis, frame_folds, pseudo_inverse
+from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import (
     Data,
     Linearised,
@@ -39,6 +39,7 @@ _UNITS = {INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 
           THICKNESS: 'm'}
 _SUSPECT = 1.0  # px: less than this is no third of the image
 _LARGER = 1.1  # than in air: what looks so much larger may be seen through a flat port
+_FOLDS = 5
 _FEW = 12  # frames, enough for a start
 _TERMS = 8  # of a free lens curve
 _EXPLAINED = 0.98  # of what a free lens curve explains
@@ -68,7 +69,7 @@ class Medium:
         data, state = self.air.data, self.air.state
         if not self.free:
             return on_other_data(data, state)
-        part = frame_folds(data.frames)
+        part = np.arange(data.frames) % min(_FOLDS, data.frames)
         squares, counts = np.zeros(data.frames), np.zeros(data.frames)
         for fold in range(int(part.max()) + 1):
             mine = part == fold

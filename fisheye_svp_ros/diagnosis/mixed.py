@@ -91,53 +91,31 @@ class Equations:
         )
 
     def sorted(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
-        """Sort coefficients (E, k), (R,): by frame (F, b), by landmark (L, 3), shared (Q,)."""
+        """Sort coefficients (E, k, ...), (R, ...): by frame (F, b, ...), by landmark, shared."""
         if self.by_frame:
             count = len(r) - 3 * len(self.landmarks)
-            return e, r[count:].reshape(-1, 3), r[:count]
+            return e, r[count:].reshape(-1, 3, *r.shape[1:]), r[:count]
         count = len(self.pose_scale) * self.width
-        return r[:count].reshape(-1, self.width), e, r[count:]
+        return r[:count].reshape(len(self.pose_scale), self.width, *r.shape[1:]), e, r[count:]
 
 
-def equations(
-    design: Design, pose: Array, border: Array, like: Equations | None = None,
-    frames: Index | None = None,
-) -> Equations:
-    """Multiply out the columns of a design, of poses (F, M, 6) and of a border (F, M, X).
-
-    frames: those that count; like: equations of the same frames, to arrange these like them.
-    """
-    scale = np.sqrt((pose**2).sum(axis=1)) if like is None else like.pose_scale
+def equations(design: Design, pose: Array, border: Array) -> Equations:
+    """Multiply out the columns of a design, of poses (F, M, 6) and of a border (F, M, X)."""
+    scale = np.sqrt((pose**2).sum(axis=1))
     scale = np.where(scale < 1e-9, np.inf, scale)
-    chosen = np.arange(len(pose)) if frames is None else frames
-    products = multiplied(design, pose / scale[:, None], border, chosen)
+    products = multiplied(design, pose / scale[:, None], border)
     width = products.ff.shape[-1]
     l_label = np.where(design.landmark_label < 0, ABSENT, design.landmark_label)
-    by_frame = len(pose) * width >= l_label.size if like is None else like.by_frame
+    by_frame = len(pose) * width >= l_label.size
     f_label = np.concatenate([np.full(6, FIXED), design.frame_label])
     blocks = arranged(
         products, np.broadcast_to(f_label, (len(pose), width)), l_label, design.shared_label,
         by_frame,
     )
-    filled = (np.abs(pose).sum(axis=-1) + np.abs(border).sum(axis=-1))[chosen] > 0
+    rows = int((np.abs(pose).sum(axis=-1) + np.abs(border).sum(axis=-1) > 0).sum())
     poses = int(np.isfinite(scale).sum())
-    found = Equations(
-        blocks, by_frame, int(filled.sum()), poses, scale, width, np.arange(len(l_label))
-    )
-    return found if frames is not None else _held(found, np.where(np.isfinite(scale), _RIDGE, 1.0))
-
-
-def less_frames(eq: Equations, part: Equations, frames: Index) -> Equations:
-    """Return equations without some frames, whose own equations are `part`."""
-    b, c = eq.blocks, part.blocks
-    left = Blocks(
-        b.ee - c.ee, b.er - c.er, b.rr - c.rr, b.ex - c.ex, b.rx - c.rx, b.xx - c.xx,
-        b.e_label, b.r_label,
-    )
-    # Poses that no row depends on any more stay where they are.
-    ridge = np.zeros(eq.pose_scale.shape)
-    ridge[frames] = 1.0
-    return _held(replace(eq, blocks=left), ridge)
+    found = Equations(blocks, by_frame, rows, poses, scale, width, np.arange(len(l_label)))
+    return _held(found, np.where(np.isfinite(scale), _RIDGE, 1.0))
 
 
 def _held(eq: Equations, ridge: Array) -> Equations:

@@ -26,6 +26,8 @@ VIEW = 'the whole view is off: its points may be in another order'
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
+_SETTLED = 0.1  # of the scale: how little predictions may move
+_ROUNDING = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
 
@@ -70,10 +72,13 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     scale, offset = _scale(views, _offset(model, pose, views))
     if np.nanmax(offset / scale) > _SUSPECT:
         for _ in range(_ROUNDS):
+            before = offset
             fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
             weight = np.where(views.used, views.weight * fading, 0.0)
             pose = localize(model, views._replace(weight=weight), pose).pose
             scale, offset = _scale(views, _offset(model, pose, views))
+            if np.nanmax(np.abs(offset - before) / scale) < _SETTLED:
+                break
     of_landmark = _scale_of_landmark(views, offset)
     typical = float(np.median(scale))
     whole = scale[:, 0] > max(_VIEW * typical, _VIEW_PX)
@@ -126,7 +131,7 @@ def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
 def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
     """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
     median = np.nanmedian(offset, axis=1, keepdims=True)
-    return np.maximum(median, np.nanmedian(offset)) / _MEDIAN, offset
+    return np.maximum(median, max(np.nanmedian(offset), _ROUNDING)) / _MEDIAN, offset
 
 
 def _scale_of_landmark(views: Views, offset: Array) -> Array:

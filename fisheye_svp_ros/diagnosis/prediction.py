@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.evidence import Evidence, frame_folds, pseudo_inverse
+from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit_poses, moved
 from fisheye_svp_ros.diagnosis.refit import Local
 
@@ -74,7 +74,7 @@ def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldO
 def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]) -> State:
     """Return the state without some of its effects, the rest fitted anew (one linear step)."""
     linear = evidence.linear
-    kept, change, _ = _refitted(evidence, evidence.factored.information, names)
+    kept, change, _ = _refitted(evidence, evidence.information, names)
     shared = np.zeros(evidence.own)
     shared[kept] = change
     state = linear.state
@@ -92,8 +92,8 @@ def _refitted(
     """
     gone = np.zeros(evidence.own, dtype=bool)
     values = np.zeros(evidence.own)
-    for name, columns, value in placed_terms(evidence):
-        if name in names:
+    for effect, columns, value in evidence.terms:
+        if effect.name in names:
             gone[columns], values[columns] = True, value
     way = np.zeros(len(information))
     way[-1] = 1.0
@@ -106,34 +106,19 @@ def _refitted(
     return kept, change / evidence.scale[kept], way
 
 
-def placed_terms(evidence: Evidence) -> list[tuple[str, Index, Array]]:
-    """Return name, columns among what is shared, and values of each effect in the model."""
-    terms = [t for t in evidence.linear.state.terms if t[0].stage != 'noise']
-    start = evidence.own - sum(len(values) for _, values in terms)
-    placed = []
-    for effect, values in terms:
-        placed.append((effect.name, np.arange(start, start + len(values)), values))
-        start += len(values)
-    return placed
-
-
 def frames_in_turn(
     evidence: Evidence, without: Sequence[str] = (), local: bool = False
 ) -> HeldOut:
     """Predict frames left out in turn by a fit to the others (linear in all parameters)."""
-    linear, part = evidence.linear, frame_folds(evidence.linear.data.frames)
+    linear, even = evidence.linear, _evenly(evidence.linear)
     residual = np.zeros_like(linear.residual)
-    for fold, f in enumerate(evidence.folds):
-        mine = np.flatnonzero(part == fold)
-        _, _, way = _refitted(evidence, f.information, without)
-        left = evidence.border[mine] @ way
-        if local:
-            left = left - _local_rows(evidence, *f.coefficients(way), mine)
-        even = _evenly(linear)[mine]
-        left, poses = left * even, linear.frame_columns[mine] * even[..., None]
-        fitted = np.linalg.pinv(poses, rcond=1e-9) @ left[..., None]
-        residual[mine] = (left - (poses @ fitted)[..., 0]) / even
-    return _figures(linear, residual)
+    for frame, information in enumerate(evidence.in_turn):
+        _, _, way = _refitted(evidence, information, without)
+        rows = evidence.left_out.rows if local else evidence.border
+        left, poses = rows[frame] @ way * even[frame], linear.frame_columns[frame]
+        poses = poses * even[frame][:, None]
+        residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)
+    return _figures(linear, residual / even)
 
 
 def _evenly(linear: Linearised) -> Array:
@@ -141,19 +126,6 @@ def _evenly(linear: Linearised) -> Array:
     weight, own = (linear.data.blocks(w[..., None] * np.ones(2))
                    for w in (linear.data.views.weight, linear.weight))
     return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
-
-
-def _local_rows(evidence: Evidence, e: Array, r: Array, frames: Index) -> Array:
-    """Return what offsets of landmarks and of the image do in some frames (f, M), whitened."""
-    eq = evidence.equations
-    random = evidence.design.kept(evidence.variances.alive)
-    _, landmark, shared = eq.sorted(e, r)
-    offset = np.zeros((len(random.landmark) + 1, 3))
-    offset[eq.landmarks] = np.where(random.landmark_label[eq.landmarks] >= 0, landmark, 0.0)
-    rows = (random.place[frames] @ offset[random.slot[frames]][..., None])[..., 0]
-    height = evidence.linear.residual.shape[1]
-    everywhere = (random.shared @ shared).reshape(-1, height)
-    return np.asarray(rows.reshape(len(frames), height) + everywhere[frames])
 
 
 def _figures(linear: Linearised, whitened: Array) -> HeldOut:

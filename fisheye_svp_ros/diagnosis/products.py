@@ -42,53 +42,33 @@ class Products(NamedTuple):
     xx: Array
 
 
-def multiplied(design: Design, pose: Array, border: Array, frames: Index) -> Products:
-    """Multiply out some frames; the other frames' blocks are zero."""
-    count, height, _ = pose.shape
-    labels = design.landmark_label
-    landmarks, shared, edge = len(labels), design.shared.shape[1], border.shape[-1]
-    width = 6 + design.frame.shape[-1]
-    p = Products(
-        np.zeros((count, width, width)), np.zeros((landmarks, 3, 3)),
-        np.zeros((landmarks, 3, count, width)), np.zeros((shared, shared)),
-        np.zeros((shared, count, width)), np.zeros((landmarks, 3, shared)),
-        np.zeros((count, width, edge)), np.zeros((landmarks, 3, edge)), np.zeros((shared, edge)),
-        np.zeros((edge, edge)),
+def multiplied(design: Design, pose: Array, border: Array) -> Products:
+    """Multiply out the columns of a design, of poses and of a border."""
+    frames, height, _ = pose.shape
+    landmarks, shared, edge = len(design.landmark), design.shared, border.shape[-1]
+    own = np.concatenate([pose, design.frame], axis=-1)
+    across, flat = np.swapaxes(own, -1, -2), border.reshape(frames * height, edge)
+    offsets = design.offsets
+    lf = np.zeros((3 * landmarks, frames, own.shape[-1]))
+    sf = np.zeros((shared.shape[1], frames, own.shape[-1]))
+    ss = np.zeros((shared.shape[1], shared.shape[1]))
+    for f in range(frames):
+        rows = slice(f * height, (f + 1) * height)
+        lf[:, f], sf[:, f] = offsets[rows].T @ own[f], shared[rows].T @ own[f]
+        part = shared[rows]
+        seen = np.unique(part.indices)  # a frame fills a part of the image
+        dense = part[:, seen].toarray()
+        ss[np.ix_(seen, seen)] += dense.T @ dense
+    place = design.place * (design.slot >= 0)[..., None, None]
+    ll = np.zeros((landmarks, 3, 3))
+    np.add.at(ll, design.slot, np.swapaxes(place, -1, -2) @ place)
+    there = design.landmark_label >= 0
+    ll *= there[:, :, None] & there[:, None, :]
+    return Products(
+        across @ own, ll, lf.reshape(landmarks, 3, frames, -1), ss, sf,
+        (offsets.T @ shared).toarray().reshape(landmarks, 3, -1), across @ border,
+        (offsets.T @ flat).reshape(landmarks, 3, -1), shared.T @ flat, flat.T @ flat,
     )
-    offsets = bool((labels >= 0).any())
-    for f in frames:
-        own = np.concatenate([pose[f], design.frame[f]], axis=-1)
-        s = design.shared[f * height : (f + 1) * height].toarray()
-        p.ff[f], p.fx[f] = own.T @ own, own.T @ border[f]
-        p.ss[:] += s.T @ s
-        p.sf[:, f], p.sx[:] = s.T @ own, p.sx + s.T @ border[f]
-        p.xx[:] += border[f].T @ border[f]
-        n = np.flatnonzero(design.slot[f] >= 0)
-        if not offsets or not len(n):
-            continue
-        slot = design.slot[f, n]
-        place = np.where(labels[slot][:, None] >= 0, design.place[f, n], 0.0)
-        across = np.swapaxes(place, -1, -2)
-        pairs = (2 * n[:, None] + np.arange(2)).ravel()
-        all_rows = np.concatenate([own, border[f], s], axis=-1)
-        crossed = across @ all_rows[pairs].reshape(len(n), 2, -1)
-        for first in _once(slot):  # two cameras see a landmark twice
-            at, part = slot[first], crossed[first]
-            p.ll[at] += (across @ place)[first]
-            p.lf[at, :, f] += part[..., :width]
-            p.lx[at] += part[..., width : width + edge]
-            p.ls[at] += part[..., width + edge :]
-    return p
-
-
-def _once(slot: Index) -> list[Index]:
-    """Return groups of places in `slot` in each of which every value stands once."""
-    groups, left = [], np.arange(len(slot))
-    while len(left):
-        first = np.unique(slot[left], return_index=True)[1]
-        groups.append(left[first])
-        left = np.delete(left, first)
-    return groups
 
 
 def arranged(

@@ -18,7 +18,7 @@ MILLIMETRE = 1e-3  # unit of offsets on the target
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
     'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
-    'board_in_plane': 'target', 'board_normal': 'target',
+    'board_stretch': 'target', 'board_in_plane': 'target', 'board_normal': 'target',
     'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
     'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
 }
@@ -116,6 +116,18 @@ class Design(NamedTuple):
     grids: tuple[Grid, ...]
     fields: tuple[BoardField, ...]
     axes: Array
+
+    @property
+    def offsets(self) -> sparse.csr_array:
+        """Columns (F M, 3 L) of the offsets of landmarks, sparse; zero for what is not there."""
+        row, place = np.arange(self.slot.size * 2), self.place.reshape(-1, 3)
+        slot = np.repeat(self.slot.ravel(), 2)
+        values = np.where((slot >= 0)[:, None] & (self.landmark_label[slot] >= 0), place, 0.0)
+        column = 3 * np.maximum(slot, 0)[:, None] + np.arange(3)
+        return sparse.csr_array(
+            (values.ravel(), (np.repeat(row, 3), column.ravel())),
+            (len(row), 3 * len(self.landmark)),
+        )
 
     def kept(self, alive: Mask) -> Design:
         """Return the design with some of the components (`NAMES`) only."""
@@ -235,8 +247,8 @@ def _board_fields(
 ) -> list[BoardField]:
     """Return smooth displacements of boards, along and across them: neighbours err alike.
 
-    What the catalogue has for a whole board is taken out: its pose and scale along it, its smooth
-    shape across it.
+    Along it, what is linear has its own variance: paper stretches as a whole.  Across it, the
+    smooth shapes that the catalogue has are taken out.
     """
     fields = []
     for i, board in enumerate(linear.scene.boards):
@@ -247,6 +259,9 @@ def _board_fields(
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
         centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
         bumps = bump_values(at[None], np.ones((1, len(at)), dtype=bool), centres, pitch)[0]
+        stretch = np.zeros((len(local), 2))
+        stretch[mine] = at - at.mean(axis=0)
+        fields.append(BoardField('board_stretch', (0, 1), stretch))
         for name, axes, degree in (('board_in_plane', (0, 1), 1), ('board_normal', (2,), 4)):
             values = np.zeros((len(local), len(centres)))
             values[mine] = _outside_powers(bumps, at, degree)

@@ -73,17 +73,12 @@ def _own(fitted: Fitted) -> Array:
 def _rows(fitted: Fitted, e: Array, r: Array, values: Array) -> Array:
     """Return what coefficients (E, k, C), (R, C) and fixed values (K, C) do to the rows."""
     eq, random = fitted.factored.equations, fitted.design
-    count = values.shape[-1]
-    shape = fitted.linear.residual.shape
-    rows = fitted.linear.shared_columns @ (values / fitted.scale[:, None])
-    for c in range(count):
-        frame, landmark, shared = eq.sorted(e[..., c], r[:, c])
-        offset = np.zeros((len(random.landmark) + 1, 3))
-        offset[eq.landmarks] = np.where(random.landmark_label[eq.landmarks] >= 0, landmark, 0.0)
-        moved = (random.place @ offset[random.slot][..., None])[..., 0].reshape(shape)
-        rows[..., c] += moved + (random.shared @ shared).reshape(shape)
-        rows[..., c] += (_own(fitted) @ frame[..., None])[..., 0]
-    return np.asarray(rows)
+    frame, landmark, shared = eq.sorted(e, r)
+    offset = np.zeros((len(random.landmark), 3, values.shape[-1]))
+    offset[eq.landmarks] = landmark
+    flat = random.offsets @ offset.reshape(-1, offset.shape[-1]) + random.shared @ shared
+    rows = flat.reshape(*fitted.linear.residual.shape, -1) + _own(fitted) @ frame
+    return np.asarray(rows + fitted.linear.shared_columns @ (values / fitted.scale[:, None]))
 
 
 def _products(fitted: Fitted, rows: Array) -> tuple[Array, Array, Array]:
@@ -92,15 +87,9 @@ def _products(fitted: Fitted, rows: Array) -> tuple[Array, Array, Array]:
     count = rows.shape[-1]
     flat = rows.reshape(-1, count)
     by_frame = np.swapaxes(_own(fitted), -1, -2) @ rows
-    by_point = rows.reshape(*random.slot.shape, 2, count)
-    landmark = np.zeros((len(random.landmark), 3, count))
-    f, n = np.nonzero(random.slot >= 0)
-    np.add.at(landmark, random.slot[f, n],
-              np.swapaxes(random.place[f, n], -1, -2) @ by_point[f, n])
-    landmark = np.where(random.landmark_label[..., None] >= 0, landmark, 0.0)[eq.landmarks]
+    landmark = (random.offsets.T @ flat).reshape(-1, 3, count)[eq.landmarks]
     shared = random.shared.T @ flat
-    columns = fitted.linear.shared_columns / fitted.scale
-    x = flat_rows(columns).T @ flat
+    x = flat_rows(fitted.linear.shared_columns / fitted.scale).T @ flat
     if eq.by_frame:
         return by_frame, np.concatenate([shared, landmark.reshape(-1, count)]), x
     return landmark, np.concatenate([by_frame.reshape(-1, count), shared]), x

@@ -8,8 +8,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step, choose
-from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse, swept
+from fisheye_svp_ros.diagnosis.choice import (
+    SIGNIFICANCE,
+    HeldOutGain,
+    Step,
+    choose,
+    held_out_gain,
+)
+from fisheye_svp_ros.diagnosis.evidence import (
+    Evidence,
+    Placed,
+    Score,
+    gather_evidence,
+    pseudo_inverse,
+    swept,
+)
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.model import fit as refit_by_least_squares
 from fisheye_svp_ros.diagnosis.noise import (
@@ -19,7 +32,6 @@ from fisheye_svp_ros.diagnosis.noise import (
     outlying,
     with_noise_growth,
 )
-from fisheye_svp_ros.diagnosis.prediction import placed_terms
 from fisheye_svp_ros.diagnosis.refit import Fitted, fit_of, refit
 from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
@@ -39,7 +51,8 @@ _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a rou
 class Found:
     """The state with its causes, the evidence around it, the fit, the trace.
 
-    base: the first evidence; growth: of the noise with the angle, if it is a cause.
+    base: the first evidence; growth: of the noise with the angle, if it is a cause; given: the
+    effects that the lens came with.
     """
 
     state: State
@@ -49,6 +62,12 @@ class Found:
     base: Evidence
     gross: Gross
     growth: NoiseCause | None
+    given: tuple[Effect, ...]
+
+    @property
+    def causes(self) -> list[Placed]:
+        """What was found: effects, their columns among what is shared, values."""
+        return [term for term in self.evidence.terms if term[0] not in self.given]
 
 
 def search(
@@ -62,13 +81,17 @@ def search(
     dropped: set[str] = set()
     growth: NoiseCause | None = None
     cleaned = settled = finest = False
+    given = tuple(effect for effect, _ in state.terms)
+    # What the lens came with is as little asked for as what the user knows.
+    known = (*wanted.included, *(effect.name for effect in given))
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
         evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
         base, before = base or evidence, evidence.variances
-        included, gone = _needed(evidence, wanted.included)
-        trace += [_gone(name) for name in gone]
+        included, steps = _needed(evidence, known, wanted.quick)
+        trace += steps
+        gone = _names(steps)
         dropped.update(gone)
         choice = choose(evidence, included, _most(evidence, turn), dropped, wanted.quick)
         trace += choice.trace
@@ -100,9 +123,23 @@ def search(
         settled = cleaned
     if changed:
         evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
+    while True:
+        # The last variances weigh the last fit.
+        state = refit(data, state, free, evidence.variances).state
+        evidence = evidence.around(data, state, free, wanted.left_out, finest)
+        included, steps = _needed(evidence, known, wanted.quick)
+        if not steps:
+            break
+        trace += steps
+        state = _changed(evidence, state, included, _names(steps), ())
+        evidence = gather_evidence(data, state, free, evidence.variances, wanted.left_out, finest)
     fitted = fit_of(evidence)
     assert base is not None
-    return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth)
+    return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth, given)
+
+
+def _names(steps: Sequence[Step]) -> list[str]:
+    return [step.effect.partition('(')[0] for step in steps]
 
 
 def _most(evidence: Evidence, turn: int) -> int:
@@ -152,43 +189,53 @@ def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) 
     return refit_by_least_squares(data, state, free)
 
 
-def _needed(evidence: Evidence, kept: Sequence[str]) -> tuple[Index, list[str]]:
-    """Return the columns of what is still needed, given the others, and the names of the rest."""
+def _needed(
+    evidence: Evidence, known: Sequence[str], quick: bool
+) -> tuple[Index, list[Step]]:
+    """Return the columns of what is still needed, given the others, and why the rest is not.
+
+    The weakest goes first: what is no longer significant, then what held-out frames no longer
+    want.
+    """
     included = np.arange(evidence.own)
-    gone: list[str] = []
+    gone: list[Step] = []
     while True:
-        weakest, worst = None, SIGNIFICANCE
-        for name, columns, _ in placed_terms(evidence):
-            if name in gone or name in kept or name == LandmarkSurveyEffect.name:
+        weakest: tuple[float, Index, Step] | None = None
+        for effect, columns, _ in evidence.terms:
+            if effect.name in known or not np.isin(columns, included).all():
                 continue
-            p = drop_test(evidence, included, columns) * evidence.forms.names()
-            if p > worst:
-                weakest, worst = (name, columns), p
+            step = _doubt(evidence, included, effect, columns, quick)
+            if step is not None and (weakest is None or step.corrected > weakest[0]):
+                weakest = step.corrected, columns, step
         if weakest is None:
             return included, gone
-        gone.append(weakest[0])
+        gone.append(weakest[2])
         included = np.setdiff1d(included, weakest[1])
 
 
-def drop_test(evidence: Evidence, included: Index, columns: Index) -> float:
-    """Return the p-value of an effect in the model given everything else that is included."""
+def _doubt(
+    evidence: Evidence, included: Index, effect: Effect, columns: Index, quick: bool
+) -> Step | None:
+    """Return why an effect is not needed beside everything else that is included, if so."""
+    score = drop_test(evidence, included, columns)
+    corrected = min(1.0, score.p_value * evidence.forms.names())
+    gain, why = HeldOutGain(np.nan, np.nan), 'removed: the other causes explain it'
+    if corrected < SIGNIFICANCE:
+        if quick or effect.per_frame:
+            return None
+        gain = held_out_gain(evidence, np.setdiff1d(included, columns), columns, effect)
+        if gain.convincing:
+            return None
+        why = 'removed: it does not predict better any more'
+    return Step(effect.key, score.statistic, score.rank, score.p_value, corrected,
+                gain.value, gain.stderr, False, why)
+
+
+def drop_test(evidence: Evidence, included: Index, columns: Index) -> Score:
+    """Test an effect in the model given everything else that is included."""
     rest = np.setdiff1d(included, columns)
-    information = restored(evidence, columns)
-    score = evidence.score(swept(information, rest), columns)
-    return evidence.confident(score, rest, columns).p_value
-
-
-def restored(evidence: Evidence, columns: Index) -> Array:
-    """Return the information as if some columns of the model had not been fitted."""
-    information = evidence.information.copy()
-    values = np.zeros(len(information) - 1)
-    for _, mine, value in placed_terms(evidence):
-        values[mine] = value * evidence.scale[mine]
-    chosen = np.intersect1d(columns, np.arange(evidence.own))
-    add = information[:, chosen] @ values[chosen]
-    information[:, -1] += add
-    information[-1] += np.append(add[:-1], add[-1])
-    return information
+    information = evidence.restored(evidence.information, rest)
+    return evidence.confident(evidence.score(swept(information, rest), columns), rest, columns)
 
 
 def _estimated(
@@ -197,7 +244,7 @@ def _estimated(
     """Return chosen forms with their joint estimates."""
     columns = [evidence.columns_of(form) for form in forms]
     every = np.concatenate([included, *columns])
-    information = evidence.information
+    information = evidence.restored(evidence.information, included)
     inverse, _ = pseudo_inverse(information[np.ix_(every, every)], 1e-12)
     values = (inverse @ information[every, -1]) / evidence.scale[every]
     found, at = [], len(included)
@@ -231,8 +278,3 @@ def transferred(old: Effect, values: Array, new: Effect) -> Array:
     """Return start values of a form of an effect from another form's, by parameter name."""
     known = dict(zip((p.name for p in old.parameters), values, strict=True))
     return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
-
-
-def _gone(name: str) -> Step:
-    return Step(name, 0.0, 0, 1.0, 1.0, np.nan, np.nan, False,
-                'removed: the other causes explain it')

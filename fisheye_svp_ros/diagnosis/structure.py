@@ -16,6 +16,7 @@ from fisheye_svp_ros.diagnosis.refit import Fitted
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 
 _VARIABLE = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
+_FEWEST = 200  # numbers beyond the poses' own: of fewer no test of structure says anything
 
 
 class Structure(NamedTuple):
@@ -43,6 +44,9 @@ def remaining_structure(
         name = _VARIABLE[part.name.partition('_')[0]]
         old = found.get(name, Structure(name, 1.0, 0.0))
         found[name] = Structure(name, min(old.p_value, part.p_value), old.share + part.share)
+    full = evidence.full
+    if full.rows - full.poses - evidence.own < _FEWEST:
+        return list(found.values())
     tests = [*_field_tests(evidence), *_scatter_tests(fitted, known_noise)]
     tests.append(('image', float(stats.norm.sf(ripples(fitted))), 0.0))
     for name, p, share in tests:

@@ -171,6 +171,17 @@ class Effect(ABC):
         return other
 
     @property
+    def of_recording(self) -> bool:
+        """Whether it happened to one recording, so that neither lens nor target has it."""
+        return False
+
+    def holds_for(self, t: Array, known: Array) -> bool:
+        """Whether it says anything of other frames, of times t (s), than those of known times."""
+        if not self.of_recording:
+            return True
+        return bool(np.nanmin(known) <= np.median(t) <= np.nanmax(known))
+
+    @property
     def per_frame(self) -> bool:
         """Whether parameters belong to single frames, so that other frames say nothing of them."""
         return False

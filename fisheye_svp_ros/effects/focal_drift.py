@@ -30,6 +30,10 @@ class FocalDriftEffect(PlaneEffect):
         return [cls(degree, start, duration) for degree in (1, 2, 3)]
 
     @property
+    def of_recording(self) -> bool:
+        return True
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f'relative_t{i + 1}', '1', 0.01) for i in range(self.degree))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -12,13 +13,19 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.lens import Lens
 
+_MOST = 8  # polynomials
+
 
 @dataclass(frozen=True)
 class RadialProfileEffect(Effect):
-    """A smooth change of h(theta), px, as sums of Chebyshev polynomials of theta / theta_max."""
+    """A smooth change of h(theta), px, as sums of Chebyshev polynomials of theta / theta_max.
+
+    first: of the polynomials; those before it do what the lens's own coefficients do.
+    """
 
     terms: int = 2
     theta_max: float = field(default=1.5707963, metadata={'key': False})
+    first: int = field(default=1, metadata={'key': False})
 
     name = 'radial_profile'
     stage = 'ray'
@@ -27,18 +34,26 @@ class RadialProfileEffect(Effect):
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
-        return [cls(terms, round(scene.theta_max, 6)) for terms in (1, 2, 4, 8)]
+        own, limit = len(scene.lens.image_height.coefficient_names), round(scene.theta_max, 6)
+        finest = cls(_MOST, limit, own % _MOST + 1)
+        return [*(cls(terms, limit) for terms in (1, 2, 4)), finest]
+
+    def joined(self, other: Self) -> Effect:
+        return replace(other, terms=max(self.terms, other.terms),
+                       first=min(self.first, other.first))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        return tuple(Parameter(f'h{i + 1}', 'px', 10.0) for i in range(self.terms))
+        return tuple(Parameter(f'h{i}', 'px', 10.0) for i in range(self.first, self.terms + 1))
 
     def columns(self, scene: Scene) -> Array:
         height = ChebyshevHeight(self.theta_max, (0.0,) * self.terms).columns(scene.theta)
+        height = height[..., self.first - 1 :]
         return np.stack([np.zeros_like(height), height], axis=-2)
 
     def curved(self, lens: Lens, values: Array) -> Lens:
-        change = ChebyshevHeight(self.theta_max, tuple((values / lens.focal).tolist()))
+        every = np.concatenate([np.zeros(self.first - 1), values])
+        change = ChebyshevHeight(self.theta_max, tuple((every / lens.focal).tolist()))
         return replace(lens, image_height=lens.image_height.plus(change))
 
     def refocused(self, values: Array, ratio: float) -> Array:

@@ -29,9 +29,16 @@ class RigFlexEffect(Effect):
         frames = tuple(int(frame) for frame in np.unique(scene.views.frame))
         return [cls(degree, frames) for degree in (1, 2, 0) if degree < len(frames)]
 
+    def holds_for(self, t: Array, known: Array) -> bool:
+        return False  # the frames of another table have numbers of their own
+
     @property
     def per_frame(self) -> bool:
         return not self.degree
+
+    @property
+    def of_recording(self) -> bool:
+        return True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

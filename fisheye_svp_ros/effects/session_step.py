@@ -37,11 +37,18 @@ class SessionStepEffect(Effect):
             raise Untestable('fewer than six frames')
         return [cls((float(start),), timed) for start in instants[2:-1]]
 
+    def holds_for(self, t: Array, known: Array) -> bool:
+        return self.timed and super().holds_for(t, known)
+
     def joined(self, other: Self) -> Effect:
         return replace(self, starts=tuple(dict.fromkeys((*self.starts, *other.starts))))
 
     def refocused(self, values: Array, ratio: float) -> Array:
         return np.asarray((values.reshape(-1, len(_STEP)) / [ratio, 1.0, 1.0]).ravel())
+
+    @property
+    def of_recording(self) -> bool:
+        return True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

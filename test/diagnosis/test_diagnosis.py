@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
-from fisheye_svp_ros.diagnosis.noise import quantisation_step
+from fisheye_svp_ros.diagnosis.noise import Gross, quantisation_step
+from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
@@ -185,3 +187,63 @@ def test_what_the_user_knows_is_taken_in_or_left_out():
         Wanted(left_out=('skwe',))
     with pytest.raises(ParameterError, match='without a test'):
         Wanted(included=('wrong_ids',))
+
+
+def table_of(seed, frames=12, cameras=1, terms=()):
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng, cameras, frames)
+    return observe(lens(), terms, pose, views, SIGMA, rng)
+
+
+def test_what_the_lens_already_holds_is_no_cause_again():
+    effect, values = CATALOGUE['decentering'](), np.array([0.002, -0.001])
+    table = table_of(21, 24, terms=[(effect, values)])
+    known = replace(lens(), corrections={'decentering': effect.to_dict(values)})
+    found = diagnose(table, known)
+    assert found.verdict == 'adequate' and not found.causes
+    corrections = found.lens.corrections['decentering']['parameters']
+    assert corrections['p1'] == pytest.approx(0.002, abs=2e-4)
+
+
+def test_what_happened_to_a_recording_is_no_part_of_the_lens():
+    step = CATALOGUE['session_step']((12.0,), False)
+    table = table_of(22, 24, terms=[(step, np.array([0.002, 1.0, 0.0]))])
+    found = diagnose(table, lens(), held_out=table_of(23, 8))
+    assert [cause.effect for cause in found.causes] == ['session_step']
+    assert not found.lens.corrections
+    # The frames of a table of its own are not those that the step is between.
+    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+
+
+@pytest.mark.parametrize('kept', [
+    lambda t: t.frame < 1,
+    lambda t: t.frame < 2,
+    lambda t: ~((t.camera == 0) & np.isin(t.frame, [0, 3, 11])),
+    lambda t: ~((t.camera == 1) & (t.frame > 1)),
+    lambda t: (t.camera == 1) == (t.frame > 5),
+    lambda t: (t.landmark % 9 == 0) | (t.frame > 6),
+], ids=['one frame', 'two frames', 'first blind', 'second seldom', 'never both', 'few points'])
+def test_rigs_and_frames_that_see_little(kept):
+    table = table_of(24, 12, 2)
+    found = diagnose(table.take(kept(table)), lens(), free_intrinsics=True)
+    assert not found.causes
+    assert np.isfinite(found.extended.rms_px)
+    found.to_dict()
+
+
+def test_the_last_fit_is_the_best_under_the_last_variances():
+    rng = np.random.default_rng(25)
+    pose, views = scene(rng)
+    moves = rng.normal(size=views.points[0].shape) * 1e-3
+    terms = [(CATALOGUE['viewpoint_shift'].candidates(fitted(25)[2].scene)[0], np.array([0.02]))]
+    table = observe(lens(), terms, pose, views._replace(points=views.points + moves), SIGMA, rng)
+    table = replace(table, xyz=views.points[0][table.landmark])
+    data = prepare(table)
+    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
+    found = search(data, fit(data, start(data, lens()), ()), (), Wanted(), gross, lambda _: None)
+    own = np.arange(found.evidence.own)
+    information = found.evidence.information
+    step = np.linalg.solve(information[np.ix_(own, own)], information[own, -1])
+    errors = standard_errors(found.evidence) * found.evidence.scale[own]
+    assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
+    assert np.abs(step / errors).max() < 0.1

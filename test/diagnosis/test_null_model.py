@@ -9,7 +9,8 @@ from scipy import stats
 
 from fisheye_svp_ros.diagnosis.components import score_components, significance
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
-from fisheye_svp_ros.diagnosis.mixed import equations, factored, less_frames, solve
+from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
+from fisheye_svp_ros.diagnosis.mixed import equations, factored, solve
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, design
 from fisheye_svp_ros.diagnosis.refit import fit_linear, local_offsets
@@ -126,28 +127,40 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
-def test_frames_can_be_taken_out_again():
-    linear = linearised()
-    random = design(linear)
+@pytest.mark.parametrize('by_frame', [False, True])
+def test_a_frame_left_out_is_as_if_it_had_never_been(by_frame):
+    linear = linearised(cameras=2, frames=6)
+    random, pose = design(linear), linear.frame_columns
+    if not by_frame:  # what single frames have of their own makes their blocks the larger part
+        random = random._replace(frame=random.frame[..., :2], frame_label=random.frame_label[:2])
     border = np.concatenate(
         [linear.effect_columns(CATALOGUE['decentering']()), linear.residual[..., None]], axis=-1
     )
-    eq = equations(random, linear.frame_columns, border)
+    eq = equations(random, pose, border)
     now = some_variances(eq)
-    out = np.array([0, 7, 11])
-    part = equations(random, linear.frame_columns, border, eq, out)
-    fewer = factored(less_frames(eq, part, out).trimmed(now.alive), now.lam, now.weight)
-    data = linear.data
-    keep = ~np.isin(np.arange(data.frames), out)
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    assert f.equations.by_frame == by_frame
+    found = left_out_in_turn(f, random, pose, border)
+    keep = np.arange(len(pose)) != 3
+    rows = np.repeat(keep, linear.residual.shape[1])[:, None]
     gone = random._replace(
         frame=random.frame * keep[:, None, None], place=random.place * keep[:, None, None, None],
-        shared=random.shared.multiply(np.repeat(keep, linear.residual.shape[1])[:, None]).tocsr(),
+        shared=random.shared.multiply(rows).tocsr(),
         slot=np.where(keep[:, None], random.slot, -1),
     )
-    rest = equations(gone, linear.frame_columns * keep[:, None, None],
-                     border * keep[:, None, None], eq)
+    rest = equations(gone, pose * keep[:, None, None], border * keep[:, None, None])
     direct = factored(rest.trimmed(now.alive), now.lam, now.weight)
-    np.testing.assert_allclose(fewer.information, direct.information, rtol=1e-4)
+    np.testing.assert_allclose(f.information - found.information[3], direct.information, rtol=1e-4)
+    # What the others predict of the frame's image, its pose fitted to what they leave.
+    way = np.array([0.0, 0.0, 1.0])
+    _, landmark, shared = direct.equations.sorted(*direct.coefficients(way))
+    offset = np.zeros((len(random.landmark) + 1, 3))
+    offset[direct.equations.landmarks] = landmark
+    moved = (random.place[3] @ offset[random.slot[3]][..., None]).ravel()
+    height = linear.residual.shape[1]
+    left = linear.residual[3] - moved - random.shared[3 * height : 4 * height] @ shared
+    left -= pose[3] @ np.linalg.lstsq(pose[3], left, rcond=1e-9)[0]
+    np.testing.assert_allclose(found.rows[3] @ way, left, atol=1e-5 * np.abs(left).max())
 
 
 def test_variances_that_were_put_in_come_out():
