@@ -21,15 +21,14 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
+    from fisheye_svp_ros.commands.lenses import add_lens_argument
     from fisheye_svp_ros.commands.photographs import add_board_arguments
 
     parser.add_argument('observations', metavar='OBS',
                         help='observations: a CSV file, a folder of ORPC files, a recording; or '
                         'photographs, with --board')
     add_board_arguments(parser)
-    parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='the simulation: a lens file, or the name of one that comes with '
-                        'the package')
+    add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
                         help='true poses; unknown and fitted by default')
     parser.add_argument('--free', choices=['intrinsics'],
@@ -58,22 +57,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
+    from fisheye_svp_ros.commands.lenses import load_lenses
     from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-    from fisheye_svp_ros.diagnosis.inputs import poses_by_frame
+    from fisheye_svp_ros.diagnosis.inputs import free_names, poses_by_frame, rig_lenses
     from fisheye_svp_ros.diagnosis.known_truth import known_errors
-    from fisheye_svp_ros.diagnosis.model import intrinsic_names
     from fisheye_svp_ros.diagnosis.wanted import Wanted
-    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
-    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.progress import stages
 
     if (args.number or args.room) and not args.count:
         raise ParameterError('--for and --room go with --next N')
-    lens = load_lens(lens_path(args.lens))
-    free = args.free == 'intrinsics' or lens.calibration is not None
-    observations = _read(args.observations, args, lens)
-    held_out = _read(args.held_out, args, lens) if args.held_out else None
+    given = load_lenses(args.lens)
+    if args.count and len(given) > 1:
+        raise ParameterError('--next plans the photographs of one camera; give one lens')
+    free = True if args.free == 'intrinsics' else None
+    observations, lens = _read(args.observations, args, given)
+    held_out = _read(args.held_out, args, given)[0] if args.held_out else None
+    names = free_names(rig_lenses(observations, lens), free)
     poses = None
     if args.poses:
         poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
@@ -84,13 +84,12 @@ def run(args: argparse.Namespace) -> None:
             progress=progress,
         )
         progress('errors where the truth is known')
-        names = intrinsic_names(lens) if free else ()
         known = known_errors(diagnosis.before, diagnosis.after, names)
         wanted = _wanted(args, diagnosis) if args.count else None
         if args.output:
             progress('report')
             with together():
-                _write(args, diagnosis, known, free, wanted)
+                _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args.output, wanted)
 
 
@@ -103,14 +102,20 @@ def _wanted(args: argparse.Namespace, diagnosis: Diagnosis) -> Next:
                             args.number, room)
 
 
-def _read(path: str, args: argparse.Namespace, lens: Lens) -> Observations:
+def _read(
+    path: str, args: argparse.Namespace, given: dict[str, Lens]
+) -> tuple[Observations, Lens | dict[str, Lens]]:
+    """Return the views that can be posed, and the lens of all cameras or that of each."""
+    from fisheye_svp_ros.commands.lenses import lenses_of
     from fisheye_svp_ros.commands.notes import note_left_out
     from fisheye_svp_ros.commands.photographs import measured
     from fisheye_svp_ros.diagnosis.inputs import posable
 
-    observations, left_out = posable(measured(path, args)[0], lens)
+    table, _ = measured(path, args)
+    lens = given[''] if set(given) == {''} else lenses_of(table.cameras, given)
+    observations, left_out = posable(table, lens)
     note_left_out(left_out)
-    return observations
+    return observations, lens
 
 
 def _print(
@@ -136,7 +141,8 @@ def _print(
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)
     if folder:
-        print(f'{folder}: report.html, diagnosis.json, {text.EXTENDED}, residuals.csv')
+        lenses = ', '.join(str(Path(camera) / text.EXTENDED) for camera in diagnosis.lenses)
+        print(f'{folder}: report.html, diagnosis.json, {lenses}, residuals.csv')
 
 
 def _write(
@@ -155,10 +161,11 @@ def _write(
     if wanted:
         document['next'] = wanted.to_list()
     write_json(folder / 'diagnosis.json', document)
-    save_lens(diagnosis.lens, folder / EXTENDED)
+    for camera, lens in diagnosis.lenses.items():
+        save_lens(lens, folder / camera / EXTENDED)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations.cameras)
     write_report(diagnosis, points, known, Inputs(
-        args.observations, args.lens, args.poses, args.held_out, folder, free
+        args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free
     ), wanted)
 
 

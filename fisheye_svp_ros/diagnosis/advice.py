@@ -10,7 +10,7 @@ import numpy as np
 from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.measured import Measured
-from fisheye_svp_ros.diagnosis.noise import VIEW
+from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW
 from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
 
@@ -95,8 +95,9 @@ def _frames(found: Found) -> list[Advice]:
             frames=[int(numbers[i]) for i in order],
         ))
     gross = found.gross
-    off = sorted({int(data.observations.frame[row]) for row, why in
-                  zip(gross.rows, gross.why, strict=True) if why == VIEW})
-    if off:
-        advice.append(Advice('look at these photographs: ' + VIEW, frames=off))
+    for reason in (VIEW, FRAME):
+        off = sorted({int(data.observations.frame[row]) for row, why in
+                      zip(gross.rows, gross.why, strict=True) if why == reason})
+        if off:
+            advice.append(Advice('look at these photographs: ' + reason, frames=off))
     return advice

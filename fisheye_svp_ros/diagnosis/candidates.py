@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.cameras import RigScene
 from fisheye_svp_ros.diagnosis.model import Linearised
-from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 
 _GAPS = 4
@@ -47,18 +49,20 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
         if kind.stage == 'noise' or name in left_out:
             continue
         try:
-            forms = kind.candidates(linear.scene)
+            by_lens = _forms(kind, linear.scene, linear.state.labels)
         except Untestable as why:
             untestable[name] = str(why)
             continue
+        forms = [form for own in by_lens for form in own]
         if name == LandmarkSurveyEffect.name:
             continue  # single landmarks are asked last, all at once
         effects += forms
         count[name] = len(forms)
-        if name == SessionStepEffect.name:
-            richest += _longest_pauses(linear, forms)
-        else:
-            richest.append(max(forms, key=lambda form: len(form.parameters)))
+        for own in by_lens:
+            if name == SessionStepEffect.name:
+                richest += _longest_pauses(own)
+            else:
+                richest.append(max(own, key=lambda form: len(form.parameters)))
     at, start = [], 0
     for effect in effects:
         at.append(slice(start, start + len(effect.parameters)))
@@ -71,8 +75,31 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
     return Forms(tuple(effects), tuple(at), columns, where, count, untestable)
 
 
-def _longest_pauses(linear: Linearised, steps: Sequence[Effect]) -> list[Effect]:
+def _forms(
+    kind: type[Effect], scene: Scene, labels: Sequence[str]
+) -> list[Sequence[Effect]]:
+    """Return the forms of an effect; what a lens has, each lens of a rig has for itself.
+
+    Raises Untestable where there is none.
+    """
+    of_lens = kind.stage in ('ray', 'image', 'detector') and not kind.of_target
+    if not isinstance(scene, RigScene) or not of_lens:
+        return [kind.candidates(scene)]
+    found: list[Sequence[Effect]] = []
+    reason = Untestable('no camera sees anything')
+    for _, camera, own in scene.parts:
+        try:
+            found.append(by_camera(camera, labels[camera], kind.candidates(own)))
+        except Untestable as why:
+            reason = why
+    if not found:
+        raise reason
+    return found
+
+
+def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:
     """Return steps at the longest pauses between frames, where sessions are likely to change."""
-    starts = np.array([step.starts[0] for step in steps if isinstance(step, SessionStepEffect)])
+    plain = [step.parts[0][2] if isinstance(step, OfCameras) else step for step in steps]
+    starts = np.array([step.starts[0] for step in plain if isinstance(step, SessionStepEffect)])
     pauses = np.diff(starts, prepend=starts[:1])
     return [steps[i] for i in np.sort(np.argsort(-pauses, kind='stable')[:_GAPS])]

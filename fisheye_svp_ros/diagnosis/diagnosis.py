@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,13 +12,13 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import Step
+from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses
 from fisheye_svp_ros.diagnosis.measured import Fit, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import (
     Linearised,
     State,
     fit,
-    intrinsic_names,
     prepare,
     start,
 )
@@ -34,6 +34,8 @@ from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_caus
 from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
+from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -66,11 +68,16 @@ class Diagnosis:
     trace: list[Step]
     gain: Gain
     intrinsics: dict[str, Intrinsic]
-    lens: Lens
+    lenses: dict[str, Lens]
     local: Local
     errors: ModelError
     before: Linearised
     after: Linearised
+
+    @property
+    def lens(self) -> Lens:
+        """The extended lens, of the first camera of a rig."""
+        return next(iter(self.lenses.values()))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
@@ -101,25 +108,30 @@ class Diagnosis:
 
 
 def diagnose(
-    observations: Observations, lens: Lens, *, free_intrinsics: bool | None = None,
+    observations: Observations, lens: Lens | Mapping[str, Lens], *,
+    free_intrinsics: bool | None = None,
     poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
     wanted: Wanted | None = None, progress: Callable[[str], None] = lambda _: None,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
+    lens: of every camera, or the lenses of a rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
     poses: true poses by frame; held_out: other frames of the same camera and target; wanted:
     causes to take in or leave out; progress: told what is being done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
-    if free_intrinsics is None:
-        free_intrinsics = lens.calibration is not None
-    free = intrinsic_names(lens) if free_intrinsics else ()
+    lenses = rig_lenses(observations, lens)
+    free = free_names(lenses, free_intrinsics)
+    first, *others = lenses.values()
+    if held_out is not None and others and held_out.cameras != observations.cameras:
+        raise ObservationError(f'{held_out.source}: its cameras are not those of the rig, '
+                               + ', '.join(observations.cameras))
     wanted = wanted or Wanted()
     progress('fitting the simulation as it is')
     everything = prepare(observations, poses)
-    data, gross = find_gross_errors(everything, start(everything, lens))
-    base = fit(data, start(data, lens), free)
+    data, gross = find_gross_errors(everything, start(everything, first, others))
+    base = fit(data, start(data, first, others), free)
     step = quantisation_step(observations.uv)
     rounded = step / np.sqrt(12) > _STEP_OVER_NOISE * _residual_px(Linearised(data, base, free))
     if rounded:
@@ -127,7 +139,7 @@ def diagnose(
         wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
     medium = None
     if 'flat_port' not in wanted.left_out:
-        medium = find_medium(data, lens, base, free, progress)
+        medium = find_medium(data, first, base, free, progress)
     if medium is not None:
         # Index and lens curve look alike: the intrinsics stay as they were in air.
         base, free = medium.state, medium.names
@@ -136,7 +148,7 @@ def diagnose(
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data')
     return _judged(
-        observations, lens, found, Measured(found, free, held_out, wanted.quick, medium),
+        observations, lenses, found, Measured(found, free, held_out, wanted.quick, medium),
         noise_causes, held_out,
     )
 
@@ -148,7 +160,7 @@ def _residual_px(linear: Linearised) -> float:
 
 
 def _judged(
-    observations: Observations, lens: Lens, found: Found, measured: Measured,
+    observations: Observations, lenses: Mapping[str, Lens], found: Found, measured: Measured,
     noise_causes: list[Cause], held_out: Observations | None,
 ) -> Diagnosis:
     evidence = found.evidence
@@ -181,7 +193,7 @@ def _judged(
         trace=found.trace,
         gain=measured.gain,
         intrinsics=measured.intrinsics,
-        lens=extended_lens(lens, found.state, observations),
+        lenses=extended_lenses(lenses, found.state, observations),
         local=measured.local,
         errors=ModelError.of(evidence),
         before=measured.before,
@@ -195,11 +207,16 @@ def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:
     return 'unexplained' if left else 'adequate'
 
 
-def extended_lens(lens: Lens, state: State, observations: Observations) -> Lens:
-    """Return the lens that was fitted, with its effects, for every command and node."""
-    # A fitted height curve may turn a little earlier than the one the lens came with.
-    limit = min(lens.max_incidence, state.lens.image_height.limit * (1 - 1e-6))
-    fitted = replace(state.lens, calibration=lens.calibration, max_incidence=limit)
+def extended_lenses(
+    lenses: Mapping[str, Lens], state: State, observations: Observations
+) -> dict[str, Lens]:
+    """Return the lenses that were fitted, with their effects, for every command and node."""
     # What happened to one recording is no part of the lens.
     lasting = [term for term in state.terms if not term[0].of_recording]
-    return extend_lens(fitted, lasting, observations)
+    found = {}
+    for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
+        # A fitted height curve may turn a little earlier than the one the lens came with.
+        limit = min(lenses[name].max_incidence, fitted.image_height.limit * (1 - 1e-6))
+        own = replace(fitted, calibration=lenses[name].calibration, max_incidence=limit)
+        found[name] = extend_lens(own, camera_terms(lasting, camera), observations)
+    return found

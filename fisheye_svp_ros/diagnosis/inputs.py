@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.diagnosis.model import intrinsic_names
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
@@ -13,16 +16,45 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.measured import posable_views
 
 
-def posable(observations: Observations, lens: Lens) -> tuple[Observations, tuple[int, ...]]:
+def rig_lenses(observations: Observations, lens: Lens | Mapping[str, Lens]) -> dict[str, Lens]:
+    """Return the lens of each camera by name, or the one of all under ''.
+
+    Raises ObservationError for a camera of the observations without a lens.
+    """
+    if isinstance(lens, Lens):
+        return {'': lens}
+    missing = [name for name in observations.cameras if name not in lens]
+    if missing:
+        raise ObservationError(f'{observations.source}: camera {missing[0]!r} has no lens')
+    return {name: lens[name] for name in observations.cameras}
+
+
+def free_names(lenses: Mapping[str, Lens], free: bool | None = None) -> tuple[str, ...]:
+    """Return the intrinsics that are fitted, those of a rig with the camera's name before them.
+
+    free: of all lenses or of none; None asks each lens whether a calibration made it.
+    """
+    return tuple(
+        f'{camera}.{name}' if camera else name for camera, lens in lenses.items()
+        if (lens.calibration is not None if free is None else free)
+        for name in intrinsic_names(lens)
+    )
+
+
+def posable(
+    observations: Observations, lens: Lens | Mapping[str, Lens]
+) -> tuple[Observations, tuple[int, ...]]:
     """Return the views that fix a pose, and the frames that have others.
 
     Raises GeometryError where a camera has no view left.
     """
-    model = ForwardModel(lens)
+    lenses = rig_lenses(observations, lens)
+    models = [ForwardModel(one) for one in lenses.values()]
     kept = np.ones(len(observations), dtype=bool)
     left_out: set[int] = set()
     for camera in np.unique(observations.camera):
         mine = observations.camera == camera
+        model = models[int(camera) if len(models) > 1 else 0]
         _, frames = posable_views(observations.take(mine), model)
         kept[mine & np.isin(observations.frame, frames)] = False
         left_out.update(frames)

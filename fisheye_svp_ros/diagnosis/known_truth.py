@@ -10,9 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.pose import Pose, axis_angle_between
-from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import triangulate
 
 _FOLDS = 3
@@ -65,8 +63,7 @@ def _trained(linear: Linearised, free: Sequence[str]) -> Iterator[tuple[Data, St
         part = replace(linear.state, pose=linear.state.pose.take(np.flatnonzero(kept)))
         trained = fit(chosen_views(data, kept[data.frame_of]), part, free)
         held_out = chosen_views(data, ~kept[data.frame_of])
-        model = ForwardModel(trained.lens, trained.terms)
-        solved = localize(model, held_out.views.take(_first(held_out))).pose
+        solved = trained.cameras.localize(held_out.views.take(_first(held_out)))
         yield held_out, replace(trained, pose=solved)
 
 
@@ -90,14 +87,14 @@ def _axis_errors(held_out: Data, state: State) -> Array:
 
 def _depth_errors(held_out: Data, state: State) -> Array:
     """Return the mean error of each frame, m; NaN where the cameras share no landmark."""
-    model = ForwardModel(state.lens, state.terms)
+    first, second = (state.cameras.model(camera) for camera in (0, 1))
     place = state.pose if held_out.poses is None else _true(held_out)
     right_pose = place.compose(state.rig.take(1))
     rig = state.rig.take(1).inverse()
     errors = []
     for i, view in enumerate(_first(held_out)):
         points, left, right = _shared(held_out, int(view))
-        found = triangulate(model, model, rig, left, right).points
+        found = triangulate(first, second, rig, left, right).points
         off = np.linalg.norm(found - right_pose.take(i).into_body(points), axis=-1)
         errors.append(float(off[np.isfinite(off)].mean()) if np.isfinite(off).any() else np.nan)
     return np.array(errors)

@@ -234,7 +234,7 @@ class Measured:
         base, after = self.found.base, self._free_errors()
         before = standard_errors(base, jackknife=False)
         rig = _rig_columns(base, self.free)
-        was, now = base.linear.state.lens.parameters, self.found.state.lens.parameters
+        was, now = base.linear.state.parameters, self.found.state.parameters
         return {
             name: Intrinsic(
                 was[name], float(before[rig + i]), now[name], after[name]

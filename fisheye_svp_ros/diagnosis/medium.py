@@ -210,7 +210,7 @@ def _free_curve(data: Data, base: State) -> State:
 def _magnified(air: Linearised, lens: Lens, state: State) -> bool:
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
-    model = Linearised(air.data, state, ()).model.lens
+    model = Linearised(air.data, state, ()).model.model(0).lens
     height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
                      for one in (model, lens))
     return height > _LARGER * known

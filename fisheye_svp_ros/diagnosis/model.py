@@ -9,16 +9,16 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.cameras import Cameras, Seen
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
-from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
-from fisheye_svp_ros.optics.camera import lens_columns
+from fisheye_svp_ros.effects.forward import ForwardModel, Term
+from fisheye_svp_ros.effects.of_cameras import by_camera
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
-from fisheye_svp_ros.solve.localization import localize
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,43 @@ class Data:
 
 @dataclass(frozen=True)
 class State:
-    """A fit: poses (F,) of the rig's body, rig (C,) of the cameras in it, lens, effects."""
+    """A fit: poses (F,) of the rig's body, rig (C,) of the cameras in it, lens, effects.
+
+    others: the lenses of the further cameras of a rig, by whose names (`labels`) parameters and
+    effects are told apart; without them every camera has the same lens.
+    """
 
     pose: Pose
     rig: Pose
     lens: Lens
     terms: tuple[Term, ...]
+    others: tuple[Lens, ...] = ()
+    labels: tuple[str, ...] = ('',)
+
+    @property
+    def lenses(self) -> tuple[Lens, ...]:
+        """The lens of each camera of a rig, or the one of all."""
+        return (self.lens, *self.others)
+
+    @property
+    def cameras(self) -> Cameras:
+        """The forward models of the cameras."""
+        return Cameras(self.lenses, self.terms)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Values of the parameters of all lenses."""
+        return {
+            f'{label}.{name}' if label else name: value
+            for label, lens in zip(self.labels, self.lenses, strict=True)
+            for name, value in lens.parameters.items()
+        }
+
+    def own_names(self, free: Sequence[str]) -> list[list[str]]:
+        """Return which of some parameters each lens has, by their names there."""
+        heads = [f'{label}.' if label else '' for label in self.labels]
+        return [[name.removeprefix(head) for name in free if name.startswith(head)]
+                for head in heads]
 
     def view_poses(self, data: Data) -> Pose:
         """Return the camera's pose in each view (S,)."""
@@ -96,30 +127,70 @@ def intrinsic_names(lens: Lens) -> tuple[str, ...]:
     return (*INTRINSICS, *lens.image_height.coefficient_names)
 
 
-def start(data: Data, lens: Lens) -> State:
-    """Localize every view with the lens as it is; take the rig from the median of the frames.
+def start(data: Data, lens: Lens, others: Sequence[Lens] = ()) -> State:
+    """Localize every view with the lens as it is; take the rig from the middle of the frames.
 
+    others: the lenses of the further cameras of a rig.
     Raises GeometryError, naming the frame, where a view has too few points.
     """
-    model = ForwardModel(lens)
-    solved = localize(model, data.views).pose
-    pose = data.poses or _frame_poses(data, solved, identity(data.cameras))
-    rig = identity(data.cameras)
-    for camera in range(1, data.cameras):
-        mine = np.flatnonzero(data.camera_of == camera)
-        relative = pose.take(data.frame_of[mine]).inverse().compose(solved.take(mine))
-        middle = np.argsort(np.linalg.norm(relative.position, axis=1))[len(mine) // 2]
-        rig.put(camera, relative.take(middle))
-    terms = model.terms_for(data.views)
-    target = {} if len(terms) > len(model.terms) else lens.target
-    return State(pose, rig, replace(lens, corrections={}, target=target), terms)
+    models = [ForwardModel(one) for one in (lens, *others)]
+    labels = data.observations.cameras if others else ('',)
+    terms = models[0].terms_for(data.views)
+    of_target = terms[len(models[0].terms) :]
+    if others:
+        held: dict[str, Term] = {}
+        for i, (label, model) in enumerate(zip(labels, models, strict=True)):
+            effects = by_camera(i, label, (effect for effect, _ in model.terms))
+            for effect, (_, values) in zip(effects, model.terms, strict=True):
+                known = held.get(effect.name)
+                held[effect.name] = (effect, values) if known is None else (
+                    known[0].joined(effect), np.concatenate([known[1], values]))
+        terms = (*held.values(), *of_target)
+    bare = [replace(one, corrections={}, target={} if of_target else one.target)
+            for one in (lens, *others)]
+    state = State(identity(data.frames), identity(data.cameras), bare[0], terms, tuple(bare[1:]),
+                  labels)
+    solved = state.cameras.localize(data.views)
+    rig = _rig(data, solved)
+    return replace(state, rig=rig, pose=data.poses or _frame_poses(data, solved, rig))
 
 
 def start_poses(data: Data, trained: State) -> State:
     """Return a state fitted to other data with the poses of these frames; all else is kept."""
-    solved = localize(ForwardModel(trained.lens, trained.terms), data.views).pose
+    solved = trained.cameras.localize(data.views)
     pose = data.poses or _frame_poses(data, solved, trained.rig)
     return fit_poses(data, replace(trained, pose=pose))
+
+
+def _rig(data: Data, solved: Pose) -> Pose:
+    """Return the cameras (C,) in the first one, each from the frame in the middle of all."""
+    rig, placed = identity(data.cameras), np.zeros(data.frames, dtype=bool)
+    body = identity(data.frames) if data.poses is None else data.poses
+    placed[:] = data.poses is not None
+    for camera in range(data.cameras):
+        mine = np.flatnonzero(data.camera_of == camera)
+        frames = data.frame_of[mine]
+        shared = placed[frames]
+        if camera and shared.any():
+            relative = body.take(frames[shared]).inverse().compose(solved.take(mine[shared]))
+            rig.put(camera, relative.take(_middle(relative)))
+        new = ~shared
+        own = solved.take(mine[new]).compose(rig.take([camera] * int(new.sum())).inverse())
+        body.put(frames[new], own)
+        placed[frames] = True
+    return rig
+
+
+def _middle(poses: Pose) -> int:
+    """Return which pose is nearest to all others."""
+    count = len(poses.position)
+    far = np.zeros((count, count))
+    size = max(float(np.median(np.linalg.norm(poses.position, axis=1))), 1e-9)
+    for i in range(count):
+        change = poses.difference(poses.take([i] * count))
+        far[i] = np.linalg.norm(change[:, 3:], axis=1)
+        far[i] += np.linalg.norm(change[:, :3], axis=1) / size
+    return int(np.argmin(np.median(far, axis=1)))
 
 
 def _frame_poses(data: Data, solved: Pose, rig: Pose) -> Pose:
@@ -139,9 +210,9 @@ class Linearised:
 
     def __init__(self, data: Data, state: State, free: Sequence[str]) -> None:
         self.data, self.state, self.free = data, state, tuple(free)
-        self.model = ForwardModel(state.lens, state.terms)
+        self.model = state.cameras
         pose = state.view_poses(data)
-        self.linear: LinearViews = self.model.linearise(pose, data.views)
+        self.linear: Seen = self.model.linearise(pose, data.views)
         self.scene: Scene = self.model.scene(pose, data.views, self.linear)
         self.weight = data.views.weight * noise_weight(state.terms, self.scene)
         with np.errstate(invalid='ignore'):
@@ -149,7 +220,7 @@ class Linearised:
         self.residual = data.blocks(offset * self.weight[..., None])
         frame, rig = self._pose_columns(pose)
         self.frame_columns = self.whitened(frame)
-        shared = [rig, lens_columns(self.model.lens, self.linear.image, list(free))]
+        shared = [rig, self.model.lens_columns(self.linear, state.own_names(free))]
         shared += [
             self.model.effect_columns(effect, self.scene, self.linear)
             for effect, _ in state.terms if is_shared(effect)
@@ -232,22 +303,30 @@ class _Fit:
         self._poses_only = poses_only
 
     def pack(self, state: State) -> Arrays:
-        lens = parameter_values(state.lens, self._free)
+        lens = np.concatenate([
+            parameter_values(lens, tuple(names))
+            for lens, names in zip(state.lenses, state.own_names(self._free), strict=True)
+        ])
         values = [v for effect, v in state.terms if is_shared(effect)]
         parts = (*state.pose, *state.rig, np.concatenate([np.array(lens), *values]))
         return tuple(array[None] for array in parts)
 
     def unpack(self, packed: Arrays) -> State:
         rotation, position, rig_rotation, rig_position, shared = (a[0] for a in packed)
-        count = len(self._free)
-        lens = self._template.lens.with_parameters(self._free, list(shared[:count]))
-        values, terms = shared[count:], []
+        values, lenses, terms = shared, [], []
+        for lens, names in zip(
+            self._template.lenses, self._template.own_names(self._free), strict=True
+        ):
+            lenses.append(lens.with_parameters(names, list(values[: len(names)])))
+            values = values[len(names) :]
         for effect, known in self._template.terms:
             if is_shared(effect):
                 known, values = values[: len(known)], values[len(known) :]
             terms.append((effect, known))
         rig = Pose(rig_rotation, rig_position)
-        return State(Pose(rotation, position), rig, lens, tuple(terms))
+        pose = Pose(rotation, position)
+        return replace(self._template, pose=pose, rig=rig, lens=lenses[0],
+                       others=tuple(lenses[1:]), terms=tuple(terms))
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         if not len(index):

@@ -9,13 +9,12 @@ import numpy as np
 from scipy import optimize, stats
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.cameras import Cameras
 from fisheye_svp_ros.diagnosis.model import Data, State, chosen_views
 from fisheye_svp_ros.diagnosis.refit import Fitted
-from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.localization import localize
 
 _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
 _GATE = 6.0  # and within which it belongs to another one
@@ -23,6 +22,7 @@ _SUSPECT = 6.0  # below this no point is worth a robust fit
 SWAPPED = 'it lies where another landmark is predicted'
 FAR = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
+FRAME = 'its cameras contradict each other: points in another order, or another moment'
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
@@ -67,7 +67,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     a model error bends as a whole holds no gross error, nor does a landmark that is off in most
     of its views.  A view out of all proportion belongs elsewhere as a whole.
     """
-    model = ForwardModel(state.lens, state.terms)
+    model = state.cameras
     views, pose = data.views, state.view_poses(data)
     scale, offset = _scale(views, _offset(model, pose, views))
     if np.nanmax(offset / scale) > _SUSPECT:
@@ -75,7 +75,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
             before = offset
             fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
             weight = np.where(views.used, views.weight * fading, 0.0)
-            pose = localize(model, views._replace(weight=weight), pose).pose
+            pose = model.localize(views._replace(weight=weight), pose)
             scale, offset = _scale(views, _offset(model, pose, views))
             if np.nanmax(np.abs(offset - before) / scale) < _SETTLED:
                 break
@@ -86,10 +86,41 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
     swapped = _fits_another(model, pose, views, far, _GATE * typical)
     gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
-    for mask, why in ((swapped, SWAPPED), (far & ~swapped, FAR),
-                      (views.used & whole[:, None], VIEW)):
-        gross = gross.with_more(views.row[mask], offset[mask], why)
-    return set_aside(data, far | (views.used & whole[:, None])), gross
+    torn, apart = _torn_frames(data, state, typical)
+    whole = whole & ~torn
+    far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
+    for mask, px, why in ((swapped, offset, SWAPPED), (far & ~swapped, offset, FAR),
+                          (views.used & whole[:, None], offset, VIEW),
+                          (views.used & torn[:, None], apart, FRAME)):
+        gross = gross.with_more(views.row[mask], px[mask], why)
+    return set_aside(data, far | (views.used & (whole | torn)[:, None])), gross
+
+
+def _torn_frames(data: Data, state: State, typical: float) -> tuple[Mask, Array]:
+    """Return the views (S,) of frames whose cameras contradict each other, and by how much, px.
+
+    Each view alone may fit: a board seen in reversed order is a board turned by half.  But then
+    no pose of the rig explains two of them, whichever is asked to predict the other.
+    """
+    views, model = data.views, state.cameras
+    apart = np.zeros(views.used.shape)
+    if data.cameras < 2:
+        return np.zeros(len(views.frame), dtype=bool), apart
+    place = state.rig.take(data.camera_of)
+    body = model.localize(views).compose(place.inverse())
+    misfit = np.full(len(views.frame), np.inf)
+    several = np.bincount(data.frame_of)[data.frame_of] > 1
+    for step in range(1, data.cameras):
+        # From another view of the same frame: views are in the order of frames.
+        other = np.arange(len(views.frame))
+        for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
+            other[mine] = np.roll(mine, step)
+        offset = _offset(model, body.take(other).compose(place), views)
+        median = np.nanmedian(np.where(np.isfinite(offset), offset, 1e9), axis=1)
+        mine = (other != np.arange(len(other))) & (median < misfit)
+        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
+    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX))
+    return np.asarray(torn & (torn.mean() < 0.2)), apart
 
 
 def set_aside(data: Data, mask: Mask) -> Data:
@@ -122,7 +153,7 @@ def outlying(
     return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
 
 
-def _offset(model: ForwardModel, pose: Pose, views: Views) -> Array:
+def _offset(model: Cameras, pose: Pose, views: Views) -> Array:
     """Distances (S, N) of the points from their predictions, px; NaN for padding."""
     distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
     return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
@@ -187,7 +218,7 @@ def with_noise_growth(state: State, growth: float) -> State:
 
 
 def _fits_another(
-    model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
+    model: Cameras, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
     """Which far points (S, N) lie where another landmark of the table is predicted."""
     ids, first = np.unique(views.landmark[views.used], return_index=True)

@@ -111,6 +111,7 @@ class Effect(ABC):
 
     name: ClassVar[str]
     stage: ClassVar[str]
+    of_target: ClassVar[bool] = False  # whether another target would not have it
     signature: ClassVar[str]
     to_separate: ClassVar[str]
 
@@ -139,7 +140,7 @@ class Effect(ABC):
     @property
     def place(self) -> str:
         """The field of a lens that holds this effect where nothing else in the lens can."""
-        return 'target' if self.stage == 'target' else 'corrections'
+        return 'target' if self.stage == 'target' or self.of_target else 'corrections'
 
     def extend(self, lens: Lens, values: Array) -> Lens:
         """Return the lens with this effect in its place, added to what stands there.

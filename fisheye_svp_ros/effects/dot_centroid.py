@@ -22,6 +22,7 @@ class DotCentroidEffect(Effect):
 
     name = 'dot_centroid'
     stage = 'image'
+    of_target = True  # it is the target's dots that are so large
     signature = 'residuals across tilted boards that grow with the size of the dot in the image'
     to_separate = 'dots of half the size, or corners instead of dots'
 
@@ -30,10 +31,6 @@ class DotCentroidEffect(Effect):
         if not any(board.flat for board in scene.boards):
             raise Untestable('no landmarks lie on a flat board, so no dot has a known plane')
         return [cls()]
-
-    @property
-    def place(self) -> str:
-        return 'target'  # it is the target's dots that are so large
 
     parameters = (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 

@@ -184,6 +184,22 @@ class TestTerminal:
                          ' '.join(out.split()))
         assert float(said[2]) < 0.5 * float(said[1])
 
+    def test_a_rig_has_a_lens_a_camera(self, scene, capsys):
+        table, _ = seen({})
+        other = replace(table, camera=np.ones_like(table.camera), uv=table.uv + 0.1)
+        both = {name: np.concatenate([getattr(table, name), getattr(other, name)])
+                for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+        write_observations(scene / 'rig.csv', replace(table, cameras=('left', 'right'), **both))
+        lens = scene / 'lens.yaml'
+        given = ['diagnose', scene / 'rig.csv', '--lens', f'left={lens}']
+        assert cli.main([*map(str, given)]) == 2
+        assert 'camera right has no lens' in capsys.readouterr().err
+        given += ['--lens', f'right={lens}', '--quick', '-o', scene / 'rig']
+        assert cli.main([*map(str, given)]) == 0
+        assert 'left/extended_lens.yaml, right/extended_lens.yaml' in capsys.readouterr().out
+        assert load_lens(scene / 'rig' / 'right' / 'extended_lens.yaml').fx == pytest.approx(
+            LENS.fx, rel=0.01)
+
     def test_held_out_file(self, scene, capsys, tmp_path):
         assert run('shift.csv', scene, '--held-out', scene / 'test.csv') == 0
         assert 'viewpoint_shift' in capsys.readouterr().out

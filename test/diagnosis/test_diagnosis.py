@@ -14,7 +14,7 @@ from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 
 SIGMA = 0.2
 
@@ -247,3 +247,57 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     errors = standard_errors(found.evidence) * found.evidence.scale[own]
     assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
     assert np.abs(step / errors).max() < 0.1
+
+
+def rig_table(seed, right_terms=(), frames=16):
+    """Return what two cameras with lenses of their own see, and the lenses."""
+    lenses = {'left': lens(), 'right': replace(lens(), fx=395.0, fy=395.0, cx=775.0, name='right')}
+    seen = []
+    for camera, (one, terms) in enumerate(zip(lenses.values(), ((), right_terms), strict=True)):
+        rng = np.random.default_rng(seed)
+        pose, views = scene(rng, 2, frames)
+        table = observe(one, terms, pose, views, SIGMA, rng)
+        seen.append(table.take(table.camera == camera))
+    both = {name: np.concatenate([getattr(part, name) for part in seen])
+            for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+    return replace(seen[0], cameras=('left', 'right'), **both), lenses
+
+
+def test_each_camera_of_a_rig_has_causes_of_its_own():
+    skew = CATALOGUE['skew']()
+    table, lenses = rig_table(26, [(skew, np.array([0.002]))])
+    found = diagnose(table, lenses, free_intrinsics=True)
+    assert [cause.effect for cause in found.causes] == ['skew']
+    assert list(found.causes[0].parameters) == ['right.shear']
+    assert found.causes[0].parameters['right.shear']['value'] == pytest.approx(0.002, abs=5e-4)
+    assert not found.lenses['left'].corrections
+    assert set(found.lenses['right'].corrections) == {'skew'}
+    assert found.lenses['right'].fx == pytest.approx(395.0, abs=1.0)
+    assert {'left.fx', 'right.fx'} <= set(found.intrinsics)
+    again = diagnose(table, found.lenses)
+    assert again.verdict == 'adequate' and not again.causes
+
+
+def test_a_frame_of_a_rig_from_another_moment_is_named():
+    table, lenses = rig_table(27)
+    uv = table.uv.copy()
+    place = {key: i for i, key in enumerate(
+        zip(table.frame.tolist(), table.camera.tolist(), table.landmark.tolist(), strict=True))}
+    moved = [(i, place[9, 1, n]) for (f, c, n), i in place.items()
+             if (f, c) == (4, 1) and (9, 1, n) in place]
+    here, there = np.array(moved).T
+    uv[here] = table.uv[there]
+    wrong = (table.frame == 4) & (table.camera == 1)
+    kept = ~wrong | np.isin(np.arange(len(table)), here)
+    found = diagnose(replace(table, uv=uv).take(kept), lenses)
+    assert not found.causes
+    assert {row['frame'] for row in found.gross} == {4}
+    assert [advice.frames for advice in found.advice if 'contradict' in advice.what] == [[4]]
+
+
+def test_a_rig_needs_a_lens_for_each_camera():
+    table, lenses = rig_table(28, frames=4)
+    with pytest.raises(ObservationError, match='right'):
+        diagnose(table, {'left': lenses['left']})
+    with pytest.raises(ObservationError, match='not those of the rig'):
+        diagnose(table, lenses, held_out=replace(table, cameras=('a', 'b')))
