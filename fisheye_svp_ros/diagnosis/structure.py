@@ -16,6 +16,7 @@ from fisheye_svp_ros.diagnosis.refit import Fitted
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 
 _VARIABLE = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
+_TOLERATED = 1.2  # a stated sigma is an estimate, too: of a detector, or of a person
 _FEWEST = 200  # numbers beyond the poses' own: of fewer no test of structure says anything
 
 
@@ -82,8 +83,10 @@ def _scatter_tests(fitted: Fitted, known_noise: bool) -> Iterator[tuple[str, flo
     if known_noise:
         eq = fitted.factored.equations
         freedom = eq.rows - eq.poses - len(fitted.solution.values)
-        size = fitted.solution.variance * freedom, freedom
-        yield 'size', 2 * float(min(stats.chi2.sf(*size), stats.chi2.cdf(*size))), 0.0
+        squares = fitted.solution.variance * freedom
+        larger = stats.chi2.sf(squares / _TOLERATED**2, freedom)
+        smaller = stats.chi2.cdf(squares * _TOLERATED**2, freedom)
+        yield 'size', 2 * float(min(larger, smaller)), 0.0
 
 
 def _trend(e2: Array, z: Array) -> float:

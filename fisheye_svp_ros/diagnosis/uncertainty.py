@@ -93,7 +93,7 @@ class ModelError:
         fields = random.shared.power(2) @ np.where(
             np.isin(random.shared_label, _of_the_image()), variance[random.shared_label], 0.0)
         misfit = misfit + np.asarray(fields).reshape(misfit.shape)
-        px = np.where(weight > 0, 1 / np.maximum(weight, 1e-300) ** 2, np.nan)
+        px = np.where(weight > 0, weight, np.nan) ** -2.0
         parameters = np.einsum('fmk,kl,fml->fm', columns, self.covariance, columns)
         return Parts(self.variances.sigma**2 * px, parameters * px, misfit * px)
 
@@ -156,7 +156,5 @@ def _of_the_lens(linear: Linearised) -> Array:
 
 def _turns(linear: Linearised) -> Array:
     """Return whitened derivatives (F, M, 3) by a turn of the camera that all frames share."""
-    local = linear.linear.pose.into_body(linear.linear.points)
-    crossed = np.cross(np.eye(3), local[..., None, :])  # axis by axis, how a point moves
-    columns = linear.linear.image.d_point @ np.swapaxes(crossed, -1, -2)
-    return linear.whitened(np.nan_to_num(columns))
+    rotation = linear.state.view_poses(linear.data).rotation
+    return linear.whitened(np.nan_to_num(linear.linear.d_pose[..., 3:] @ rotation[:, None]))

@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.refit import fit_linear, local_offsets
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances, estimate, start_variances
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.reporting.diagnosis_text import COMPONENTS
 
 SIGMA = 0.2
 TESTED = ('viewpoint_shift', 'decentering', 'skew', 'target_shape')
@@ -263,3 +264,7 @@ def test_predicted_offsets_are_near_the_true_ones():
     true = moves[found.landmark]
     # Poses and the catalogue take up part of what all landmarks do together.
     assert np.corrcoef(found.offset.ravel(), true.ravel())[0, 1] > 0.7
+
+
+def test_every_component_has_words():
+    assert set(NAMES) <= set(COMPONENTS)
