@@ -139,10 +139,10 @@ def diagnose(
         wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
     medium = None
     if 'flat_port' not in wanted.left_out:
-        medium = find_medium(data, first, base, free, progress)
+        medium = find_medium(everything, data, first, base, free, progress)
     if medium is not None:
         # Index and lens curve look alike: the intrinsics stay as they were in air.
-        base, free = medium.state, medium.names
+        data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)

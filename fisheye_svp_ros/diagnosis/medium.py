@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis.model import (
     flat_rows,
     start,
 )
+from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
@@ -45,6 +46,8 @@ _TERMS = 8  # of a free lens curve
 _EXPLAINED = 0.98  # of what a free lens curve explains
 _WORSE = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
 _LIQUIDS = (1.30, 1.56)  # refractive indices of what one photographs through (water to oils)
+_KEPT = 0.8  # of the points, at least, are no gross errors behind a port that is there
+_THICKEST = 0.05  # m, of glass
 _TOLD = 0.02  # standard error above which the index is not told by the data
 
 
@@ -52,12 +55,14 @@ _TOLD = 0.02  # standard error above which the index is not told by the data
 class Medium:
     """A port with another medium behind it, and the simulation in air that it takes the place of.
 
-    state, names: the fit, and what of the port was fitted; air: the simulation as it was, fitted;
+    state, names: the fit, and what of the port was fitted; gross: errors set aside beside it; air:
+    the simulation as it was, fitted to the same data;
     p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well.
     """
 
     state: State
     names: tuple[str, ...]
+    gross: Gross
     air: Linearised
     free: tuple[str, ...]
     p_value: float
@@ -114,11 +119,13 @@ class Medium:
 
 
 def find_medium(
-    data: Data, lens: Lens, base: State, free: Sequence[str], progress: Callable[[str], None]
+    everything: Data, data: Data, lens: Lens, base: State, free: Sequence[str],
+    progress: Callable[[str], None],
 ) -> Medium | None:
     """Ask whether the camera looks through a flat port into another medium than air.
 
-    lens: as it was in air; base: the fit of the simulation with `free` intrinsics.
+    everything: with gross errors, data: without those that stand out in air; lens: as it was in
+    air; base: the fit of the simulation with `free` intrinsics.
     """
     if lens.port is not None or data.cameras > 1:
         return None
@@ -129,12 +136,12 @@ def find_medium(
     curve = _free_curve(data, base)
     if not (_magnified(air, lens, curve) or _rms_px(Linearised(data, curve, ())) > _SUSPECT):
         return None
-    found = _behind_port(data, lens)
+    found = _behind_port(everything, data, lens)
     if found is None:
         return None
-    state, names = found
-    if not _LIQUIDS[0] <= state.lens.parameters[INDEX] <= _LIQUIDS[1]:
-        return None
+    data, gross, state, names = found
+    base = fit(data, start(data, lens), free)
+    air, curve = Linearised(data, base, free), _free_curve(data, base)
     plain = Linearised(data, replace(base, lens=_held(lens, base.lens)), ())
     before, after, least = (_cost(fitted) for fitted in (
         Linearised(data, fit(data, plain.state, ()), ()), Linearised(data, state, ()),
@@ -148,7 +155,7 @@ def find_medium(
         return None
     mine = _cost(air)
     p_value = float(stats.chi2.sf((before - after) / square, len(names)))
-    return Medium(state, names, air, tuple(free), p_value, max(0.0, 1 - after / mine),
+    return Medium(state, names, gross, air, tuple(free), p_value, max(0.0, 1 - after / mine),
                   bool(merits[1] < merits[0]))
 
 
@@ -158,8 +165,14 @@ def _held(lens: Lens, fitted: Lens) -> Lens:
                    image_height=lens.image_height)
 
 
-def _behind_port(data: Data, lens: Lens) -> tuple[State, tuple[str, ...]] | None:
-    """Fit the place of a port from several starts; free the index where the data tell it."""
+def _behind_port(
+    everything: Data, data: Data, lens: Lens
+) -> tuple[Data, Gross, State, tuple[str, ...]] | None:
+    """Fit the place of a port from several starts; free the index where the data tell it.
+
+    Returns also the data without the gross errors that stand out behind the port: in air other
+    points may have seemed to be some.
+    """
     chosen = np.linspace(0, data.frames - 1, min(_FEW, data.frames)).astype(int)
     few = chosen_views(data, np.isin(data.frame_of, chosen))
     tried: list[tuple[float, State]] = []
@@ -172,18 +185,24 @@ def _behind_port(data: Data, lens: Lens) -> tuple[State, tuple[str, ...]] | None
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
     best = min(tried, key=lambda one: one[0])[1]
-    state = fit(data, start(data, replace(lens, port=best.lens.port)), PLACE)
+    wet = replace(lens, port=best.lens.port)
+    data, gross = find_gross_errors(everything, start(everything, wet))
+    if data.views.used.sum() < _KEPT * everything.views.used.sum():
+        return None
+    state = fit(data, start(data, wet), PLACE)
     if not np.isfinite(_cost(Linearised(data, state, ()))):
         return None
     freed, errors, _ = _freed(data, state, (*PLACE, INDEX))
     names: tuple[str, ...] = PLACE
-    if errors[-1] < _TOLD:
+    liquid = _LIQUIDS[0] <= freed.lens.parameters[INDEX] <= _LIQUIDS[1]
+    if errors[-1] < _TOLD and liquid:
         state, names = freed, (*PLACE, INDEX)
     freed, errors, gain = _freed(data, state, (*names, THICKNESS))
     # Glass of no thickness is part of the distance.
-    if freed.lens.parameters[THICKNESS] > 0 and gain > np.log(2 * len(data.observations)):
+    thickness = freed.lens.parameters[THICKNESS]
+    if 0 < thickness < _THICKEST and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
-    return state, names
+    return data, gross, state, names
 
 
 def _freed(data: Data, state: State, names: tuple[str, ...]) -> tuple[State, Array, float]:
