@@ -213,7 +213,7 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise LensError(f'{where}: {name} is {value!r}; a number is needed')
     if not abs(value) < _MOST:
-        raise LensError(f'{where}: {name} is {value}; a number below {_MOST:g} is needed')
+        raise LensError(f'{where}: {name} is {value}; a finite number is needed, below {_MOST:g}')
     return float(value)
 
 
@@ -227,7 +227,7 @@ def _pixels(mapping: Mapping[str, Any], name: str, where: str) -> int:
 def _vector(values: Any, where: str) -> list[float]:
     if not isinstance(values, list):
         raise LensError(f'{where} must be a list of numbers, is {values!r}')
-    return [_number({'a value': value}, 'a value', where) for value in values]
+    return [_number({'value': value}, 'value', where) for value in values]
 
 
 def _refuse_unknown(

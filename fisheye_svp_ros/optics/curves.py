@@ -77,7 +77,9 @@ class KannalaBrandt(ImageHeight):
     @property
     def limit(self) -> float:
         # dh/dtheta is a polynomial in theta^2; its first positive root ends the monotone range.
-        roots = np.roots([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        terms = np.array([9 * self.k4, 7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
+        # What makes no difference up to pi would only make numbers overflow.
+        roots = np.roots(np.where(np.abs(terms) * np.pi ** np.arange(8, -1, -2) < 1e-15, 0, terms))
         real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
         return float(min(np.sqrt(real.min()), np.pi)) if real.size else np.pi
 

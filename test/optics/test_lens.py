@@ -152,7 +152,7 @@ def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model
     ('image.width', None, 'image: width is None; a number is needed'),
     ('image.width', '640', "image: width is '640'; a number is needed"),
     ('image.width', 640.5, 'image: width is 640.5; a whole number of pixels is needed'),
-    ('image.width', float('nan'), 'image: width is nan; a whole number of pixels is needed'),
+    ('image.width', float('nan'), 'image: width is nan; a finite number is needed'),
     ('image.height', 0, 'height is 0; it must be above 0'),
     ('projection', None, 'projection is missing; a mapping is needed'),
     ('projection.model', None, 'projection.model is None; known are orthographic, equidistant'),
@@ -165,15 +165,15 @@ def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model
     ('projection.cx', float('nan'), 'cx is nan; a finite number is needed'),
     ('projection.f', 400.0, 'projection has both f and fx or fy; keep one of them'),
     ('projection.k', 0.1, 'projection.k must be a list of numbers, is 0.1'),
-    ('projection.k', ['a'], r"projection.k must be a list of numbers, is \['a'\]"),
+    ('projection.k', ['a'], "projection.k: value is 'a'; a number is needed"),
     ('projection.k', [0.0] * 5, 'projection.k has 5 values; this model takes 4'),
-    ('projection.k', [float('nan')], 'k1 is nan; a finite number is needed'),
+    ('projection.k', [float('nan')], 'value is nan; a finite number is needed'),
     ('projection.k', [-0.3], r'max_incidence_deg is 95; these curves allow .* up to 60\.39'),
     ('projection.p1', 0.1, "projection: unknown field 'p1'; known are"),
     ('max_incidence_deg', 'wide', "max_incidence_deg is 'wide'; a number is needed"),
     ('max_incidence_deg', 0, 'max_incidence_deg is 0; these curves allow a value above 0'),
     ('max_incidence_deg', 190, 'max_incidence_deg is 190; these curves allow'),
-    ('max_incidence_deg', float('nan'), 'max_incidence_deg is nan; these curves allow'),
+    ('max_incidence_deg', float('nan'), 'max_incidence_deg is nan; a finite number is needed'),
     ('viewpoint_shift', 0.001, 'viewpoint_shift must be a mapping with a model'),
     ('viewpoint_shift.model', 'cahvore', "viewpoint_shift.model is 'cahvore'; known are gennery"),
     ('viewpoint_shift.s0', 'x', "viewpoint_shift: s0 is 'x'; a number is needed"),
@@ -210,7 +210,7 @@ def test_broken_lens_is_refused_with_its_reason(path, value, reason, tmp_path):
     (b'', 'a YAML mapping is expected, found NoneType'),
     (b'- 1\n', 'a YAML mapping is expected, found list'),
     (b'image: {width: 1\n', 'broken YAML at line 2: '),
-    (b'\xff\xfe\x00', 'not a text file; a YAML file in UTF-8 is expected'),
+    (b'\xff\xfe\x00', 'not a text file; one in UTF-8 is expected'),
 ])
 def test_broken_file_is_refused_with_its_reason(content, reason, tmp_path):
     file = tmp_path / 'broken.yaml'
@@ -251,3 +251,8 @@ def test_kannala_brandt_ends_where_its_height_stops_growing():
     edge, slope = curve.value_and_slope(np.array(curve.limit))
     assert slope == pytest.approx(0.0, abs=1e-12)
     assert curve.angle(edge) == pytest.approx(curve.limit, abs=1e-6)
+
+
+def test_a_coefficient_next_to_nothing_changes_no_limit():
+    assert KannalaBrandt(-0.1, 0.0, 0.0, 1e-320).limit == KannalaBrandt(-0.1).limit
+    assert KannalaBrandt(-0.1, 0.0, 0.0, 5e-324).limit == KannalaBrandt(-0.1).limit

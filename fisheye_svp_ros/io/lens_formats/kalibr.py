@@ -63,6 +63,8 @@ def _rig(rows: Any, where: str) -> Pose:
         matrix = np.array(rows, dtype=float).reshape(4, 4)
     except (TypeError, ValueError) as cause:
         raise LensError(f'{where}: T_cn_cnm1 must be a matrix of 4 x 4') from cause
+    if not np.isfinite(matrix).all():
+        raise LensError(f'{where}: T_cn_cnm1 holds what is no number')
     return Pose(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
 
 
