@@ -262,6 +262,7 @@ def test_what_was_asked_for_stays(compiled, unsettled):
 
 @pytest.mark.parametrize('name', ['auto', 'numba'])
 def test_a_numba_that_does_not_go_with_this_numpy(unsettled, monkeypatch, name):
+    pytest.importorskip('numba', reason='its version is part of what is said')
     monkeypatch.setitem(sys.modules, 'fisheye_svp_ros.optics.engines.numba_engine', None)
     monkeypatch.delattr(engines, 'numba_engine', raising=False)
     monkeypatch.setattr(engines, 'find_spec', lambda _: 'there')
