@@ -85,9 +85,14 @@ class MrcalCore:
         self._project_all(ctypes.c_long(len(points)), *map(_at, (points, self._lens, uv)), last)
 
 
+# -Ofast by its parts: a library linked with it makes the whole process flush subnormal numbers.
+_OFAST = ('-O3', '-fno-math-errno', '-fno-trapping-math', '-ffinite-math-only',
+          '-fno-signed-zeros', '-fassociative-math', '-freciprocal-math')
+
+
 @cache
 def _kernel() -> ctypes.CDLL:
-    return _compile('cc', ['-Ofast', '-fopenmp-simd'], [_HERE / 'kernel.c'], 'kernel')
+    return _compile('cc', [*_OFAST, '-fopenmp-simd'], [_HERE / 'kernel.c'], 'kernel')
 
 
 @cache
