@@ -41,7 +41,8 @@ class _Worker:
     def __init__(self) -> None:
         context = multiprocessing.get_context('spawn')
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=work, args=(theirs,), daemon=True)
+        # No daemon: the detector's search has a process of its own.
+        self._process = context.Process(target=work, args=(theirs,))
         self._process.start()
         theirs.close()
         self.task: Task | None = None
@@ -95,8 +96,9 @@ def run_all(wanted: list[Surface], total: int, first: int, workers: int) -> dict
                     pending += _halves(worker, outcomes)
     except KeyboardInterrupt:
         print('interrupted: what was tried so far', file=sys.stderr)
-    for worker in running:
-        worker.end()
+    finally:
+        for worker in running:
+            worker.end()
     return outcomes
 
 
