@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,9 @@ _UNITS = {
 }
 _HUGE = 20.0  # m; a target larger than this was measured in other units
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
+
+# Matrices are small for BLAS: more threads than one wait for each other.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.points import PointResiduals
     from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
+
+# Matrices are small for BLAS: more threads than one wait for each other.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
