@@ -23,7 +23,7 @@ Grey = NDArray[np.uint8]
 Found = tuple[Index, Array]
 Finder = Callable[[Grey, Pattern], Found | None]
 
-_ARUCO: Any = cv2.aruco
+_ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
 _SEARCHED = 1600  # px; larger images are searched smaller first
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB = cv2.CALIB_CB_ACCURACY
@@ -165,6 +165,9 @@ def _all(ok: bool, corners: Any) -> Found | None:
 
 
 def _dictionary(pattern: Pattern) -> Any:
+    if _ARUCO is None:
+        raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
+                             'install 4.7 or newer, or opencv-contrib')
     number = getattr(_ARUCO, pattern.dictionary, None)
     number = getattr(_ARUCO, pattern.dictionary.lower().replace('dict_apriltag',
                      'DICT_APRILTAG'), None) if number is None else number

@@ -48,7 +48,9 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
         slot = np.repeat(random.slot[frame], 2)[used]
         place = random.place[frame].reshape(height, 3)[used]
         inside, rest, at_border = _eliminated(f, frame, own, shared, slot, place, random)
-        half = linalg.solve_triangular(f.factor, rest, lower=True, check_finite=False)
+        half = rest
+        if len(rest):  # LAPACK of an older SciPy refuses systems without unknowns
+            half = linalg.solve_triangular(f.factor, rest, lower=True, check_finite=False)
         # P of this frame's rows, and P border
         p = np.eye(len(used)) - inside - half.T @ half
         left = border[frame][used] - at_border - half.T @ f.border

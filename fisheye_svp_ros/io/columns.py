@@ -194,7 +194,9 @@ def _to_parquet(
         if writer is None:
             names = pending[0].schema.names
             schema = pending[0].schema.with_metadata({_NAMES: _checksum(names)})
-            writer = pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True)
+            # pyarrow writes page checksums from 15 on.
+            checked = {'write_page_checksum': True} if _major(pyarrow) >= 15 else {}
+            writer = pyarrow.parquet.ParquetWriter(path, schema, **checked)
         if sum(map(len, pending)) >= _ROWS:
             table = pyarrow.concat_tables(pending)
             whole = len(table) // _ROWS * _ROWS
@@ -204,3 +206,7 @@ def _to_parquet(
     with writer:
         if pending:
             writer.write_table(pyarrow.concat_tables(pending))
+
+
+def _major(module: Any) -> int:
+    return int(module.__version__.partition('.')[0])
