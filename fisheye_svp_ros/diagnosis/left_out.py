@@ -14,7 +14,7 @@ import numpy as np
 from scipy import linalg
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.mixed import Factored
+from fisheye_svp_ros.diagnosis.mixed import Factored, solve_lower
 from fisheye_svp_ros.diagnosis.random_effects import Design
 
 
@@ -48,20 +48,16 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
         slot = np.repeat(random.slot[frame], 2)[used]
         place = random.place[frame].reshape(height, 3)[used]
         inside, rest, at_border = _eliminated(f, frame, own, shared, slot, place, random)
-        half = rest
-        if len(rest):  # LAPACK of an older SciPy refuses systems without unknowns
-            half = linalg.solve_triangular(f.factor, rest, lower=True, check_finite=False)
+        half = solve_lower(f.factor, rest)
         # P of this frame's rows, and P border
         p = np.eye(len(used)) - inside - half.T @ half
         left = border[frame][used] - at_border - half.T @ f.border
         basis = _span(pose[frame][used])
         left -= basis @ (basis.T @ left)
         root = linalg.cholesky(p + basis @ basis.T, lower=True, check_finite=False)
-        first = linalg.solve_triangular(root, left, lower=True, check_finite=False)
+        first = solve_lower(root, left)
         information[frame] = first.T @ first
-        rows[frame, used] = linalg.solve_triangular(
-            root, first, lower=True, trans=1, check_finite=False
-        )
+        rows[frame, used] = solve_lower(root, first, trans=1)
     return LeftOut(information, rows)
 
 

@@ -11,7 +11,7 @@ Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), ch
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -23,6 +23,14 @@ from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design
 FIXED, ABSENT = -1, -2  # labels: without a prior; not there
 _RIDGE = 1e-10  # of a pose's normalised columns: known poses have none
 _NEVER = 1e12
+
+
+def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
+    """Solve triangular equations; where there are none, LAPACK of an older SciPy refuses them."""
+    if not len(root):
+        return right
+    return np.asarray(
+        linalg.solve_triangular(root, right, lower=True, trans=trans, check_finite=False))
 
 
 @dataclass(frozen=True)
@@ -161,7 +169,7 @@ class Factored:
         flat = first.reshape(-1, first.shape[-1])
         second = r - self.coupled.reshape(len(flat), len(r)).T @ flat
         if len(second):
-            second = linalg.solve_triangular(self.factor, second, lower=True, check_finite=False)
+            second = solve_lower(self.factor, second)
         bent = self.block_border.reshape(len(flat), len(x) + 1)[:, :-1]
         third = x - bent.T @ flat - self.border[:, :-1].T @ second
         values = linalg.solve(self.information[:-1, :-1], third, assume_a='pos')
@@ -189,7 +197,7 @@ class Factored:
         flat = first.reshape(-1, first.shape[-1])
         second = r - self.coupled.reshape(len(flat), len(r)).T @ flat
         if len(second):
-            second = linalg.solve_triangular(self.factor, second, lower=True, check_finite=False)
+            second = solve_lower(self.factor, second)
         found = flat.T @ flat + second.T @ second
         if x is None:
             return np.asarray(found)
@@ -226,9 +234,7 @@ def factored(eq: Equations, lam: Array, weight: Array) -> Factored:
     rr[np.diag_indices_from(rr)] += r
     if len(rr):
         factor = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
-        border = linalg.solve_triangular(
-            factor, b.rx - flat.T @ bent, lower=True, check_finite=False
-        )
+        border = solve_lower(factor, b.rx - flat.T @ bent)
     else:
         factor, border = rr, b.rx
     information = b.xx - bent.T @ bent - border.T @ border
@@ -255,8 +261,8 @@ def solve(f: Factored, spread: bool = True) -> Solution:
     """Solve for all coefficients; the border must be of full rank."""
     info, gradient = f.information[:-1, :-1], f.information[:-1, -1]
     root = linalg.cholesky(info, lower=True, check_finite=False)
-    half = linalg.solve_triangular(root, gradient, lower=True, check_finite=False)
-    values = linalg.solve_triangular(root, half, lower=True, trans=1, check_finite=False)
+    half = solve_lower(root, gradient)
+    values = solve_lower(root, half, trans=1)
     freedom = f.equations.rows - f.equations.poses - len(values)
     variance = float(f.information[-1, -1] - half @ half) / max(freedom, 1)
     e, r = f.coefficients(np.append(-values, 1.0))
@@ -271,7 +277,7 @@ def _back(factor: Array, right: Array) -> Array:
     if not len(factor):
         return right
     return np.asarray(
-        linalg.solve_triangular(factor, right, lower=True, trans=1, check_finite=False)
+        solve_lower(factor, right, trans=1)
     )
 
 

@@ -8,7 +8,7 @@ from scipy import linalg, optimize, stats
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
-from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve
+from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve, solve_lower
 from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
 from fisheye_svp_ros.diagnosis.reml import GONE, landmark_labels, start_variances
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
@@ -121,23 +121,21 @@ def _posterior(f: Factored) -> Array:
     eq, info = f.equations, f.information[:-1, :-1]
     root = linalg.cholesky(info, lower=True, check_finite=False) if len(info) else info
     count = len(eq.landmarks)
-    by_border = linalg.solve_triangular(
-        f.factor, f.border[:, :-1], lower=True, trans=1, check_finite=False
-    )
+    by_border = solve_lower(f.factor, f.border[:, :-1], trans=1)
     if eq.by_frame:
         unit = np.zeros((len(f.factor), 3 * count))
         unit[-3 * count :] = np.eye(3 * count)
-        through = linalg.solve_triangular(f.factor, unit, lower=True, check_finite=False)
+        through = solve_lower(f.factor, unit)
         own, fixed = np.zeros((count, 3, 3)), by_border[-3 * count :]
     else:
         back = np.swapaxes(f.inverse, -1, -2)
         flat = (back @ f.coupled).reshape(3 * count, -1)
-        through = linalg.solve_triangular(f.factor, flat.T, lower=True, check_finite=False)
+        through = solve_lower(f.factor, flat.T)
         own = back @ f.inverse
         fixed = (back @ (f.block_border[..., :-1] - f.coupled @ by_border)).reshape(3 * count, -1)
     found = own + _outer(through, count)
     if len(root):
-        half = linalg.solve_triangular(root, fixed.T, lower=True, check_finite=False)
+        half = solve_lower(root, fixed.T)
         found = found + _outer(half, count)
     return np.asarray(found)
 
