@@ -108,12 +108,11 @@ class Cameras:
 
     def effect_columns(self, effect: Effect, scene: Scene, seen: Seen) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""
-        scenes = scene.parts if isinstance(scene, RigScene) else ((None, 0, scene),)
-        if len(self.models) == 1:
+        if not isinstance(scene, RigScene):
             return self.models[0].effect_columns(effect, scene, seen.parts[0].linear)
         count = len(effect.parameters)
         columns = np.zeros((*seen.uv.shape, count))
-        for part, (_, _, own) in zip(seen.parts, scenes, strict=True):
+        for part, (_, _, own) in zip(seen.parts, scene.parts, strict=True):
             model = self.model(part.camera)
             if not isinstance(effect, OfCameras):
                 columns[part.rows] = model.effect_columns(effect, own, part.linear)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,20 +32,6 @@ from fisheye_svp_ros.nodes.model_critic import ModelCritic
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
-
-
-@pytest.fixture
-def graph(ros_domain: int) -> Iterator[Callable[..., Graph]]:
-    """Return a function that starts a graph; each argument is a parameter NAME:=VALUE."""
-    graphs: list[Graph] = []
-
-    def start(*parameters: str) -> Graph:
-        graphs.append(Graph(*(word for p in parameters for word in ('-p', p))))
-        return graphs[-1]
-
-    yield start
-    for one in graphs:
-        one.close()
 
 
 class Attack:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -44,36 +44,22 @@ def raw(pixels: NDArray[np.uint8], stamp: int) -> Any:
 
 
 @pytest.fixture
-def graphs(ros_domain: int) -> Iterator[Callable[..., Graph]]:
-    """Return a function that starts a graph; each argument is a parameter NAME:=VALUE."""
-    started: list[Graph] = []
-
-    def start(*parameters: str) -> Graph:
-        started.append(Graph(*(word for one in parameters for word in ('-p', one))))
-        return started[-1]
-
-    yield start
-    for one in started:
-        one.close()
+def detecting(graph: Callable[..., Graph]) -> Graph:
+    detecting = graph(f'board:={BOARD}')
+    detecting.start(Detector)
+    return detecting
 
 
-@pytest.fixture
-def graph(graphs: Callable[..., Graph]) -> Graph:
-    graph = graphs(f'board:={BOARD}')
-    graph.start(Detector)
-    return graph
-
-
-def test_images_to_points(graph: Graph) -> None:
-    landmarks = graph.hear(PointCloud2, 'landmarks', LATCHED)
-    graph.until(lambda: landmarks)
+def test_images_to_points(detecting: Graph) -> None:
+    landmarks = detecting.hear(PointCloud2, 'landmarks', LATCHED)
+    detecting.until(lambda: landmarks)
     assert read_landmarks(landmarks[0]).landmarks.points == pytest.approx(PRINTED.corners)
-    points = graph.hear(PointCloud2, 'image_points')
+    points = detecting.hear(PointCloud2, 'image_points')
     where = poses(2, 4)
-    images = graph.tell(Image, 'image', SENSOR)
+    images = detecting.tell(Image, 'image', SENSOR)
     for i in range(2):
         message = raw(photograph(where.take(i)), 7 + i)
-        graph.until(lambda message=message: (
+        detecting.until(lambda message=message: (
             images.publish(message),
             any(p.header.stamp == message.header.stamp for p in points))[1])
         found = read_image_points(points[-1])
@@ -82,29 +68,29 @@ def test_images_to_points(graph: Graph) -> None:
         assert points[-1].header.frame_id == 'camera'
 
 
-def test_compressed_and_bad_images(graph: Graph) -> None:
-    points = graph.hear(PointCloud2, 'image_points')
+def test_compressed_and_bad_images(detecting: Graph) -> None:
+    points = detecting.hear(PointCloud2, 'image_points')
     image = photograph(poses(1, 4).take(0))
-    tell = graph.tell(CompressedImage, 'image/compressed', SENSOR)
+    tell = detecting.tell(CompressedImage, 'image/compressed', SENSOR)
     data = array('B', cv2.imencode('.png', image)[1].tobytes())
     good = CompressedImage(header=header(5), format='png', data=data)
-    graph.until(lambda: (tell.publish(good), points)[1])
-    heard, images = len(points), graph.tell(Image, 'image', SENSOR)
+    detecting.until(lambda: (tell.publish(good), points)[1])
+    heard, images = len(points), detecting.tell(Image, 'image', SENSOR)
     images.publish(raw(image[:-20], 6))
     short = raw(image, 7)
     short.data = short.data[:100]
     images.publish(short)
-    graph.idle(0.5)
+    detecting.idle(0.5)
     assert not any(p.header.stamp.nanosec in (6, 7) for p in points[heard:])
-    graph.until(lambda: (images.publish(raw(image, 8)),
+    detecting.until(lambda: (images.publish(raw(image, 8)),
                          any(p.header.stamp.nanosec == 8 for p in points))[1])
 
 
 def test_a_search_is_bounded_and_the_next_image_is_searched(
-    graphs: Callable[..., Graph]
+    graph: Callable[..., Graph]
 ) -> None:
     """Noise of this size takes seconds, as everything in it may be a square."""
-    g = graphs(f'board:={BOARD}', 'longest_search:=0.2')
+    g = graph(f'board:={BOARD}', 'longest_search:=0.2')
     points, diagnostics = g.hear(PointCloud2, 'image_points'), g.hear(
         DiagnosticArray, '/diagnostics')
     node = g.start(Detector)
@@ -124,7 +110,7 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(
 
 
 def test_from_rendered_images_to_the_true_pose(
-    graphs: Callable[..., Graph], tmp_path: Path
+    graph: Callable[..., Graph], tmp_path: Path
 ) -> None:
     """Camera, detector and localizer as a user starts them; the error within its covariance."""
     lens = tmp_path / 'small.yaml'
@@ -132,7 +118,7 @@ def test_from_rendered_images_to_the_true_pose(
     where = poses(2, 4)
     listed = [float(value) for i in range(2) for value in (
         *where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))]
-    g = graphs(f'board:={BOARD}', f'photograph:={BOARD}', f'lens:={lens}', f'poses:={listed}',
+    g = graph(f'board:={BOARD}', f'photograph:={BOARD}', f'lens:={lens}', f'poses:={listed}',
                'rate:=2.0', 'sigma_px:=0.04', 'board_frame:=world')
     images, estimated = g.hear(Image, 'image', SENSOR), g.hear(
         PoseWithCovarianceStamped, 'localizer/pose')
@@ -166,22 +152,22 @@ def test_from_rendered_images_to_the_true_pose(
     (('detections:=true',), 'apriltag_msgs is not installed'),
 ])
 def test_tags_of_others_need_their_messages_and_a_grid(
-    graphs: Callable[..., Graph], parameters: tuple[str, ...], reason: str,
+    graph: Callable[..., Graph], parameters: tuple[str, ...], reason: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector.find_spec', lambda name: None)
     if 'grid' in reason:
         monkeypatch.setattr('fisheye_svp_ros.nodes.detector._tag_array', lambda: DiagnosticArray)
-    g = graphs(*parameters)
+    g = graph(*parameters)
     with pytest.raises(ParameterError, match=reason):
         g.start(Detector)
 
 
-def test_tags_that_others_found(graphs: Callable[..., Graph], tmp_path: Path) -> None:
+def test_tags_that_others_found(graph: Callable[..., Graph], tmp_path: Path) -> None:
     grid = tmp_path / 'grid.yaml'
     grid.write_text("target_type: 'aprilgrid'\ntagCols: 3\ntagRows: 2\ntagSize: 0.05\n"
                     'tagSpacing: 0.3\n')
-    g = graphs(f'board:=aprilgrid:{grid}')
+    g = graph(f'board:=aprilgrid:{grid}')
     node = g.start(Detector)
     corners = [SimpleNamespace(x=10.0 + i, y=20.0) for i in range(4)]
     tags = [SimpleNamespace(id=number, corners=corners) for number in (2, 99)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,20 +46,6 @@ from fisheye_svp_ros.solve.localization import localize
 class Endpoint(NamedTuple):
     topic_type: str
     qos_profile: Any
-
-
-@pytest.fixture
-def graph(ros_domain: int) -> Iterator[Callable[..., Graph]]:
-    """Return a function that starts a graph; each argument is a parameter NAME:=VALUE."""
-    graphs: list[Graph] = []
-
-    def start(*parameters: str) -> Graph:
-        graphs.append(Graph(*(word for p in parameters for word in ('-p', p))))
-        return graphs[-1]
-
-    yield start
-    for one in graphs:
-        one.close()
 
 
 def run_to_the_end(graph: Graph) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -21,19 +21,6 @@ from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.pose import Pose
-
-
-@pytest.fixture
-def graph(ros_domain: int) -> Iterator[Callable[..., Graph]]:
-    started: list[Graph] = []
-
-    def start(*parameters: str) -> Graph:
-        started.append(Graph(*(word for p in parameters for word in ('-p', p))))
-        return started[-1]
-
-    yield start
-    for one in started:
-        one.close()
 
 
 def edges(heard: list[Any]) -> dict[tuple[str, str], list[Any]]:
