@@ -78,7 +78,8 @@ class Free:
             normal += across.T @ across
             right += across.T @ d
         scale = 1 / np.sqrt(np.diag(normal))
-        common = scale * np.linalg.lstsq(normal * np.outer(scale, scale), right * scale)[0]
+        normal *= np.outer(scale, scale)
+        common = scale * np.linalg.lstsq(normal, right * scale, rcond=None)[0]
         poses = np.array([np.linalg.solve(r, q.T @ (d - c @ common)) for q, r, c, d in solved])
         moved = np.einsum('mij,mj->mi', self.pose, poses[self.scene.frame]) + self.common @ common
         return Step(poses, common, displacement - moved)

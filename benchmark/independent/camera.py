@@ -138,7 +138,7 @@ def _draw_k(rng: np.random.Generator, theta_max: float) -> tuple[float, ...]:
         return tuple(rng.normal(0, [0.03, 0.01, 0.003, 0.0005]).tolist())
     theta = np.linspace(0.02, theta_max, 80)
     powers = theta[:, None] ** np.array([3, 5, 7, 9])
-    k = np.linalg.lstsq(powers, HEIGHTS[other][0](theta) - theta)[0]
+    k = np.linalg.lstsq(powers, HEIGHTS[other][0](theta) - theta, rcond=None)[0]
     return tuple((k + rng.normal(0, [3e-3, 1e-3, 3e-4, 5e-5])).tolist())
 
 

@@ -39,12 +39,18 @@ class CameraTopics:
         self._world, self._transforms = settings.world_frame, node.transforms
         self.frame = f'{name}_{settings.camera_frame}' if name else settings.camera_frame
         self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED)
-        self._pose = node.announce(PoseStamped, f'{prefix}true_pose')
+        # Who solves listens to the true pose, but not to images.
+        self._pose = node.announce(PoseStamped, f'{prefix}true_pose', wait=photographs)
         self._images = self._points = None
         if photographs:
-            self._images = node.announce(Image, f'{prefix}image', SENSOR, wait=True)
+            self._images = node.announce(Image, f'{prefix}image', SENSOR)
         else:
             self._points = node.announce(PointCloud2, f'{prefix}image_points', wait=True)
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody looks at the images, where there are any."""
+        return self._images is None or self._images.get_subscription_count() > 0
 
     def publish(
         self, stamp: int, seen: Observations | Pixels, pose: Pose | None, lens: Lens | None
@@ -89,6 +95,12 @@ class CameraNode(BaseNode):
             if not _TOPIC.fullmatch(topic):
                 raise ParameterError(f'lock_step: {topic[:100]!r} is not the name of a topic')
         return settings
+
+    def has_listeners(self) -> bool:
+        """Say whether as many listen as the parameters ask for, and somebody to the images."""
+        return super().has_listeners() and (
+            not self.settings.wait_for_subscribers
+            or all(camera.is_watched for camera in self._cameras.values()))
 
     @abstractmethod
     def publish_set(self, step: Any, stamp: int) -> None:

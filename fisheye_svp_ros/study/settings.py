@@ -14,7 +14,8 @@ class Settings:
 
     wait_for_subscribers: int = parameter(
         0, 'Hold back what this node has to tell until so many listen to its image points (a '
-        'camera) or results (a solver), so that nobody misses the first', span=(0, 1000)
+        'camera; to its true pose, where it photographs) or results (a solver), so that nobody '
+        'misses the first', span=(0, 1000)
     )
     folder: str = parameter(
         '', 'Folder below which files may be named while the node runs, by `scenario` or a new '

@@ -6,9 +6,11 @@ import argparse
 import os
 import re
 import shlex
+import signal
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -18,7 +20,7 @@ from helpers.nodes import ROOT
 from fisheye_svp_ros import cli, standalone
 
 PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
-         'whats_wrong.md', 'photographs.md', 'water.md', 'next_photographs.md',
+         'whats_wrong.md', 'photographs.md', 'water.md', 'next_photographs.md', 'nodes.md',
          '../README.md')
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
@@ -37,7 +39,7 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
         with socket.socket() as probe:
             if probe.connect_ex(('127.0.0.1', 8786)) == 0:
                 pytest.skip('somebody else has a Dask scheduler on port 8786')
-    if 'record --sweep' in block and not standalone.is_genuine():
+    if 'fisheye-svp record' in block and not standalone.is_genuine():
         pytest.importorskip('cyclonedds')
     tools = tmp_path / 'bin'
     tools.mkdir()
@@ -49,9 +51,18 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
         'PATH': f'{tools}{os.pathsep}{os.environ["PATH"]}',
         'PYTHONPATH': os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')]),
     }
-    done = subprocess.run(['bash', '-euc', block], cwd=tmp_path, env=env, text=True, timeout=240,
-                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
-    assert done.returncode == 0, done.stdout
+    log = tmp_path / 'log'
+    with log.open('w') as stream:
+        process = subprocess.Popen(['bash', '-euc', block], cwd=tmp_path, env=env,
+                                   start_new_session=True, stdout=stream,
+                                   stderr=subprocess.STDOUT)
+        try:
+            status = process.wait(240)
+        finally:
+            with suppress(ProcessLookupError):  # what a block that failed has left behind
+                os.killpg(process.pid, signal.SIGKILL)
+    text = log.read_text()
+    assert status == 0 and ']: dropped:' not in text and 'Traceback' not in text, text
 
 
 @pytest.mark.parametrize('page', [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))],

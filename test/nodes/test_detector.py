@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from scipy.stats import chi2
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
-from geometry_msgs.msg import PoseWithCovarianceStamped  # isort: skip
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2  # isort: skip
 
 from fisheye_svp_ros.errors import ObservationError, ParameterError
@@ -145,6 +145,20 @@ def test_from_rendered_images_to_the_true_pose(
         covariance = np.reshape(message.pose.covariance, (6, 6))
         assert error @ np.linalg.solve(covariance, error) < chi2.isf(1e-4, 6)
         assert metrics['position_error_m'] == pytest.approx(np.linalg.norm(error[:3]))
+
+
+def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    lens = tmp_path / 'small.yaml'
+    save_lens(LENS, lens)
+    g = graph(f'photograph:={BOARD}', f'lens:={lens}', 'rate:=20.0', 'wait_for_subscribers:=1')
+    images = g.hear(Image, 'image', SENSOR)
+    camera = g.start(SyntheticCamera)
+    g.until(lambda: camera.camera('').is_watched)
+    assert not camera.has_listeners() and not images
+    g.hear(PoseStamped, 'true_pose')
+    g.until(lambda: images)
 
 
 @pytest.mark.parametrize(('parameters', 'reason'), [
