@@ -59,11 +59,13 @@ def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.run import supply_rclpy
     from fisheye_svp_ros.io.bags import BagWriter
+    from fisheye_svp_ros.nodes.executables import ending_quietly
 
-    supply_rclpy()
-    import rclpy
+    with ending_quietly():
+        supply_rclpy()
+        import rclpy
 
-    from fisheye_svp_ros.nodes.recorder import Recorder
+        from fisheye_svp_ros.nodes.recorder import Recorder
 
     rclpy.init(args=['--ros-args', *args.ros_args])
     try:

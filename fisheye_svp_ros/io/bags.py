@@ -1,4 +1,4 @@
-"""rosbag2 recordings (MCAP): written so that a crash loses a second at most, read even then."""
+"""rosbag2 recordings (MCAP): written so that a crash loses what came since the last flush only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.files import read_text
 from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
 
-_FLUSH_EVERY = 1.0  # s
 _SHOWN = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _FOREVER = QosTime(9223372036, 854775807)  # as rmw has it
@@ -79,7 +78,6 @@ class BagWriter:
         except (WriterError, OSError) as cause:
             raise BagError(f'{path}: a recording cannot be written there ({cause})') from cause
         self._connections: dict[str, Connection] = {}
-        self._flushed = time.monotonic()
         self._last = 0
 
     def __enter__(self) -> BagWriter:
@@ -115,19 +113,19 @@ class BagWriter:
             self._last = max(time.time_ns(), self._last)
             self._writer.write(self._connections[topic], self._last, data)
             self.count += 1
-            if time.monotonic() - self._flushed > _FLUSH_EVERY:
-                self.flush()
         except OSError as cause:
             raise BagError(f'{self.path}: cannot be written ({cause.strerror})') from cause
 
     def flush(self) -> None:
         """Hand to the operating system what has been written so far."""
         storage: Any = self._writer.storage
-        # The writer keeps a chunk of a megabyte in memory; a crash would lose it.
-        if storage.chunk.bio.tell():
-            storage.close_chunk()
-        storage.bio.flush()
-        self._flushed = time.monotonic()
+        try:
+            # The writer keeps a chunk of a megabyte in memory; a crash would lose it.
+            if storage.chunk.bio.tell():
+                storage.close_chunk()
+            storage.bio.flush()
+        except OSError as cause:
+            raise BagError(f'{self.path}: cannot be written ({cause.strerror})') from cause
 
 
 class Bag:

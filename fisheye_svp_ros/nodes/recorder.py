@@ -17,7 +17,9 @@ from fisheye_svp_ros.io.bags import BagWriter, Offered
 
 _COUNTED = ('/image_points', '/result')
 _LOOK_EVERY = 0.2  # s, for topics that are new
+_FLUSH_EVERY = 1.0  # s; a crash loses no more
 _QUIET = 0.5  # s without a message after which nothing is on its way any more
+_LONGEST = 2.0  # s to wait for that
 
 
 class Recorder(Node):  # type: ignore[misc]
@@ -29,23 +31,26 @@ class Recorder(Node):  # type: ignore[misc]
         self._bag = bag
         self._wanted = wanted
         self._warned: set[str] = set()
-        self._timer = self.create_timer(_LOOK_EVERY, self._look)
+        self.create_timer(_LOOK_EVERY, self._look)
+        self.create_timer(_FLUSH_EVERY, bag.flush)
 
     def spin(self) -> None:
-        """Record until SIGINT or SIGTERM, and then until nothing more arrives."""
-        executor, ended = SingleThreadedExecutor(), []
+        """Record until SIGINT or SIGTERM, and then what is on its way; a second one ends that."""
+        executor, signals, quiet = SingleThreadedExecutor(), list[float](), False
         executor.add_node(self)
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.append(True))
-        while not ended:
+            signal.signal(number, lambda *_: signals.append(time.monotonic()))
+        while not signals:
             executor.spin_once(timeout_sec=_LOOK_EVERY)
-        self._timer.cancel()
-        # Only a whole wait that brought nothing says so: this process may have been held up.
-        waited, count = 0.0, -1
-        while waited < _QUIET or self._bag.count > count:
+        for timer in self.timers:
+            timer.cancel()
+        while len(signals) == 1 and not quiet:
+            # Only a whole wait that brought nothing says so: this process may have been held up.
+            # Where others go on publishing, it is enough that nothing waits to be taken.
             start, count = time.monotonic(), self._bag.count
-            executor.spin_once(timeout_sec=_QUIET)
-            waited = time.monotonic() - start
+            patience = _QUIET if start - signals[0] < _LONGEST else 0.0
+            executor.spin_once(timeout_sec=patience)
+            quiet = self._bag.count == count and time.monotonic() - start >= patience
 
     def _look(self) -> None:
         # A node that waits for its listeners counts those of image_points or ~/result: when it

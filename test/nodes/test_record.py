@@ -8,9 +8,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from helpers import graph  # noqa: F401 - supplies the message packages
 from fisheye_svp_ros import standalone
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
-from fisheye_svp_ros.io import bags, decoding
+from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
 from fisheye_svp_ros.io.columns import arrow, read_columns
 from fisheye_svp_ros.io.decoding import stamp_of
@@ -346,6 +346,26 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
     assert 'only what is whole is read' in bag.damage
 
 
+def test_a_recorder_has_flushed_what_came_and_ends_while_others_go_on(
+    command: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    recorder = command('record', '-o', str(tmp_path / 'bag'))
+    arguments = 'run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1'
+    assert command(*arguments, '-p', 'repeat:=false').finish() == 0
+
+    def flushed() -> int:
+        with suppress(BagError):
+            return len(tabulate(Bag(tmp_path / 'bag').records(is_tabulated))['stamp_ns'])
+        return 0
+
+    until(lambda: flushed() == 1, 20)
+    endless = command(*arguments, '-p', 'rate:=20.0')
+    until(lambda: flushed() > 1)
+    assert recorder.finish(signal.SIGINT, 20) == 0
+    assert 'on 5 topics' in recorder.lines[-1] and Bag(tmp_path / 'bag').damage == ''
+    assert endless.finish(signal.SIGTERM) == 0
+
+
 def test_bad_arguments_of_record(command: Callable[..., NodeProcess], tmp_path: Path) -> None:
     (tmp_path / 'bag').mkdir()
     there = command('record', '-o', str(tmp_path / 'bag'))
@@ -397,18 +417,6 @@ def test_measured_camera_and_localizer_agree_with_the_command(
         theirs = [float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
         assert np.abs(np.array(ours) - theirs).max() < 1e-9
     assert min(poses) == 26 * 10**9, 'frames carry their own time'
-
-
-def test_flushing_is_what_bounds_the_loss(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bags, '_FLUSH_EVERY', 0.0)
-    writer = BagWriter(tmp_path / 'bag')
-    message = messages.key_values_message('n', {'scenario': 1}, 1)
-    for _ in range(3):
-        writer.write('/scenario', DIAGNOSTICS, cdr(message))
-        time.sleep(0.001)
-    unfinished = Bag(tmp_path / 'bag')
-    assert len(list(unfinished.records(is_tabulated))) == 3 and 'whole' in unfinished.damage
-    writer.__exit__(None, None, None)
 
 
 def test_reading_a_recording_needs_neither_ros_nor_dds(tmp_path: Path) -> None:
