@@ -42,7 +42,14 @@ class Offered(NamedTuple):
 
 
 class _Storage(McapWriter):
-    """The writer of rosbags, with the checksum that it leaves out."""
+    """The writer of rosbags, with the checksum that it leaves out.
+
+    The file has the name that rosbag2 gives it; `ros2 bag reindex` looks for no other.
+    """
+
+    def __init__(self, path: Path, compression: Any) -> None:
+        super().__init__(path, compression)
+        self.path = self.path.rename(path / f'{path.name}_0.mcap')
 
     def close_chunk(self) -> None:
         start, checksum = self.bio.tell(), zlib.crc32(self.chunk.bio.getbuffer())

@@ -16,9 +16,8 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rcl_interfaces.msg import (
-    SetParametersResult,
-)
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -119,6 +118,7 @@ class BaseNode(Node):  # type: ignore[misc]
         self._failures = 0
         self._candidate: tuple[Settings, Any] | None = None
         self._waited_for: list[Any] = []
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.announce(DiagnosticArray, '/diagnostics')
         self.every(1.0, self._publish_diagnostics)
 
@@ -177,9 +177,9 @@ class BaseNode(Node):  # type: ignore[misc]
             text = ''.join(traceback.format_exception(error)).rstrip()
             self.get_logger().error(f'internal error, told once: {text}')
 
-    def every(self, period: float, callback: Callable[[], None]) -> Any:
-        """Have a function called every `period` seconds."""
-        return self.create_timer(period, self.guarded(callback))
+    def every(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
+        """Have a function called every `period` seconds, of real time where no clock is given."""
+        return self.create_timer(period, self.guarded(callback), clock=clock or self._steady)
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""
@@ -318,13 +318,14 @@ class BaseNode(Node):  # type: ignore[misc]
         for topic, count in self._inputs.items():
             counts |= {f'{topic}: received': count.received, f'{topic}: dropped': count.dropped}
         more, trouble = self.report()
+        now = self.get_clock().now().nanoseconds
+        trouble = trouble or ('' if now else 'use_sim_time is true, but /clock has no time yet')
         bad = trouble or any(count.dropped for count in self._inputs.values())
         text = trouble or (self._complaint if bad else 'all inputs usable')
         level = DiagnosticStatus.WARN if bad else DiagnosticStatus.OK
         if self._failures:
             level, text = DiagnosticStatus.ERROR, f'{self._failures} internal errors; {text}'
         name = f'{self.get_fully_qualified_name()}: inputs'
-        now = self.get_clock().now().nanoseconds
         self._diagnostics.publish(messages.key_values_message(
             name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
 

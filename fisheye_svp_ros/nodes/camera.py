@@ -123,7 +123,7 @@ class CameraNode(BaseNode):
                 self._hear_answers_on(topic)
         if self._timer is not None:
             self.destroy_timer(self._timer)
-        self._timer = self.every(1 / self.settings.rate, self._tick)
+        self._timer = self.every(1 / self.settings.rate, self._tick, self.get_clock())
 
     def camera(self, name: str) -> CameraTopics:
         """Return the topics of a camera."""

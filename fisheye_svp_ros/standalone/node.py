@@ -207,8 +207,10 @@ class Node(ParameterHolder):
         self._guards.append(guard)
         return guard
 
-    def create_timer(self, timer_period_sec: float, callback: Callable[[], Any]) -> Timer:
-        """Have a function called periodically."""
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[[], Any], *, clock: Clock | None = None
+    ) -> Timer:
+        """Have a function called periodically; no clock here is other than real time."""
         timer = Timer(self, callback, Duration(seconds=timer_period_sec).nanoseconds)
         self._timers.append(timer)
         return timer

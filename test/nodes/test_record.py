@@ -336,7 +336,7 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
     recorder = command('record', '-o', str(tmp_path / 'bag'))
     camera = command('run', 'synthetic_camera', '--ros-args', '-p', 'wait_for_subscribers:=1',
                      '-p', 'rate:=300.0')
-    file = tmp_path / 'bag' / 'bag.mcap'
+    file = tmp_path / 'bag' / 'bag_0.mcap'
     until(lambda: file.exists() and file.stat().st_size > 20_000)
     recorder.process.send_signal(signal.SIGKILL)
     recorder.process.wait()
