@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench mutation poses fuzz test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench compare mutation poses fuzz test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -58,6 +58,20 @@ bench: .venv-bench/ready
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
 
+# Held-out corners of real cameras through other calibrations, into docs/compare.md; ten minutes.
+COMPARE_PYTHON ?= python3.12
+COMPARE_DATA ?= data
+compare: .venv-compare/ready
+	.venv-compare/bin/python -m benchmark.compare $(COMPARE_DATA)
+
+# mrcal without what only its windows need, which wants to be compiled.
+.venv-compare/ready: setup.py
+	@echo "Installing what is compared into .venv-compare: some minutes, this once"
+	$(COMPARE_PYTHON) -m venv .venv-compare
+	.venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging
+	.venv-compare/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
+	touch $@
+
 # What spoilt views do to poses, into docs/reliability.md; ten minutes.
 poses: $(VENV)/ready
 	$(BIN)/python -m benchmark.poses
@@ -87,4 +101,4 @@ $(VENV)/ready: setup.py
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-oldest .venv-bench $(OUT)
+	rm -rf $(VENV) .venv-oldest .venv-bench .venv-compare $(OUT)

@@ -1,0 +1,1 @@
+"""Held-out corners of real cameras through other calibrations, beside ours."""

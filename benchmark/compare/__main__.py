@@ -1,0 +1,212 @@
+"""`python -m benchmark.compare DATA`: the same held-out corners through ours and through others.
+
+DATA holds the folders ov_plane, ov_cube (train.csv, test.csv) and photos (chessboard,
+square_grid); what is not there is left out.  Writes docs/compare.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import NamedTuple
+
+# One core each: read when NumPy is imported.
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+
+import numpy as np  # noqa: E402
+
+import fisheye_svp_ros as fsvp  # noqa: E402
+from benchmark.compare.peers import PEERS, NotHereError  # noqa: E402
+from benchmark.compare.scoring import residuals, rms  # noqa: E402
+from benchmark.compare.sets import (  # noqa: E402
+    BOARDS,
+    Set,
+    grid_of,
+    photograph_set,
+    table_set,
+)
+from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose  # noqa: E402
+from fisheye_svp_ros.diagnosis.inputs import posable  # noqa: E402
+from fisheye_svp_ros.diagnosis.model import prepare, start_poses  # noqa: E402
+from fisheye_svp_ros.diagnosis.prediction import on_other_data  # noqa: E402
+from fisheye_svp_ros.diagnosis.refit import Local  # noqa: E402
+from fisheye_svp_ros.io.files import write_text  # noqa: E402
+from fisheye_svp_ros.library import Localized  # noqa: E402
+from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
+from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
+
+_DOC = Path(__file__).parents[2] / 'docs' / 'compare.md'
+_MARK = '<!-- figures -->'
+_OV = (1280, 800)
+SETS: dict[str, Callable[[Path], Set]] = {
+    'ov_plane': lambda data: table_set(data / 'ov_plane', _OV),
+    'ov_cube': lambda data: table_set(data / 'ov_cube', _OV),
+    'photos/chessboard': lambda data: photograph_set(
+        data / 'photos' / 'chessboard', 'chessboard:4x6:30mm'),
+    'photos/square_grid': lambda data: photograph_set(
+        data / 'photos' / 'square_grid', 'squares:3x4:30mm:30mm'),
+}
+
+
+class Row(NamedTuple):
+    """A model on one set: held-out rms, px, of so many points; seconds of the clock and of cores.
+
+    whole_px: the rms with gross errors.  NaN: not known, or the row above has it.
+    """
+
+    model: str
+    rms_px: float
+    whole_px: float
+    points: int
+    wall: float
+    cores: float
+    note: str = ''
+    ours: bool = False
+
+
+@dataclass
+class Clock:
+    """Seconds of the clock and of processors, children among them."""
+
+    wall: float = np.nan
+    cores: float = np.nan
+
+
+@contextmanager
+def timed() -> Iterator[Clock]:
+    """Time a block."""
+    clock, wall, before = Clock(), time.perf_counter(), os.times()
+    yield clock
+    clock.wall = time.perf_counter() - wall
+    clock.cores = sum(os.times()[:4]) - sum(before[:4])
+
+
+def compared(data: Set) -> list[Row]:
+    """Return the rows of a set."""
+    with timed() as fitting:
+        lens = fsvp.calibrate(data.train, 'kannala_brandt', data.size).lens
+    data = replace(data, test=posable(data.test, lens)[0])
+    train, _ = posable(data.train, lens)
+    with timed() as naming:
+        found = diagnose(train, lens, held_out=data.test)
+    gross = {(row['frame'], row['landmark']) for row in found.gross
+             if row['why'].startswith('held out')}
+    places = zip(data.test.frame.tolist(), data.test.landmark.tolist(), strict=True)
+    fair = np.array([place not in gross for place in places])
+    start = fsvp.localize(data.test, lens)
+    count, names = int(fair.sum()), ', '.join(cause.effect for cause in found.causes)
+    return [
+        Row('ours, `calibrate`', found.base.heldout_rms_px, _nominal(lens, data.test, start),
+            count, fitting.wall, fitting.cores, ours=True),
+        Row('ours, `diagnose`: lens', found.lens_only.heldout_rms_px, np.nan, count, naming.wall,
+            naming.cores, names, True),
+        Row('ours, `diagnose`: named', found.named.heldout_rms_px, _whole(found, data.test),
+            count, np.nan, np.nan, ours=True),
+        Row('ours, `diagnose`: extended', found.extended.heldout_rms_px,
+            _whole(found, data.test, found.local), count, np.nan, np.nan, ours=True),
+        *(_row(name, data, fair, start, lens.fx) for name in PEERS),
+    ]
+
+
+def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
+    return rms(residuals(lambda points: fsvp.project(lens, points).uv, test.frame, test.xyz,
+                         test.uv, start.pose))
+
+
+def _whole(found: Diagnosis, test: Observations, local: Local | None = None) -> float:
+    """Return the rms of all held-out points, gross errors among them."""
+    data, known = prepare(test), found.after.data.observations.t
+    terms = tuple(e for e in found.after.state.terms if e[0].holds_for(test.t, known))
+    solved = start_poses(data, replace(found.after.state, terms=terms))
+    return on_other_data(data, solved, local).rms
+
+
+def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Row:
+    grid, test = grid_of(data), data.test
+    try:
+        with timed() as clock:
+            fitted = PEERS[name](data, grid, focal)
+    except NotHereError as reason:
+        return Row(name, np.nan, np.nan, 0, np.nan, np.nan, str(reason))
+    near = _incidence(test, start) < fitted.before
+    apart = residuals(fitted.project, test.frame[near], fitted.places(test)[near], test.uv[near],
+                      start.pose)
+    note = f'without {(~near).sum()} points beyond {fitted.before:.0f}°' * bool((~near).any())
+    mine = fair[near]
+    return Row(name, rms(apart[mine]), rms(apart), int(mine.sum()), clock.wall, clock.cores,
+               '; '.join(filter(None, (fitted.note, note))))
+
+
+def _incidence(test: Observations, start: Localized) -> Array:
+    """Return incidence angles (N,), degrees."""
+    angle = np.empty(len(test))
+    for i, number in enumerate(start.frame):
+        mine = test.frame == number
+        points = start.pose.take(i).into_body(test.xyz[mine])
+        angle[mine] = np.degrees(np.arctan2(np.hypot(*points[:, :2].T), points[:, 2]))
+    return angle
+
+
+def section(data: Set, rows: list[Row]) -> list[str]:
+    """Return the part of docs/compare.md on one set."""
+    best = min((row.rms_px for row in rows if not row.ours and np.isfinite(row.rms_px)),
+               default=np.nan)
+    boards = len(np.unique(data.train.board))
+    held_out = len(np.unique(data.test.frame // BOARDS))
+    lines = [
+        f'## {data.name}', '',
+        f'{len(data.train)} points in {len(data.train.frames)} frames of '
+        f'{boards} board{"s" * (boards > 1)} to fit; {len(data.test)} in {held_out} frames held '
+        'out.', '',
+        '| model | held-out rms, px | beside the best of the others | points | with gross errors, '
+        'px | wall s | processor s | causes, notes |', '|---|---:|---:|---:|---:|---:|---:|---|',
+    ]
+    for row in rows:
+        figures = (f'{row.rms_px:.3f}', f'{row.rms_px / best:.2f}', f'{row.points or ""}',
+                   f'{row.whole_px:.3f}', f'{row.wall:.1f}', f'{row.cores:.1f}')
+        cells = ' | '.join('' if cell == 'nan' else cell for cell in figures)
+        lines.append(f'| {row.model} | {cells} | {row.note} |')
+    return [*lines, '']
+
+
+def main() -> None:
+    """Compare on every set that is there, write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.compare')
+    parser.add_argument('data', type=Path)
+    parser.add_argument('--only', nargs='+', choices=SETS, default=list(SETS))
+    parser.add_argument('-o', '--output', type=Path, default=_DOC)
+    asked = parser.parse_args()
+    there = [name for name in asked.only if (asked.data / name).is_dir()]
+    lines = [_versions(), '']
+    with progress('comparing', len(there)) as advance:
+        for name in there:
+            data = SETS[name](asked.data)
+            lines += section(data, compared(data))
+            advance()
+    text = '\n'.join(lines)
+    print(text)
+    if asked.only == list(SETS):
+        head = asked.output.read_text(encoding='utf-8').split(_MARK)[0]
+        write_text(asked.output, f'{head}{_MARK}\n\n{text}')
+
+
+def _versions() -> str:
+    found = []
+    for name in ('mrcal', 'opencv-python-headless', 'numpy', 'scipy'):
+        try:
+            found.append(f'{name} {version(name)}')
+        except PackageNotFoundError:
+            found.append(f'{name} not installed')
+    return ', '.join(found) + '.'
+
+
+if __name__ == '__main__':
+    main()
