@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import NoReturn
 
@@ -35,9 +38,11 @@ COMMANDS = {
     'watch': 'the results of running nodes, live, in the terminal',
 }
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
+_SIGNALLED = ('record', 'run', 'watch')  # these end themselves on SIGTERM
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
 _BROKEN_PIPE = 141  # 128 + SIGPIPE
+_TERMINATED = 143  # 128 + SIGTERM
 
 
 class _Parser(argparse.ArgumentParser):
@@ -98,8 +103,26 @@ def _run(arguments: Sequence[str]) -> None:
         _refuse(commands.choices[named], unknown[0])
     if named in _SOLVING and parsed.engine:
         import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
-    parsed.run(parsed)
+    with _tidy(named):
+        parsed.run(parsed)
     sys.stdout.flush()
+
+
+@contextmanager
+def _tidy(command: str) -> Iterator[None]:
+    """Have SIGTERM end a command as an exception does: temporary files go, children end."""
+    if command in _SIGNALLED or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(*_: object) -> NoReturn:
+        sys.exit(_TERMINATED)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _refuse(parser: argparse.ArgumentParser, word: str) -> NoReturn:

@@ -22,6 +22,7 @@ from fisheye_svp_ros.scene.observations import Observations
 MRCAL = 'mrcal-calibrate-cameras'
 _PLANE = 89.0  # degrees: models of x / z end here
 _NARROWER = (180.0, 85.0, 80.0, 75.0, 70.0, 65.0, 60.0)  # degrees
+_POOR = 2.0  # px: nobody would take such a lens
 _FEWEST = 12  # points in a view for OpenCV to start from
 _MOST_LEFT_OUT = 10
 _TERMS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
@@ -65,11 +66,14 @@ def opencv_fisheye(data: Set, grid: Grid, focal: float) -> Fitted:
     for limit in _NARROWER:
         points, seen = _planes(data.train, grid, start, limit)
         try:
-            _, matrix, curve, _, _ = cv2.fisheye.calibrate(
+            error, matrix, curve, _, _ = cv2.fisheye.calibrate(
                 [one[None] for one in points], [one[None] for one in seen], data.size,
                 start.copy(), np.zeros(4), flags=flags, criteria=_TERMS)
         except cv2.error as failure:
             reason = failure.err
+            continue
+        if error > _POOR:
+            reason = f'{error:.1f} px at best'
             continue
 
         def project(xyz: Array, matrix: Array = matrix, curve: Array = curve) -> Array:

@@ -34,7 +34,7 @@ def _fitted(project: Project, xyz: Array, uv: Array, pose: Pose) -> Array:
         seen = project(pose.retract(size * change).into_body(xyz))
         return np.nan_to_num(uv - seen, nan=_LOST, posinf=_LOST, neginf=-_LOST).ravel()
 
-    found = least_squares(misfit, np.zeros(6), method='lm', diff_step=1e-6, x_scale=1e-2)
+    found = least_squares(misfit, np.zeros(6), method='lm', x_scale=1e-2)
     return np.asarray(found.fun).reshape(-1, 2)
 
 

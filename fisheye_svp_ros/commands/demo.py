@@ -35,6 +35,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import note_formats
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.columns import write_columns
+    from fisheye_svp_ros.io.files import together
     from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
     from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.paper.demonstration import demo_rows
@@ -45,13 +46,14 @@ def run(args: argparse.Namespace) -> None:
         record(bag, args.output / 'logs', args.lenses, args.radii)
     columns = tabulate(Bag(bag).records(is_tabulated))
     rows = demo_rows(columns, args.lenses, args.radii)
-    write_columns(args.output / 'table', columns)
+    with together():
+        write_columns(args.output / 'table', columns)
+        write_json(args.output / 'demo.json', {
+            'recording': str(bag), 'rows': [row._asdict() for row in rows],
+        })
+        _draw(args.output, bag, rows)
     note_formats()
-    write_json(args.output / 'demo.json', {
-        'recording': str(bag), 'rows': [row._asdict() for row in rows],
-    })
     _print(rows)
-    _draw(args.output, bag, rows)
     print(f'  recording, table, pictures: {args.output}')
 
 

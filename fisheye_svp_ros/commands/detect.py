@@ -38,15 +38,16 @@ def run(args: argparse.Namespace) -> None:
 
     detection = search(args.photographs, args)
     _print(detection, args.board)
-    if args.output:
-        with together():
+    with together():
+        if args.output:
             write_observations(args.output, detection.observations)
             write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))
-    if args.overlays:
-        from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
+        if args.overlays:
+            from fisheye_svp_ros.reporting.overlays import write_coverage, write_overlays
 
-        write_overlays(find_photographs(args.photographs, args.every), detection, args.overlays)
-        write_coverage(detection, args.overlays / 'coverage.png')
+            write_overlays(find_photographs(args.photographs, args.every), detection,
+                           args.overlays)
+            write_coverage(detection, args.overlays / 'coverage.png')
 
 
 def _print(detection: Detection, board: str) -> None:

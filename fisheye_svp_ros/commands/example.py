@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> None:
     import numpy as np
 
     from fisheye_svp_ros.commands.render import bowed, write_photographs
-    from fisheye_svp_ros.io.files import write_text
+    from fisheye_svp_ros.io.files import together, write_text
     from fisheye_svp_ros.io.lens_files import save_lens
     from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
     from fisheye_svp_ros.optics.lens import Lens
@@ -43,12 +43,9 @@ def run(args: argparse.Namespace) -> None:
     printed = Print(9, 6, 0.025)
     printed = Print(9, 6, 0.025, bow=bowed(printed.corners, 0.0015))
     poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
-    folder = args.output / 'photographs'
-    write_photographs(lens, printed, poses, Exposure(), 0, folder)
     truth = args.output / 'truth'
-    truth.mkdir(exist_ok=True)
-    for name in ('observations.csv', 'poses.csv'):
-        (folder / name).replace(truth / name)
-    save_lens(lens, truth / 'lens.yaml')
-    write_text(args.output / 'README.md', _README)
+    with together():
+        write_photographs(lens, printed, poses, Exposure(), 0, args.output / 'photographs', truth)
+        save_lens(lens, truth / 'lens.yaml')
+        write_text(args.output / 'README.md', _README)
     print(f'{args.output}: README.md says which three commands explain them')

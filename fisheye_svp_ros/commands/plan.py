@@ -45,6 +45,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.diagnosis.plan import plan
     from fisheye_svp_ros.effects.forward import ForwardModel
+    from fisheye_svp_ros.io.files import together
     from fisheye_svp_ros.io.readers import write_poses
     from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting import shot_list
@@ -56,10 +57,11 @@ def run(args: argparse.Namespace) -> None:
     planned = plan(lens, pattern.points, room_of(args.room), args.count, args.number, args.noise)
     wanted = planned.wanted
     if args.output:
-        shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
-        write_poses(args.output / 'poses.csv', np.arange(args.count), wanted.shots.camera)
-        write_json(args.output / 'plan.json',
-                   {'photographs': wanted.to_list(), 'stderr': planned.stderr})
+        with together():
+            shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
+            write_poses(args.output / 'poses.csv', np.arange(args.count), wanted.shots.camera)
+            write_json(args.output / 'plan.json',
+                       {'photographs': wanted.to_list(), 'stderr': planned.stderr})
     print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
                 shot_list.HEADER, shot_list.rows(wanted), words=shot_list.WORDS)
     print('  standard errors to expect: '

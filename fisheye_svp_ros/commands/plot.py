@@ -25,8 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
     from fisheye_svp_ros.errors import OutputError
+    from fisheye_svp_ros.io.files import together
 
-    files = _of_table(args) if _table_in(args.source) else _of_bag(args)
+    with together():
+        files = _of_table(args) if _table_in(args.source) else _of_bag(args)
     if not files:
         raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '
                           'differ are needed, or residuals')

@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> None:
     import numpy as np
 
     from fisheye_svp_ros.detect.patterns import parse_pattern
+    from fisheye_svp_ros.io.files import together
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.io.share import lens_path
@@ -62,8 +63,11 @@ def run(args: argparse.Namespace) -> None:
                         bow=bowed(printed.corners, 1e-3 * args.bow))
     poses = read_poses(args.poses).pose if args.poses else board_views(
         lens, printed, args.count, tuple(args.ranges), rng)
-    write_photographs(lens, printed, poses, Exposure(blur=args.blur, noise=args.noise),
-                      args.seed, args.output)
+    with together():
+        write_photographs(lens, printed, poses, Exposure(blur=args.blur, noise=args.noise),
+                          args.seed, args.output, args.output)
+    print(f'{args.output}: {len(poses.position)} photographs, observations.csv with their true '
+          'corners, poses.csv')
 
 
 def bowed(corners: Array, height: float) -> Field:
@@ -77,14 +81,15 @@ def bowed(corners: Array, height: float) -> Field:
 
 
 def write_photographs(
-    lens: Lens, printed: Print, poses: Pose, exposure: Exposure, seed: int, folder: Path
+    lens: Lens, printed: Print, poses: Pose, exposure: Exposure, seed: int, folder: Path,
+    truth: Path,
 ) -> None:
-    """Write a photograph a pose (P,), the true corners as observations.csv, and poses.csv."""
+    """Write a photograph a pose (P,); the true corners, observations.csv, poses.csv to `truth`."""
     import cv2
     import numpy as np
 
     from fisheye_svp_ros.effects.forward import project
-    from fisheye_svp_ros.io.files import replacing
+    from fisheye_svp_ros.io.files import write_bytes
     from fisheye_svp_ros.io.readers import write_observations, write_poses
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.scene.observations import make_observations
@@ -95,12 +100,10 @@ def write_photographs(
         for number in range(count):
             rng = np.random.default_rng([seed, number])
             image = render(lens, printed, poses.take(number), exposure, rng)
-            with replacing(folder / f'{number:03d}.png') as path:
-                cv2.imwrite(str(path), image)
+            write_bytes(folder / f'{number:03d}.png', cv2.imencode('.png', image)[1].tobytes())
             done()
     seen = project(lens, poses.into_body(printed.true_corners()))
     frame, corner = np.nonzero(seen.valid)
-    write_observations(folder / 'observations.csv', make_observations(
+    write_observations(truth / 'observations.csv', make_observations(
         frame, corner, seen.uv[frame, corner], corners[corner]))
-    write_poses(folder / 'poses.csv', np.arange(count), poses)
-    print(f'{folder}: {count} photographs, observations.csv with their true corners, poses.csv')
+    write_poses(truth / 'poses.csv', np.arange(count), poses)

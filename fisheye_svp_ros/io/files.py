@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import stat
 import tempfile
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -89,15 +91,34 @@ def together() -> Iterator[None]:
     token = _waiting.set(waiting)
     try:
         yield
-        for target, temporary in waiting.items():
-            try:
-                temporary.replace(target)
-            except OSError as cause:
-                raise OutputError(f'{target}: cannot be written ({cause.strerror})') from cause
+        with _undisturbed():
+            for target, temporary in waiting.items():
+                try:
+                    temporary.replace(target)
+                except OSError as cause:
+                    raise OutputError(f'{target}: cannot be written ({cause.strerror})') from cause
     finally:
         _waiting.reset(token)
         for temporary in waiting.values():
             temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Keep SIGINT and SIGTERM back until the block is done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    late: list[int] = []
+    kept = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(one, lambda number, _: late.append(number)) for one in kept]
+    try:
+        yield
+    finally:
+        for one, handler in zip(kept, before, strict=True):
+            signal.signal(one, handler)
+        for number in late:
+            signal.raise_signal(number)
 
 
 def written(path: Path) -> Path:
@@ -107,8 +128,13 @@ def written(path: Path) -> Path:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file whole or not at all."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, data: bytes) -> None:
+    """Write a file whole or not at all."""
     with replacing(path) as temporary:
-        temporary.write_text(text, encoding='utf-8')
+        temporary.write_bytes(data)
 
 
 def _umask() -> int:

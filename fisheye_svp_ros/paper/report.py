@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future, wait
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.io.files import replacing, together
 from fisheye_svp_ros.io.results import write_json
 from fisheye_svp_ros.paper import figures
 from fisheye_svp_ros.paper.beyond import CALIBRATION_NOISE, NOISES, POSE_SETS
@@ -47,17 +49,29 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
 
     Raises OutputError where one cannot be written.
     """
-    pictures = {
-        folder / f'{name}.png': executor.submit(draw, folder / f'{name}.png', *arguments)
-        for name, (draw, *arguments) in _drawings(results).items()
-    }
-    for drawn in pictures.values():
-        drawn.result()
-    write_json(folder / 'paper.json', results.document())
     parts = (_summary, _recovered, _localization, _stopping, _calibration, _stereo, _claims,
              _solvers, _noise, _differences)
     blocks = [block for part in parts for block in part(results)]
-    return [folder / 'paper.json', *write_blocks(folder, 'paper', blocks), *pictures]
+    with together():
+        pictures = _drawn(results, folder, executor)
+        write_json(folder / 'paper.json', results.document())
+        return [folder / 'paper.json', *write_blocks(folder, 'paper', blocks), *pictures]
+
+
+def _drawn(results: Results, folder: Path, executor: Executor) -> list[Path]:
+    """Draw the pictures by the executor; return them."""
+    drawings = _drawings(results)
+    with ExitStack() as stack:
+        places = {folder / f'{name}.png': stack.enter_context(replacing(folder / f'{name}.png'))
+                  for name in drawings}
+        under_way: list[Future[None]] = []
+        # Whatever ends this, nobody draws any longer when the temporary files go.
+        stack.callback(lambda: wait([one for one in under_way if not one.cancel()]))
+        for place, (draw, *arguments) in zip(places.values(), drawings.values(), strict=True):
+            under_way.append(executor.submit(draw, place, *arguments))
+        for drawn in under_way:
+            drawn.result()
+    return [*places]
 
 
 def _drawings(results: Results) -> dict[str, tuple[Any, ...]]:

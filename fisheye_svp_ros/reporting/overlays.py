@@ -10,8 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.detect.detection import Detection, Searched
 from fisheye_svp_ros.detect.photographs import Photograph
-from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
-from fisheye_svp_ros.io.files import replacing
+from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.io.files import write_bytes
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, picture
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
@@ -32,9 +32,8 @@ def write_overlays(
         except FisheyeSvpError:
             continue
         name = '_'.join(filter(None, (searched.camera, photograph.key)))
-        with replacing(folder / f'{name}.png') as path:
-            if not cv2.imwrite(str(path), _overlay(np.asarray(pixels), searched)):
-                raise OutputError(f'{folder}: {name}.png cannot be written')
+        drawn = cv2.imencode('.png', _overlay(np.asarray(pixels), searched))[1]
+        write_bytes(folder / f'{name}.png', drawn.tobytes())
 
 
 def _overlay(pixels: np.ndarray, searched: Searched) -> np.ndarray:

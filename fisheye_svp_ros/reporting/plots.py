@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fisheye_svp_ros.io.files import replacing
+from fisheye_svp_ros.io.files import write_bytes
 
 OURS, PUBLISHED, FAINT = '#1f5fa8', '#e07b28', '#b8bfc7'
 _STYLE: Any = {
@@ -38,8 +39,9 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
         figure = Figure(figsize=(width, height), layout='constrained')
         FigureCanvasAgg(figure)
         yield figure
-        with replacing(path) as temporary:
-            figure.savefig(temporary, dpi=150)
+        drawn = BytesIO()
+        figure.savefig(drawn, dpi=150, format=path.suffix[1:])
+        write_bytes(path, drawn.getvalue())
 
 
 def legend_below(figure: Figure, *axes: Any) -> None:

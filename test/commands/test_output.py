@@ -34,6 +34,11 @@ COMMANDS = {
     'calibrate': ('calibrate', '{obs}', '--image-size', '1536x1536', '--model', 'equidistant',
                   '-o', '{out}/new.yaml'),
     'sweep': ('sweep', '{sweep}', '-o', '{out}'),
+    'plot': ('plot', '{table}', '-o', '{out}'),
+    'plan': ('plan', '--lens', 'fish180', '--board', 'chessboard:4x3:25mm', '--room', '0.1', '0.5',
+             '--count', '1', '-o', '{out}'),
+    'render': ('render', '--lens', 'fish180', '--board', 'chessboard:4x3:25mm', '--count', '1',
+               '-o', '{out}'),
 }
 
 
@@ -42,12 +47,14 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Return input files by name."""
     folder, rng = tmp_path_factory.mktemp('given'), np.random.default_rng(4)
     paths = {name: folder / f'{name}{suffix}' for name, suffix in (
-        ('obs', '.csv'), ('lens', '.yaml'), ('sweep', '.yaml'))}
+        ('obs', '.csv'), ('lens', '.yaml'), ('sweep', '.yaml'), ('table', '.csv'))}
     lens = load_lens(lens_path('fish214')).svp()
     write_observations(paths['obs'], simulate(
         ForwardModel(lens), plane(), poses_around(plane(), 5, rng, widest=0.5), 0.1, rng))
     save_lens(lens, paths['lens'])
     paths['sweep'].write_text(SWEEP)
+    paths['table'].write_text('radius,noise_px,localizer.rms_px\n' + ''.join(
+        f'{radius},{noise},{radius * noise}\n' for radius in (0.2, 2) for noise in (0.1, 0.3)))
     return paths
 
 
@@ -123,6 +130,42 @@ def test_a_set_of_files_appears_together(tmp_path: Path) -> None:
         write_text(two, 'new')
     assert (one.read_text(), two.read_text()) == ('newer', 'new')
     assert results(tmp_path) == ['one', 'two'] and written(one) == one
+
+
+def test_a_signal_among_the_renames_waits_for_the_last(tmp_path: Path) -> None:
+    one, two = tmp_path / 'one', tmp_path / 'two'
+    replace, before = Path.replace, signal.getsignal(signal.SIGINT)
+
+    def interrupted(self: Path, target: Path) -> Path:
+        signal.raise_signal(signal.SIGINT)
+        return replace(self, target)
+
+    with pytest.raises(KeyboardInterrupt), pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Path, 'replace', interrupted)
+        with together():
+            write_text(one, 'new')
+            write_text(two, 'new')
+    assert results(tmp_path) == ['one', 'two']
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize('name', ['localize', 'plot', 'plan', 'render'])
+def test_a_command_that_is_told_to_end_leaves_nothing(
+    name: str, given: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced, before = [], signal.getsignal(signal.SIGTERM)
+
+    def end(stream: Any) -> None:
+        synced.append(stream)
+        if len(synced) == 2:  # one file is whole, the second nearly so
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(os, 'fsync', end)
+    with pytest.raises(SystemExit) as ended:
+        main(words(name, given, tmp_path / 'out'))
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert not results(tmp_path)
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_command_that_is_killed_leaves_all_or_nothing(

@@ -1,0 +1,356 @@
+"""What is left when a command is killed, or may not write: `python -m benchmark.kills`.
+
+Every command that writes, and nodes, get SIGTERM or SIGKILL at random moments of their run, half
+of them while they write.  Then: are the files of the set all there, as a whole run writes them, or
+none?  Is a temporary file left, a process?  Does the same command go through afterwards?  Disks
+that are full at some point of a run, folders that are read-only or another user's, need root.
+Writes docs/reliability.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fisheye_svp_ros.reporting.progress import progress
+
+_DOC = Path(__file__).parents[1] / 'docs' / 'reliability.md'
+_BEGIN, _END = '<!-- kills -->', '<!-- end of kills -->'
+_WRITING = 0.15  # of a run: the end, where most is written
+_PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent
+_NOBODY = 65534
+_BOARD = 'chessboard:6x5:25mm'
+_CALIBRATE = ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml')
+COMMANDS = {
+    'budget': ('budget', '--lens', 'fish180', '-o', '{out}'),
+    'calibrate': _CALIBRATE,
+    'demo': ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', '{out}'),
+    'detect': ('detect', '{photographs}', '--board', _BOARD, '-o', '{out}/seen.csv',
+               '--overlays', '{out}/overlays'),
+    'diagnose': ('diagnose', '{obs}', '--lens', '{lens}', '--quick', '-o', '{out}'),
+    'example': ('example', '-o', '{out}'),
+    'lens': ('lens', '{lens}', '--format', 'opencv', '-o', '{out}/opencv.yaml'),
+    'localize': ('localize', '{obs}', '--lens', '{lens}', '-o', '{out}'),
+    'paper': ('paper', '-o', '{out}'),
+    'plan': ('plan', '--lens', 'fish180', '--board', _BOARD, '--room', '0.1', '0.5', '--count',
+             '4', '-o', '{out}'),
+    'plot': ('plot', '{swept}', '-o', '{out}'),
+    'render': ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '6', '-o', '{out}'),
+    'sweep': ('sweep', '{sweep}', '-o', '{out}', '--workers', '2', '--resume'),
+    'table': ('table', '{recording}', '-o', '{out}'),
+}
+NODES = {
+    'record': ('record', '-o', '{out}/recording'),
+    **{f'run {node}': ('run', node) for node in (
+        'synthetic_camera', 'detector', 'localizer', 'stereo_calibrator', 'stereo_depth',
+        'model_critic')},
+}
+# What is made on the way, and is there whether or not the run came to its end.
+_WORK = {'parts', 'recording', 'logs', '.demo'}
+_SWEEP = """synthetic_camera: {ros__parameters: {sweep.seed: [1, 2, 3, 4, 5, 6, 7, 8],
+  sweep.radius: [0.2, 0.5, 2.0], noise_px: 0.2}}
+"""
+
+
+@dataclass
+class Outcome:
+    """How often what was found; told: the first few faults, in words."""
+
+    kills: Counter[str] = field(default_factory=Counter)
+    whole: int = 0
+    nothing: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    told: list[str] = field(default_factory=list)
+
+    def fault(self, kind: str, text: str) -> None:
+        """Count a fault."""
+        self.faults[kind] += 1
+        self.told.append(f'{kind}: {text}')
+
+
+def call(words: Sequence[str], before: Sequence[str] = ()) -> subprocess.Popen[str]:
+    """Start `fisheye-svp WORDS` in a session of its own; before: what is to start it."""
+    environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '97'}
+    return subprocess.Popen(
+        [*before, sys.executable, '-m', 'fisheye_svp_ros.cli', *words], env=environment,
+        start_new_session=True, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def done(words: Sequence[str]) -> tuple[int, str]:
+    """Run a command to its end; return its status and what it said on stderr."""
+    process = call(words)
+    _, said = process.communicate()
+    return process.returncode, said
+
+
+def files(folder: Path) -> dict[str, int]:
+    """Return the sizes of a command's files by name, temporary ones among them."""
+    found = {}
+    for path in sorted(folder.rglob('*')):
+        name = path.relative_to(folder)
+        if path.is_file() and not _WORK & set(name.parts):
+            found[str(name)] = path.stat().st_size
+    return found
+
+
+def temporary(names: Sequence[str]) -> list[str]:
+    """Return those of some names that are of temporary files."""
+    return [name for name in names if Path(name).name.startswith('.')]
+
+
+def left_running(session: int) -> list[int]:
+    """Return the processes of a session that live on."""
+    found = []
+    for entry in Path('/proc').iterdir():
+        try:
+            if entry.name.isdigit() and os.getsid(int(entry.name)) == session:
+                state = (entry / 'stat').read_text().rpartition(')')[2].split()[0]
+                if state != 'Z':
+                    found.append(int(entry.name))
+        except (OSError, ValueError):
+            continue
+    return found
+
+
+def prepare(folder: Path) -> dict[str, Path]:
+    """Make the inputs of the commands."""
+    given = {name: folder / name for name in ('photographs', 'swept', 'recording')}
+    given |= {'obs': folder / 'obs.csv', 'lens': folder / 'lens.yaml',
+              'sweep': folder / 'sweep.yaml'}
+    given['sweep'].write_text(_SWEEP)
+    demonstration = folder / 'demonstration'
+    for words in (
+        ('render', '--lens', 'fish180', '--board', _BOARD, '--count', '12', '-o',
+         str(given['photographs'])),
+        ('detect', str(given['photographs']), '--board', _BOARD, '-o', str(given['obs'])),
+        ('calibrate', str(given['obs']), '--model', 'kannala_brandt', '-o', str(given['lens'])),
+        ('sweep', str(given['sweep']), '-o', str(given['swept'])),
+        ('demo', '--lenses', 'fish180', '--radii', '0.2', '-o', str(demonstration)),
+    ):
+        status, said = done(words)
+        if status:
+            raise SystemExit(f'{" ".join(words)}: {said}')
+    (demonstration / 'recording').rename(given['recording'])
+    return given
+
+
+def moments(count: int, rng: random.Random) -> Iterator[float]:
+    """Yield moments of a run, 0 to 1: half of them anywhere, half at its end."""
+    for number in range(count):
+        yield rng.uniform(0.0, 1.0) if number % 2 else rng.uniform(1 - _WRITING, 1.02)
+
+
+def killed(
+    words: Sequence[str], folder: Path, count: int, rng: random.Random,
+    step: Callable[[], None] = lambda: None,
+) -> Outcome:
+    """Kill a command `count` times by each signal; words: with {out} for its folder."""
+    outcome = Outcome()
+    out = folder / 'whole'
+    begun = time.monotonic()
+    status, said = done([word.format(out=out) for word in words])
+    length, whole = time.monotonic() - begun, files(out)
+    if status or temporary([*whole]):
+        outcome.fault('whole run', f'status {status}, {[*whole]}, {said}')
+        return outcome
+    for number, moment in enumerate(moments(2 * count, rng)):
+        how = signal.SIGTERM if number // 2 % 2 else signal.SIGKILL
+        out = folder / str(number)
+        _kill(words, out, how, moment * length, whole, outcome)
+        # The next one goes through where this one was killed.
+        status, said = done([word.format(out=out) for word in words])
+        if status or not _same(files(out), whole):
+            outcome.fault('rerun', f'status {status}, {said[-300:]}')
+        shutil.rmtree(out, ignore_errors=True)
+        step()
+    return outcome
+
+
+def _kill(
+    words: Sequence[str], out: Path, how: signal.Signals, after: float, whole: dict[str, int],
+    outcome: Outcome,
+) -> None:
+    process = call([word.format(out=out) for word in words])
+    with process:
+        try:
+            process.wait(after)
+        except subprocess.TimeoutExpired:
+            outcome.kills[how.name] += 1
+            process.send_signal(how)
+        try:
+            process.wait(_PATIENCE)
+        except subprocess.TimeoutExpired:
+            outcome.fault('no end', f'{how.name} after {after:.2f} s')
+            process.kill()
+    end = time.monotonic() + _PATIENCE
+    while (alive := left_running(process.pid)) and time.monotonic() < end:
+        time.sleep(0.05)
+    for number in alive:
+        outcome.fault('orphan', f'{how.name} after {after:.2f} s')
+        os.kill(number, signal.SIGKILL)
+    found = files(out)
+    rest = temporary([*found])
+    if rest and how == signal.SIGTERM:
+        outcome.fault('temporary file', f'{how.name} after {after:.2f} s: {rest}')
+    for name in rest:
+        del found[name]
+    if not found:
+        outcome.nothing += 1
+    elif _same(found, whole):
+        outcome.whole += 1
+    else:
+        outcome.fault('part', f'{how.name} after {after:.2f} s: {[*found]}')
+
+
+def _same(found: dict[str, int], whole: dict[str, int]) -> bool:
+    """Whether the files of a set are all there, and about as long as they ought to be."""
+    shown = {name: size for name, size in found.items() if not temporary([name])}
+    return shown.keys() == whole.keys() and all(
+        0.8 * whole[name] <= size <= 1.25 * whole[name] for name, size in shown.items())
+
+
+def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Random) -> Outcome:
+    """Kill a node `count` times by each signal while it starts or runs."""
+    outcome = Outcome()
+    for number in range(2 * count):
+        how = signal.SIGTERM if number % 2 else signal.SIGKILL
+        out = folder / str(number)
+        out.mkdir()
+        _kill([word.format(out=out) for word in words], out, how, rng.uniform(0.1, 6.0), {},
+              outcome)
+        shutil.rmtree(out)
+    return outcome
+
+
+@contextmanager
+def disk(folder: Path, kilobytes: int) -> Iterator[Path]:
+    """Mount a small disk."""
+    folder.mkdir(exist_ok=True)
+    subprocess.run(['mount', '-t', 'tmpfs', '-o', f'size={kilobytes}k', 'tmpfs', folder],
+                   check=True)
+    try:
+        yield folder
+    finally:
+        subprocess.run(['umount', '-l', folder], check=True)
+
+
+def refused(words: Sequence[str], folder: Path, size: int) -> Outcome:
+    """Run a command on disks that are too small for its `size` bytes, and where it may not write.
+
+    Anything but one line, status 2 and no file is a fault.
+    """
+    outcome = Outcome()
+    for part in (0.0, 0.3, 0.9):
+        with disk(folder / 'disk', max(4, int(part * size / 1024))) as mounted:
+            if not part:
+                (mounted / 'full').write_bytes(bytes(4096))
+            _judge(outcome, f'disk of {part:.1f} of it', mounted / 'out', words)
+    with disk(folder / 'disk', 64) as mounted:
+        subprocess.run(['mount', '-o', 'remount,ro', mounted], check=True)
+        _judge(outcome, 'read-only', mounted / 'out', words)
+    owned = folder / 'owned'
+    owned.mkdir()
+    os.chown(owned, _NOBODY, _NOBODY)
+    # Without its capabilities root is as anybody else.
+    _judge(outcome, 'not allowed', owned / 'out', words, ['setpriv', '--bounding-set=-all'])
+    owned.rmdir()
+    return outcome
+
+
+def _judge(
+    outcome: Outcome, what: str, out: Path, words: Sequence[str], before: Sequence[str] = ()
+) -> None:
+    process = call([word.format(out=out) for word in words], before)
+    _, said = process.communicate()
+    outcome.kills[what] += 1
+    lines = [line for line in said.splitlines() if ': note: ' not in line]
+    if process.returncode != 2 or len(lines) != 1:
+        outcome.fault('line', f'{what}: status {process.returncode}, {lines[-3:]}')
+    if found := files(out):
+        outcome.fault('part', f'{what}: {[*found]}')
+    else:
+        outcome.nothing += 1
+
+
+def section(
+    commands: dict[str, Outcome], nodes: dict[str, Outcome], disks: dict[str, Outcome], how: str
+) -> str:
+    """Return the section of docs/reliability.md."""
+    lines = [
+        f'`{how}`:', '',
+        '| killed | SIGTERM | SIGKILL | all files | none | some | temporary files (SIGTERM) | '
+        'processes left | no end | rerun fails |',
+        '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
+    ]
+    for name, one in {**commands, **nodes}.items():
+        cells = (one.kills['SIGTERM'], one.kills['SIGKILL'], one.whole, one.nothing,
+                 *(one.faults[kind] for kind in (
+                     'part', 'temporary file', 'orphan', 'no end', 'rerun')))
+        lines.append(f'| {name} | ' + ' | '.join(map(str, cells)) + ' |')
+    tried = sum(sum(one.kills.values()) for one in disks.values())
+    faults = sum((one.faults for one in disks.values()), Counter[str]())
+    lines += ['', f'Disks that are full before, after 30 % or after 90 % of what the command '
+              f'writes, a read-only file system, and a folder of another user: {tried} runs of '
+              f'{len(disks)} commands; not one line and status 2: {faults["line"]}, files left: '
+              f'{faults["part"]}.']
+    return '\n'.join(lines)
+
+
+def main() -> int:
+    """Kill everything, write the section; return 1 where anything is at fault."""
+    parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.kills')
+    parser.add_argument('--kills', type=int, default=20, help='of each command by each signal')
+    parser.add_argument('--only', default='', help='commands and nodes whose names contain this')
+    parser.add_argument('--seed', type=int, default=0)
+    asked = parser.parse_args()
+    commands = {name: words for name, words in COMMANDS.items() if asked.only in name}
+    nodes = {name: words for name, words in NODES.items() if asked.only in name}
+    ended: dict[str, Outcome] = {}
+    stopped: dict[str, Outcome] = {}
+    kept_out: dict[str, Outcome] = {}
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        given = prepare(Path(place))
+        with progress('killing', 2 * asked.kills * len(commands) + len(nodes)) as advance:
+            for name, template in commands.items():
+                words = [word.format(out='{out}', **given) for word in template]
+                folder = Path(place, name)
+                folder.mkdir()
+                rng = random.Random(f'{asked.seed} {name}')
+                ended[name] = killed(words, folder, asked.kills, rng, advance)
+                if os.geteuid() == 0:
+                    size = sum(files(folder / 'whole').values())
+                    kept_out[name] = refused(words, folder, size)
+            for name, template in nodes.items():
+                folder = Path(place, name)
+                folder.mkdir()
+                rng = random.Random(f'{asked.seed} {name}')
+                stopped[name] = killed_node(template, folder, asked.kills, rng)
+                advance()
+    text = section(ended, stopped, kept_out, f'python -m benchmark.kills --kills {asked.kills}')
+    print(text)
+    told = [f'{name}: {line}' for group in (ended, stopped, kept_out)
+            for name, one in group.items() for line in one.told[:5]]
+    print(*told, sep='\n')
+    if not asked.only:
+        between = f'{_BEGIN}\n{text}\n{_END}'
+        old = _DOC.read_text()
+        _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
+    return int(bool(told))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
