@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench compare mutation poses fuzz test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench compare kills mutation poses fuzz test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -80,6 +80,11 @@ poses: $(VENV)/ready
 # half an hour.
 fuzz: $(VENV)/ready
 	$(BIN)/python -m benchmark.fuzz
+
+# What is left of a command that is killed, or may not write, into docs/reliability.md; needs root
+# for its small disks; an hour.
+kills: $(VENV)/ready
+	$(BIN)/python -m benchmark.kills
 
 # How many of 300 small faults the tests find, into docs/mutation.md; takes an hour or two.
 mutation: $(VENV)/ready

@@ -20,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,6 +31,7 @@ _DOC = Path(__file__).parents[1] / 'docs' / 'reliability.md'
 _BEGIN, _END = '<!-- kills -->', '<!-- end of kills -->'
 _WRITING = 0.15  # of a run: the end, where most is written
 _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent
+_LONGEST = 240.0  # s for the kills of one command
 _NOBODY = 65534
 _BOARD = 'chessboard:6x5:25mm'
 _CALIBRATE = ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml')
@@ -154,10 +155,12 @@ def moments(count: int, rng: random.Random) -> Iterator[float]:
 
 
 def killed(
-    words: Sequence[str], folder: Path, count: int, rng: random.Random,
-    step: Callable[[], None] = lambda: None,
+    words: Sequence[str], folder: Path, count: int, rng: random.Random
 ) -> Outcome:
-    """Kill a command `count` times by each signal; words: with {out} for its folder."""
+    """Kill a command by each signal; words: with {out} for its folder.
+
+    count: how often, one that takes long less often.
+    """
     outcome = Outcome()
     out = folder / 'whole'
     begun = time.monotonic()
@@ -166,6 +169,7 @@ def killed(
     if status or temporary([*whole]):
         outcome.fault('whole run', f'status {status}, {[*whole]}, {said}')
         return outcome
+    count = max(2, min(count, round(_LONGEST / (4 * length))))
     for number, moment in enumerate(moments(2 * count, rng)):
         how = signal.SIGTERM if number // 2 % 2 else signal.SIGKILL
         out = folder / str(number)
@@ -175,7 +179,6 @@ def killed(
         if status or not _same(files(out), whole):
             outcome.fault('rerun', f'status {status}, {said[-300:]}')
         shutil.rmtree(out, ignore_errors=True)
-        step()
     return outcome
 
 
@@ -324,16 +327,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         given = prepare(Path(place))
-        with progress('killing', 2 * asked.kills * len(commands) + len(nodes)) as advance:
+        with progress('killing', len(commands) + len(nodes)) as advance:
             for name, template in commands.items():
                 words = [word.format(out='{out}', **given) for word in template]
                 folder = Path(place, name)
                 folder.mkdir()
                 rng = random.Random(f'{asked.seed} {name}')
-                ended[name] = killed(words, folder, asked.kills, rng, advance)
+                ended[name] = killed(words, folder, asked.kills, rng)
                 if os.geteuid() == 0:
                     size = sum(files(folder / 'whole').values())
                     kept_out[name] = refused(words, folder, size)
+                advance()
             for name, template in nodes.items():
                 folder = Path(place, name)
                 folder.mkdir()

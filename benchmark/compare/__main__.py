@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -23,7 +22,7 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS'):
 import numpy as np  # noqa: E402
 
 import fisheye_svp_ros as fsvp  # noqa: E402
-from benchmark.compare.peers import PEERS, NotHereError  # noqa: E402
+from benchmark.compare.peers import PEERS, Fitted, NotHereError  # noqa: E402
 from benchmark.compare.scoring import residuals, rms  # noqa: E402
 from benchmark.compare.sets import (  # noqa: E402
     BOARDS,
@@ -57,7 +56,7 @@ SETS: dict[str, Callable[[Path], Set]] = {
 
 
 class Row(NamedTuple):
-    """A model on one set: held-out rms, px, of so many points; seconds of the clock and of cores.
+    """A model on one set: held-out rms, px, of so many points; seconds of a core to fit.
 
     whole_px: the rms with gross errors.  NaN: not known, or the row above has it.
     """
@@ -66,27 +65,24 @@ class Row(NamedTuple):
     rms_px: float
     whole_px: float
     points: int
-    wall: float
-    cores: float
+    seconds: float
     note: str = ''
     ours: bool = False
 
 
 @dataclass
 class Clock:
-    """Seconds of the clock and of processors, children among them."""
+    """Seconds of processors, those of child processes among them."""
 
-    wall: float = np.nan
-    cores: float = np.nan
+    seconds: float = np.nan
 
 
 @contextmanager
 def timed() -> Iterator[Clock]:
     """Time a block."""
-    clock, wall, before = Clock(), time.perf_counter(), os.times()
+    clock, before = Clock(), os.times()
     yield clock
-    clock.wall = time.perf_counter() - wall
-    clock.cores = sum(os.times()[:4]) - sum(before[:4])
+    clock.seconds = sum(os.times()[:4]) - sum(before[:4])
 
 
 def compared(data: Set) -> list[Row]:
@@ -105,13 +101,13 @@ def compared(data: Set) -> list[Row]:
     count, names = int(fair.sum()), ', '.join(cause.effect for cause in found.causes)
     return [
         Row('ours, `calibrate`', found.base.heldout_rms_px, _nominal(lens, data.test, start),
-            count, fitting.wall, fitting.cores, ours=True),
-        Row('ours, `diagnose`: lens', found.lens_only.heldout_rms_px, np.nan, count, naming.wall,
-            naming.cores, names, True),
+            count, fitting.seconds, ours=True),
+        Row('ours, `diagnose`: lens', found.lens_only.heldout_rms_px, np.nan, count,
+            naming.seconds, names, True),
         Row('ours, `diagnose`: named', found.named.heldout_rms_px, _whole(found, data.test),
-            count, np.nan, np.nan, ours=True),
+            count, np.nan, ours=True),
         Row('ours, `diagnose`: extended', found.extended.heldout_rms_px,
-            _whole(found, data.test, found.local), count, np.nan, np.nan, ours=True),
+            _whole(found, data.test, found.local), count, np.nan, ours=True),
         *(_row(name, data, fair, start, lens.fx) for name in PEERS),
     ]
 
@@ -130,18 +126,24 @@ def _whole(found: Diagnosis, test: Observations, local: Local | None = None) -> 
 
 
 def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Row:
-    grid, test = grid_of(data), data.test
+    """Return the row of the best lens that a tool has found."""
     try:
         with timed() as clock:
-            fitted = PEERS[name](data, grid, focal)
+            found = PEERS[name](data, grid_of(data), focal)
     except NotHereError as reason:
-        return Row(name, np.nan, np.nan, 0, np.nan, np.nan, str(reason))
+        return Row(name, np.nan, np.nan, 0, np.nan, str(reason))
+    rows = [_scored(name, one, data.test, fair, start)._replace(seconds=clock.seconds)
+            for one in found]
+    return min(rows, key=lambda row: row.rms_px)
+
+
+def _scored(name: str, fitted: Fitted, test: Observations, fair: Mask, start: Localized) -> Row:
     near = _incidence(test, start) < fitted.before
     apart = residuals(fitted.project, test.frame[near], fitted.places(test)[near], test.uv[near],
                       start.pose)
     note = f'without {(~near).sum()} points beyond {fitted.before:.0f}°' * bool((~near).any())
     mine = fair[near]
-    return Row(name, rms(apart[mine]), rms(apart), int(mine.sum()), clock.wall, clock.cores,
+    return Row(name, rms(apart[mine]), rms(apart), int(mine.sum()), np.nan,
                '; '.join(filter(None, (fitted.note, note))))
 
 
@@ -167,11 +169,11 @@ def section(data: Set, rows: list[Row]) -> list[str]:
         f'{boards} board{"s" * (boards > 1)} to fit; {len(data.test)} in {held_out} frames held '
         'out.', '',
         '| model | held-out rms, px | beside the best of the others | points | with gross errors, '
-        'px | wall s | processor s | causes, notes |', '|---|---:|---:|---:|---:|---:|---:|---|',
+        'px | s | causes, notes |', '|---|---:|---:|---:|---:|---:|---|',
     ]
     for row in rows:
         figures = (f'{row.rms_px:.3f}', f'{row.rms_px / best:.2f}', f'{row.points or ""}',
-                   f'{row.whole_px:.3f}', f'{row.wall:.1f}', f'{row.cores:.1f}')
+                   f'{row.whole_px:.3f}', f'{row.seconds:.1f}')
         cells = ' | '.join('' if cell == 'nan' else cell for cell in figures)
         lines.append(f'| {row.model} | {cells} | {row.note} |')
     return [*lines, '']

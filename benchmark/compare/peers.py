@@ -22,7 +22,6 @@ from fisheye_svp_ros.scene.observations import Observations
 MRCAL = 'mrcal-calibrate-cameras'
 _PLANE = 89.0  # degrees: models of x / z end here
 _NARROWER = (180.0, 85.0, 80.0, 75.0, 70.0, 65.0, 60.0)  # degrees
-_POOR = 2.0  # px: nobody would take such a lens
 _FEWEST = 12  # points in a view for OpenCV to start from
 _MOST_LEFT_OUT = 10
 _TERMS = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
@@ -46,7 +45,7 @@ class Fitted:
     before: float = 180.0
 
 
-Fit = Callable[[Set, Grid, float], Fitted]
+Fit = Callable[[Set, Grid, float], list[Fitted]]
 
 
 def views(table: Observations, grid: Grid) -> Iterator[tuple[int, Index, Array]]:
@@ -58,22 +57,24 @@ def views(table: Observations, grid: Grid) -> Iterator[tuple[int, Index, Array]]
         yield int(number), steps, split.uv[mine]
 
 
-def opencv_fisheye(data: Set, grid: Grid, focal: float) -> Fitted:
-    """Fit `cv2.fisheye`: Kannala-Brandt with four coefficients, boards flat."""
+def opencv_fisheye(data: Set, grid: Grid, focal: float) -> list[Fitted]:
+    """Fit `cv2.fisheye`: Kannala-Brandt with four coefficients, boards flat.
+
+    To all points, and to those within narrower angles: where rays come near 90 degrees it fails,
+    or ends far off.
+    """
     of = cv2 if hasattr(cv2, 'CALIB_FIX_SKEW') else cv2.fisheye  # where OpenCV 5, and 4, has them
     flags = of.CALIB_USE_INTRINSIC_GUESS + of.CALIB_RECOMPUTE_EXTRINSIC + of.CALIB_FIX_SKEW
     start, reason = _pinhole(data, focal), ''
+    found: list[Fitted] = []
     for limit in _NARROWER:
         points, seen = _planes(data.train, grid, start, limit)
         try:
-            error, matrix, curve, _, _ = cv2.fisheye.calibrate(
+            _, matrix, curve, _, _ = cv2.fisheye.calibrate(
                 [one[None] for one in points], [one[None] for one in seen], data.size,
                 start.copy(), np.zeros(4), flags=flags, criteria=_TERMS)
         except cv2.error as failure:
             reason = failure.err
-            continue
-        if error > _POOR:
-            reason = f'{error:.1f} px at best'
             continue
 
         def project(xyz: Array, matrix: Array = matrix, curve: Array = curve) -> Array:
@@ -81,12 +82,14 @@ def opencv_fisheye(data: Set, grid: Grid, focal: float) -> Fitted:
             seen, _ = cv2.fisheye.projectPoints(xyz[:, None], zero, zero, matrix, curve)
             return np.asarray(seen[:, 0])
 
-        note = f'fitted to the points within {limit:.0f}°: to more it fails' * (limit < 180)
-        return Fitted(project, _flat, note, _PLANE)
-    raise NotHereError(f'finds no lens: {reason}')
+        note = f'fitted to the points within {limit:.0f}°' * (limit < 180)
+        found.append(Fitted(project, _flat, note, _PLANE))
+    if not found:
+        raise NotHereError(f'finds no lens: {reason}')
+    return found
 
 
-def opencv_rational(data: Set, grid: Grid, focal: float) -> Fitted:
+def opencv_rational(data: Set, grid: Grid, focal: float) -> list[Fitted]:
     """Fit `cv2.calibrateCamera` with the rational model, boards flat."""
     flags = cv2.CALIB_USE_INTRINSIC_GUESS + cv2.CALIB_RATIONAL_MODEL
     start = _pinhole(data, focal)
@@ -102,7 +105,7 @@ def opencv_rational(data: Set, grid: Grid, focal: float) -> Fitted:
         zero = np.zeros(3)
         return np.asarray(cv2.projectPoints(xyz, zero, zero, matrix, curve)[0][:, 0])
 
-    return Fitted(project, _flat, before=_PLANE)
+    return [Fitted(project, _flat, before=_PLANE)]
 
 
 def _pinhole(data: Set, focal: float) -> Array:
@@ -130,7 +133,7 @@ def _planes(
 def mrcal_model(model: str) -> Fit:
     """Return what fits a lens model of mrcal, with its board warp, by its own command."""
 
-    def fit(data: Set, grid: Grid, focal: float) -> Fitted:
+    def fit(data: Set, grid: Grid, focal: float) -> list[Fitted]:
         try:
             import mrcal
         except ImportError as reason:
@@ -143,9 +146,9 @@ def mrcal_model(model: str) -> Fit:
                                              calobject_warp=warp)
         lens = found.intrinsics()
         note = f'{left_out} board views left out: it finds no start for them' if left_out else ''
-        return Fitted(lambda xyz: np.asarray(mrcal.project(xyz, *lens)),
-                      lambda table: _bent(table, grid, board), note,
-                      _PLANE if 'OPENCV' in model else 180.0)
+        return [Fitted(lambda xyz: np.asarray(mrcal.project(xyz, *lens)),
+                       lambda table: _bent(table, grid, board), note,
+                       _PLANE if 'OPENCV' in model else 180.0)]
 
     return fit
 

@@ -77,7 +77,7 @@ def test_a_bent_board_lies_on_the_nominal_one(data):
 def test_opencv_finds_the_lens_and_poses_are_fitted(data):
     start = fsvp.localize(data.test, LENS)
     start = replace(start, pose=start.pose.retract(np.full(6, 0.01)))
-    fitted = opencv_fisheye(data, grid_of(data), 200.0)
+    fitted = opencv_fisheye(data, grid_of(data), 200.0)[0]
     apart = residuals(fitted.project, data.test.frame, fitted.places(data.test), data.test.uv,
                       start.pose)
     assert rms(apart) < 1e-3
