@@ -42,6 +42,11 @@ def local(count: int) -> Iterator[Workers]:
     except BrokenExecutor as cause:
         raise SweepError('a worker process died (out of memory?); what is done is kept, '
                          '--resume goes on with fewer --workers') from cause
+    except (KeyboardInterrupt, SystemExit):
+        # Nobody waits any longer for what they are at.
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
     finally:
         executor.shutdown(cancel_futures=True)
 
