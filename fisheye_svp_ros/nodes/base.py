@@ -48,7 +48,6 @@ _KINDS_OF_ERRORS = 100  # that are told from each other
 _SHORTEST = 12  # bytes: the head of CDR and a stamp
 _TWINS = 100  # messages of which one of two subscriptions may be ahead of the other
 
-S = TypeVar('S', bound=Settings)
 T = TypeVar('T')
 
 
@@ -118,7 +117,6 @@ class BaseNode(Node):  # type: ignore[misc]
         self._failures = 0
         self._candidate: tuple[Settings, Any] | None = None
         self._waited_for: list[Any] = []
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._diagnostics = self.announce(DiagnosticArray, '/diagnostics')
         self.every(1.0, self._publish_diagnostics)
 
@@ -127,8 +125,8 @@ class BaseNode(Node):  # type: ignore[misc]
 
         Raises FisheyeSvpError where they cannot be used.
         """
-        self._warn_of_unknown_parameters()
         self.take_up()
+        self.warn_of_unknown_parameters()
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self.guarded(self._adopt))
 
@@ -179,7 +177,8 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def every(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
         """Have a function called every `period` seconds, of real time where no clock is given."""
-        return self.create_timer(period, self.guarded(callback), clock=clock or self._steady)
+        clock = clock or Clock(clock_type=ClockType.STEADY_TIME)
+        return self.create_timer(period, self.guarded(callback), clock=clock)
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""
@@ -300,7 +299,8 @@ class BaseNode(Node):  # type: ignore[misc]
             self._candidate = None
             self.configure(prepared)
 
-    def _warn_of_unknown_parameters(self) -> None:
+    def warn_of_unknown_parameters(self) -> None:
+        """Warn of what was given and means nothing to this node and its topics."""
         known = ', '.join(row.name for row in rows(self.SETTINGS))
         for name in self.given:
             # Those topics come and go with what there is to tell.

@@ -15,7 +15,7 @@ from fisheye_svp_ros.errors import StandaloneError
 PACKAGE = 'fisheye_svp_ros'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-_FLAG = ('true', 'false')
+_FLAG = ('true', 'false', 'True', 'False')  # launch itself and Python's own words
 _WORDS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'), ('lens',))}
 _OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator')
 
@@ -26,8 +26,10 @@ COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
             '', ('', 'auto', *_FLAG)),
     'namespace': ('namespace of the nodes', '', ()),
     'params': ('parameter file for all nodes, after their own; empty: none', '', ()),
-    'publish_tf': ('tell tf2 the cameras, as estimated and as true, and the rig', 'false', _FLAG),
-    'use_sim_time': ('take the time from /clock', 'false', _FLAG),
+    'publish_tf': ('tell tf2 the cameras, as estimated and as true, and the rig; empty: as the '
+                   'parameter files have it', '', ('', *_FLAG)),
+    'use_sim_time': ('take the time from /clock; empty: as the parameter files have it', '',
+                     ('', *_FLAG)),
     'log_level': ('what the nodes log from', 'info', _LEVELS),
     'respawn': ('start a node again when it ends', 'false', _FLAG),
 }
@@ -60,8 +62,9 @@ def file_arguments(names: Iterable[str]) -> list[Any]:
 
 
 def value(context: Any, name: str) -> str:
-    """Return the value of an argument."""
-    return str(LaunchConfiguration(name).perform(context))
+    """Return the value of an argument; true and false as YAML has them."""
+    text = str(LaunchConfiguration(name).perform(context))
+    return text.lower() if text in _FLAG else text
 
 
 def node(
@@ -69,14 +72,15 @@ def node(
 ) -> Any:
     """Return a node with its files, then what was given; lens and svp where it has them."""
     words = _WORDS.get(name, ('lens', 'svp'))
+    flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
     files = [value(context, f'{name}_params'), value(context, 'params')]
     return Node(
         package=PACKAGE, executable=name, namespace=value(context, 'namespace'), output='screen',
         parameters=[
             *filter(None, files),
             {word: value(context, word) for word in words if value(context, word)},
-            {'publish_tf': value(context, 'publish_tf') == 'true'} if name in _OF_TF else {},
-            {'use_sim_time': value(context, 'use_sim_time') == 'true', **given},
+            {flag: value(context, flag) == 'true' for flag in flags if value(context, flag)},
+            dict(given),
         ],
         ros_arguments=['--log-level', value(context, 'log_level')],
         respawn=value(context, 'respawn') == 'true', respawn_delay=1.0,

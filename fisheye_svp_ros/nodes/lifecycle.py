@@ -39,6 +39,11 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
         if not self.settings.lifecycle:
             super().take_up()
 
+    def warn_of_unknown_parameters(self) -> None:
+        """Warn of what means nothing, once the node is active: some is said of its topics."""
+        if self._active:
+            super().warn_of_unknown_parameters()
+
     def has_listeners(self) -> bool:
         """Say whether there is anybody to work for; there is nobody for an inactive node."""
         return self._active and super().has_listeners()
@@ -56,6 +61,7 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
         """Listen."""
         self._active = True
         self._subscribed = [create() for create in self._creations]
+        self.warn_of_unknown_parameters()
         return super().on_activate(state)
 
     def on_deactivate(self, state: Any) -> Any:

@@ -358,7 +358,9 @@ def test_stamps_follow_a_clock_that_is_set_back(
     assert stamps == [50 * 10**9, 50 * 10**9 + 1, 50 * 10**9 + 2, 10**9, 10**9 + 5]
 
 
-def test_quality_of_service_is_overridden(graph: Callable[..., Graph]) -> None:
+def test_quality_of_service_is_overridden(
+    graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
+) -> None:
     g = graph('qos_overrides./image_points.publisher.reliability:=best_effort',
               'qos_overrides./image_points.publisher.depth:=7', 'rate:=100.0')
     points = g.hear(PointCloud2, 'image_points')
@@ -370,6 +372,7 @@ def test_quality_of_service_is_overridden(graph: Callable[..., Graph]) -> None:
     g.idle(0.5)
     assert not points, 'who asks for reliable messages does not get these'
     assert not set_parameter(node, name, 'reliable').successful
+    assert 'means nothing' not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize('given', [

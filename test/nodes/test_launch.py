@@ -156,12 +156,13 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
     from rclpy.time import Time
 
     params = tmp_path / 'mine.yaml'
-    params.write_text('/**: {ros__parameters: {radius: 0.5, world_frame: map, svp: false}}')
+    params.write_text('/**: {ros__parameters: {radius: 0.5, world_frame: map, svp: false, '
+                      'publish_tf: true}}')
     buffer = tf2.Buffer()
     tf2.TransformListener(buffer, graph.probe)
     scenarios = graph.hear(DiagnosticArray, '/robot/scenario')
-    mono = launch('mono.launch.py', 'namespace:=robot', f'params:={params}', 'publish_tf:=true',
-                  'log_level:=debug', 'respawn:=true')
+    mono = launch('mono.launch.py', 'namespace:=robot', f'params:={params}',
+                  'log_level:=debug', 'respawn:=True')
     pid = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
     for child in ('camera_optical_frame', 'camera_optical_frame_true'):
         graph.until(lambda child=child: buffer.can_transform('map', child, Time()))

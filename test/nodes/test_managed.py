@@ -81,3 +81,20 @@ def test_a_lens_that_cannot_be_loaded_leaves_it_unconfigured(
     assert set_parameter(node, 'lens', 'fish214').successful
     assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
     graph.close()
+
+
+@genuine
+def test_what_is_said_of_topics_is_understood_once_they_are_there(
+    ros_domain: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    graph = Graph('-p', 'lifecycle:=true', '-p', 'lens:=fish180', '-p', 'nosuch:=1',
+                  '-p', 'qos_overrides./image_points.subscription.depth:=7')
+    try:
+        node = graph.start(Localizer)
+        node.trigger_configure()
+        node.trigger_activate()
+        assert node.get_parameter('qos_overrides./image_points.subscription.depth').value == 7
+    finally:
+        graph.close()
+    said = capfd.readouterr().err
+    assert said.count('means nothing') == 1 and "parameter 'nosuch' means nothing" in said
