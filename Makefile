@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images detectors bench compare kills mutation poses fuzz test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors bench compare kills mutation poses fuzz test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -44,6 +44,10 @@ detectors: $(VENV)/ready
 # goes on where it was interrupted.
 blind-independent: $(VENV)/ready
 	$(BIN)/python -m benchmark.independent --trials 69 -o $(OUT)/blind_independent
+
+# The live guide tried on rendered images by somebody who holds the board, into docs/next/.
+guided: $(VENV)/ready
+	$(BIN)/python -m benchmark.guided
 
 # Speed beside what a user would pick instead, into docs/benchmarks.md; leave the machine alone.
 bench: .venv-bench/ready

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -270,12 +271,19 @@ def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
     return scale
 
 
-def fit(data: Data, state: State, free: Sequence[str]) -> State:
+class Prior(NamedTuple):
+    """What is known before of free intrinsics and effect values: mean (K,), stderr (K,)."""
+
+    mean: Array
+    stderr: Array
+
+
+def fit(data: Data, state: State, free: Sequence[str], prior: Prior | None = None) -> State:
     """Refit poses, rig, free intrinsics and effect values together by least squares.
 
     The frames are the blocks of one arrow.
     """
-    problem = _Fit(data, state, free)
+    problem = _Fit(data, state, free, prior=prior)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
@@ -297,10 +305,11 @@ class _Fit:
     """One arrow system: frames are the blocks; rig, intrinsics and effects are shared."""
 
     def __init__(
-        self, data: Data, template: State, free: Sequence[str], poses_only: bool = False
+        self, data: Data, template: State, free: Sequence[str], poses_only: bool = False,
+        prior: Prior | None = None,
     ) -> None:
         self._data, self._template, self._free = data, template, tuple(free)
-        self._poses_only = poses_only
+        self._poses_only, self._prior = poses_only, prior
 
     def pack(self, state: State) -> Arrays:
         lens = np.concatenate([
@@ -334,7 +343,13 @@ class _Fit:
         linear = Linearised(self._data, self.unpack(state), self._free)
         # A column of zeros leaves its parameter where it is.
         shared = linear.shared_columns * (0.0 if self._poses_only else 1.0)
-        return _equations(linear.residual, linear.frame_columns, shared)
+        cost, normal = _equations(linear.residual, linear.frame_columns, shared)
+        if self._prior is not None:
+            off = (state[-1][0] - self._prior.mean) / self._prior.stderr
+            cost = cost + off @ off
+            normal[2][0, -len(off):, -len(off):] += np.diag(self._prior.stderr**-2)
+            normal[4][0, -len(off):] += off / self._prior.stderr
+        return cost, normal
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         return arrow_step(normal, damping)

@@ -42,16 +42,23 @@ _FLAT = 0.02  # thickness of a board over its length
 # What a person can set: steps of angles, rad, and distances between near and far
 _STEP, _QUARTER, _TILTS = np.radians(5.0), np.radians(45.0), np.radians([0, 15, 30, 45, 60])
 _DISTANCES = 9
+_NEAR = 0.25  # of the distance
 # Prior standard deviations of intrinsics that nothing is known of, over the focal length
 _WIDE = {'fx': 0.1, 'fy': 0.1, 'cx': 0.1, 'cy': 0.1}
 
 
 class Room(NamedTuple):
-    """Where the board can be: nearest and furthest, m, at which it is sharp; largest tilt, rad."""
+    """Where the board can be: nearest and furthest, m, at which it is sharp; largest tilt, rad.
+
+    field: furthest from the axis, rad; taken (P, 3): places of its middle before the camera, m,
+    where it cannot be, nor near them.
+    """
 
     near: float
     far: float
     tilt: float = float(np.radians(60.0))
+    field: float = float(np.pi)
+    taken: Array = np.zeros((0, 3))
 
 
 class Shots(NamedTuple):
@@ -86,6 +93,15 @@ class Board:
     points: Array
     board: Index
     facing: Array
+
+    @property
+    def rim(self) -> Array:
+        """The points (N, 3), m, moved outwards by their spacing: squares end beyond corners."""
+        middle = self.points.mean(axis=0)
+        local = (self.points - middle) @ self.facing.T
+        spacing = np.median(np.asarray(KDTree(self.points).query(self.points, 2)[0])[:, 1])
+        half = np.abs(local[:, :2]).max(axis=0)
+        return np.asarray(middle + local * [*(1 + spacing / half), 1.0] @ self.facing)
 
     @classmethod
     def seen_in(cls, observations: Observations, pose: Pose) -> Board:
@@ -272,9 +288,12 @@ def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Gener
         tilt[:, None] * np.stack([np.cos(axis), np.sin(axis), zero], axis=-1))
     rolled = rotation_from_vector(roll[:, None] * np.array([0.0, 0.0, 1.0]))
     turn = towards @ tilted @ rolled @ board.facing
-    place = distance[:, None] * sight - turn @ board.points.mean(axis=0)
+    middle = distance[:, None] * sight
+    place = middle - turn @ board.points.mean(axis=0)
     shots = Shots(Pose(turn, place).inverse(), distance, angle, azimuth, tilt, axis, roll)
-    possible = np.flatnonzero(_detectable(state, board, shots))[:CANDIDATES]
+    away = np.linalg.norm(middle[:, None] - room.taken, axis=-1) > _NEAR * distance[:, None]
+    allowed = away.all(axis=1) & _detectable(state, board, shots, room.field)
+    possible = np.flatnonzero(allowed)[:CANDIDATES]
     if not possible.size:
         raise GeometryError(
             f'lens {lens.name!r} does not see the whole board from {room.near:g} to '
@@ -283,21 +302,24 @@ def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Gener
     return shots.take(possible)
 
 
-def _detectable(state: State, board: Board, shots: Shots) -> Mask:
-    """Whether boards are in the image as a whole, their points far enough apart (P,)."""
-    views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)
-    image = ForwardModel(state.lens, state.terms).predict(shots.camera, views)
+def _detectable(state: State, board: Board, shots: Shots, field: float) -> Mask:
+    """Whether boards are in image and field as a whole, their points far enough apart (P,)."""
+    count, model = len(shots.distance), ForwardModel(state.lens, state.terms)
+    views = blank_views(board.landmark, board.points, count, board=board.board)
+    rim = blank_views(board.landmark, board.rim, count, board=board.board)
+    image, edge = (model.predict(shots.camera, part) for part in (views, rim))
     size = np.array([state.lens.width, state.lens.height])
-    local = shots.camera.into_body(views.points)
+    local, outer = (shots.camera.into_body(part.points) for part in (views, rim))
     normal = np.swapaxes(shots.camera.rotation, -1, -2) @ board.facing[2]
     slant = (local @ normal[..., None])[..., 0] / np.linalg.norm(local, axis=-1)
+    seen = outer[..., 2] > np.cos(field) * np.linalg.norm(outer, axis=-1)
     with np.errstate(invalid='ignore'):
-        inside = ((image.uv > _EDGE) & (image.uv < size - _EDGE)).all(axis=(1, 2))
+        inside = ((edge.uv > _EDGE) & (edge.uv < size - _EDGE)).all(axis=-1)
         many = min(_NEIGHBOURS, len(board.points) - 1)
         near = np.asarray(KDTree(board.points).query(board.points, many + 1)[1])[:, 1:]
         apart = np.linalg.norm(image.uv[:, near] - image.uv[:, :, None], axis=-1)
         found = (apart > _SPACING).all(axis=(1, 2)) & (slant > _SLANT).all(axis=1)
-        return np.asarray(image.valid.all(axis=1) & inside & found)
+        return np.asarray(found & (image.valid & edge.valid & seen & inside).all(axis=1))
 
 
 def _unit(name: str) -> str:

@@ -33,7 +33,7 @@ class Row(NamedTuple):
     def constraint(self) -> str:
         """Say what values are allowed beyond the type; empty for any."""
         if self.choices:
-            return 'one of ' + ', '.join(self.choices)
+            return 'one of ' + ', '.join(filter(None, self.choices))
         return '' if self.low is None else f'{self.low:g} to {self.high:g}'
 
     @property

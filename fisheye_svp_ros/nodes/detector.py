@@ -17,11 +17,13 @@ from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late
-from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.diagnosis.guide import NUMBERS
+from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, Unread, run
+from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
@@ -45,6 +47,30 @@ class DetectorSettings(Settings):
         False, 'Take AprilTags that others found, on `detections`, in place of images; these must '
         'have been raw, not rectified; apriltag_msgs must be installed', fixed=True
     )
+    guide: str = parameter(
+        '', 'Number of the lens that the live guide is to settle (e0: the viewpoint shift); '
+        'empty: no guide', choices=('', *NUMBERS), fixed=True
+    )
+    goal: float = parameter(
+        0.0002, 'Standard error of that number at which it is settled, m of e0, px of fx, fy, cx '
+        'and cy', span=(1e-9, 1e3), fixed=True
+    )
+    lens: str = parameter(
+        '', 'Lens that the guide begins with: a file, or a name in config/lenses; `camera_info`: '
+        'what that topic says; empty: one of this `field_of_view`', fixed=True, file=True
+    )
+    field_of_view: float = parameter(
+        3.1, 'Field of view over the width of the image, as the data sheet has it', 'rad',
+        (0.3, 6.0), fixed=True
+    )
+    near: float = parameter(0.15, 'Nearest distance at which the board is sharp', 'm',
+                            (1e-3, 1e3), fixed=True)
+    far: float = parameter(0.8, 'Furthest distance at which the board can be held', 'm',
+                           (1e-3, 1e3), fixed=True)
+    guide_output: str = parameter(
+        'guided', 'Folder for the photographs that the guide takes and observations.csv; it must '
+        'be empty', fixed=True
+    )
 
 
 class Detector(BaseNode):
@@ -66,7 +92,8 @@ class Detector(BaseNode):
         self._size: tuple[int, ...] | None = None
         self._waiting: tuple[int, Unread] | None = None
         self._searches: BoundedCalls | None = None
-        self._searched: tuple[int, str] | None = None
+        self._searched: tuple[int, str, Pixels] | None = None
+        self._guiding: Guiding | None = None
         self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
         if self.settings.detections:
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
@@ -75,6 +102,8 @@ class Detector(BaseNode):
         for kind, topic in ((Image, 'image'), (CompressedImage, 'image/compressed')):
             self.collect(kind, topic, partial(_read, kind), self._take, SENSOR_INPUT)
         self.start()
+        if self.settings.guide:
+            self._guiding = Guiding(self, self.settings, self._pattern)
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
@@ -84,6 +113,8 @@ class Detector(BaseNode):
         """End the search, too."""
         if self._searches is not None:
             self._searches.stop()
+        if self._guiding is not None:
+            self._guiding.stop()
         super().destroy_node()
 
     def prepare(self, settings: DetectorSettings) -> Pattern:
@@ -94,6 +125,12 @@ class Detector(BaseNode):
         if settings.detections and kind != 'aprilgrid':
             raise ParameterError(f'board is {settings.board!r}; with detections it must be an '
                                  'aprilgrid')
+        if settings.guide and settings.detections:
+            raise ParameterError('guide needs images; it cannot be used with detections')
+        if settings.guide and settings.board != self.settings.board:
+            raise ParameterError('board cannot be changed while the guide is at work')
+        if settings.near >= settings.far:
+            raise ParameterError('near is not below far; the board would have no room')
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:
@@ -104,11 +141,16 @@ class Detector(BaseNode):
 
     def report(self) -> tuple[dict[str, object], str]:
         """Return how many images were overtaken, and how many showed no board."""
-        return dict(self._counts), ''
+        if self._guiding is None:
+            return dict(self._counts), ''
+        guide, trouble = self._guiding.report()
+        return {**self._counts, **guide}, trouble
 
     def _take(self, stamp: int, image: Unread) -> None:
         """Keep the newest image, if anybody wants to know what is in it."""
-        if not self._points.get_subscription_count() or not self.has_listeners():
+        looked_at = self._guiding is not None and self._guiding.heard()
+        heard = looked_at or self._points.get_subscription_count()
+        if not heard or not self.has_listeners():
             return
         if self._waiting is not None:
             self._counts['images overtaken'] += 1
@@ -124,10 +166,12 @@ class Detector(BaseNode):
     def _work(self) -> None:
         """Publish what a search found; start the next one."""
         assert self._searches is not None
+        if self._guiding is not None:
+            self._guiding.work()
         found = self._searches.result()
         if found is not None and self._searched is not None:
-            self._finish(found, *self._searched)
-            self._searched = None
+            searched, self._searched = self._searched, None
+            self._finish(found, *searched)
         if self._waiting is None or self._searches.busy:
             return
         (stamp, image), self._waiting = self._waiting, None
@@ -137,21 +181,26 @@ class Detector(BaseNode):
         except ObservationError as error:
             self.drop(image.topic, error)
             return
-        self._searched = stamp, frame
+        self._searched = stamp, frame, pixels
         task = pixels, self._pattern, self._detector, self._near
         self._searches.start(task, self.settings.longest_search)
 
-    def _finish(self, found: Any, stamp: int, frame: str) -> None:
+    def _finish(self, found: Any, stamp: int, frame: str, pixels: Pixels) -> None:
         if isinstance(found, Points):
             self._near = found.uv
             self._points.publish(
                 messages.image_points_message(found.ids, found.uv, stamp, frame))
-            return
-        self._near = None
-        self._counts['images without board'] += 1
-        self._counts['searches broken off'] += isinstance(found, Late)
-        if isinstance(found, Exception):
-            self.unforeseen(found)
+        else:
+            self._near = None
+            self._counts['images without board'] += 1
+            self._counts['searches broken off'] += isinstance(found, Late)
+            if isinstance(found, Exception):
+                self.unforeseen(found)
+        if self._guiding is not None:
+            try:
+                self._guiding.look(stamp, frame, pixels, found)
+            except FisheyeSvpError as error:
+                self.drop('image', error)
 
     def _read_tags(self, message: Any, topic: str) -> tuple[str, Index, Array]:
         """Return the points of tags; libapriltag puts pixel centres at a half."""

@@ -90,10 +90,11 @@ def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> 
 
 
 def image_message(pixels: NDArray[np.uint8], stamp: int, frame: str) -> Any:
-    """Return sensor_msgs/Image, mono8, of a grey image (H, W)."""
-    height, width = pixels.shape
-    return Image(header=header(stamp, frame), height=height, width=width, encoding='mono8',
-                 is_bigendian=0, step=width, data=array('B', pixels.tobytes()))
+    """Return sensor_msgs/Image, mono8 of a grey image (H, W) or bgr8 of (H, W, 3)."""
+    height, width, *coloured = pixels.shape
+    return Image(header=header(stamp, frame), height=height, width=width,
+                 encoding='bgr8' if coloured else 'mono8', is_bigendian=0,
+                 step=pixels.strides[0], data=array('B', pixels.tobytes()))
 
 
 def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:

@@ -32,7 +32,9 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     path.write_text(OBSERVATIONS)
     solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
     one = Graph('-p', f'observations:={path}', '-p', 'style:=parallel',
-                '-p', 'lock_step:=localizer/result', '-p', 'publish_tf:=true', *solvers)
+                '-p', 'lock_step:=localizer/result', '-p', 'publish_tf:=true', *solvers,
+                '-p', 'guide:=e0', '-p', f'guide_output:={tmp_path / "guided"}',
+                '-p', 'detector:lens:=camera_info')
     yield one
     one.close()
 

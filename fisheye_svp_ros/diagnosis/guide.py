@@ -1,0 +1,320 @@
+"""A live guide: which view of the board is wanted now, whether it is there, when enough is known.
+
+`Guide` follows the board from image to image, which takes no time; `consider` solves what the
+photographs so far tell, and which one is wanted next, which takes a second: from the data sheet of
+the lens (`diagnosis.plan`), then with the lens as fitted so far, then with a diagnosis.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.inputs import posable
+from fisheye_svp_ros.diagnosis.model import (
+    Linearised,
+    Prior,
+    fit,
+    intrinsic_names,
+    prepare,
+    start,
+)
+from fisheye_svp_ros.diagnosis.next_photographs import Room
+from fisheye_svp_ros.diagnosis.next_question import Next, next_photographs
+from fisheye_svp_ros.diagnosis.plan import plan
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.simulate.simulation import blank_views
+
+MOST = 40  # photographs; with so many what is still open stays open
+ENOUGH = 0.8  # score of a view that is taken
+_AHEAD = 4  # views chosen together
+_JUDGED = 6  # photographs before the first diagnosis
+_STILL, _STANDS = 0.003, 0.5  # of the image's width, and s
+_KEPT = 200  # images
+_PATIENCE = 20.0  # s; then a view is one that cannot be had
+_LIVE = 0.1  # px, noise where the detector does not say
+_HOPE = 0.5  # that some more photographs tell two causes apart, below which none will
+_EFFECT = ViewpointShiftEffect(1)
+
+NUMBERS = (_EFFECT.parameters[0].name, *INTRINSICS, 'k1', 'k2', 'k3', 'k4')
+
+
+class Seen(NamedTuple):
+    """A board in an image: time, s; points (M,) of the pattern, uv (M, 2) and sigma (M,), px."""
+
+    t: float
+    ids: Index
+    uv: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a guide is for, and what it has.
+
+    lens: as the data sheet has it, of Kannala-Brandt's form; points (N, 3), m, of a flat board;
+    number: whose standard error is to come down to `goal`, in its unit, one of NUMBERS; latest:
+    lens and e0 as fitted last.
+    """
+
+    lens: Lens
+    points: Array
+    room: Room
+    number: str
+    goal: float
+    taken: tuple[Seen, ...] = ()
+    latest: tuple[Lens, float] | None = None
+
+
+class Stand(NamedTuple):
+    """Where matters stand.
+
+    wanted: views, best first; outline: of each, its points (N, 2), px; value, stderr: of the
+    number, None as long as it is not measured; named: causes, by a diagnosis; alike: what the
+    cause of the number may be as well; settled: no doubt is left that photographs could take
+    away; latest: lens and e0, for the next session.
+    """
+
+    wanted: Next
+    outline: tuple[Array, ...]
+    value: float | None
+    stderr: float | None
+    named: tuple[str, ...]
+    alike: tuple[str, ...]
+    settled: bool
+    latest: tuple[Lens, float] | None
+
+
+def consider(session: Session) -> Stand | Exception:
+    """Return what the photographs tell and which is wanted next; errors are returned, too."""
+    try:
+        return _considered(session)
+    except Exception as error:
+        return error
+
+
+def _considered(session: Session) -> Stand:
+    number, room = session.number, session.room
+    if not session.taken:
+        wanted = plan(session.lens, session.points, room, _AHEAD, number, _LIVE).wanted
+        return _stand(session, ForwardModel(session.lens), wanted)
+    table = observations_of(session.taken, session.points)
+    linear = _refitted(session, table)
+    lens, ((_, shift), *_) = linear.state.lens, linear.state.terms
+    session = replace(session, latest=(lens, float(shift[0])))
+    if len(session.taken) >= _JUDGED:
+        with suppress(FisheyeSvpError):  # the next photograph may mend it
+            return _judged(session, posable(table, lens)[0], lens)
+    wanted = next_photographs(linear, (), _noise(linear), _AHEAD, number, room)
+    return _stand(session, ForwardModel(lens, linear.state.terms), wanted,
+                  _value(linear, number), wanted.answers[0])
+
+
+def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
+    """Return where matters stand by a diagnosis.
+
+    Settled once the number is known and what it belongs to is told from all else, or cannot be.
+    """
+    number, room = session.number, session.room
+    found = diagnose(table, lens, free_intrinsics=True)
+    alike: tuple[str, ...] = ()
+    for cause in found.causes if number == _EFFECT.parameters[0].name else ():
+        names = cause.effect, *cause.indistinguishable_from
+        if len(names) == 1 or _EFFECT.name not in names:
+            continue
+        wanted = next_photographs(found.after, (cause,), found.noise_px, _AHEAD, room=room)
+        if wanted.answers[-1] > _HOPE:
+            return _stand(session, _model(found), wanted, named=(cause.effect,), alike=names[1:])
+        # No photograph will tell: what is it, if it is what is asked for?
+        alike = tuple(name for name in names if name != _EFFECT.name)
+        found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(left_out=alike))
+        break
+    wanted = next_photographs(found.after, found.causes, found.noise_px, _AHEAD, number, room)
+    value, stderr = _value(found.after, number), wanted.answers[0]
+    for cause in found.causes:
+        if number in cause.parameters:
+            value = cause.parameters[number]['value']
+            stderr = max(stderr, cause.parameters[number]['stderr'])
+    return _stand(session, _model(found), wanted, value, stderr,
+                  tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
+
+
+def _model(found: Diagnosis) -> ForwardModel:
+    state = found.after.state
+    return ForwardModel(state.lens, state.terms)
+
+
+def _stand(
+    session: Session, model: ForwardModel, wanted: Next, value: float | None = None,
+    stderr: float | None = None, named: tuple[str, ...] = (), alike: tuple[str, ...] = (),
+    settled: bool = False,
+) -> Stand:
+    board, count = wanted.board, len(wanted.shots.distance)
+    views = blank_views(board.landmark, board.points, count, board=board.board)
+    outline = np.full((count, len(session.points), 2), np.nan)
+    outline[:, board.landmark] = model.predict(wanted.shots.camera, views).uv
+    return Stand(wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
+
+
+def _value(linear: Linearised, number: str) -> float:
+    """Return a number of lens or effects; 0 where there is none of it."""
+    values = dict(linear.state.parameters)
+    for effect, own in linear.state.terms:
+        values |= {p.name: float(v) for p, v in zip(effect.parameters, own, strict=True)}
+    return values.get(number, 0.0)
+
+
+def _refitted(session: Session, table: Observations) -> Linearised:
+    """Return lens and e0 as far as the photographs tell them; the data sheet says the rest."""
+    lens, shift = session.latest or (session.lens, 0.0)
+    data, free = prepare(table), intrinsic_names(lens)
+    state = start(data, lens)
+    state = replace(state, terms=((_EFFECT, np.array([shift])),))
+    state = fit(data, state, free, _prior(session.lens, free))
+    return Linearised(data, state, free)
+
+
+def _prior(lens: Lens, free: Sequence[str]) -> Prior:
+    """Return what a data sheet tells: a lens to some per cent, a shift of millimetres."""
+    edge = lens.max_incidence
+    loose = {'fx': 0.1 * lens.fx, 'fy': 0.1 * lens.fy, 'cx': 0.05 * lens.fx, 'cy': 0.05 * lens.fy}
+    loose |= {f'k{i}': 0.2 / edge**(2 * i) for i in range(1, 5)}
+    return Prior(np.array([*(lens.parameters[name] for name in free), 0.0]),
+                 np.array([*(loose[name] for name in free), _EFFECT.parameters[0].large]))
+
+
+def _noise(linear: Linearised) -> float:
+    """Return the noise of u and of v, px, from what the fit leaves, no less than is stated."""
+    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+    px = linear.residual[weight > 0] / weight[weight > 0]
+    unknown = linear.frame_columns.shape[-1] * len(linear.residual)
+    stated = 1 / float(weight.max())
+    return max(stated, float(np.sqrt(px @ px / max(px.size - unknown, 1))))
+
+
+def observations_of(taken: Sequence[Seen], points: Array) -> Observations:
+    """Return photographs of a board with points (N, 3), m, as a table; frames count from 0."""
+    count = [len(seen.ids) for seen in taken]
+    ids = np.concatenate([seen.ids for seen in taken])
+    sigma = np.concatenate([seen.sigma for seen in taken])
+    return make_observations(
+        np.repeat(np.arange(len(taken)), count), ids, np.concatenate([s.uv for s in taken]),
+        points[ids], t=np.repeat([seen.t for seen in taken], count),
+        sigma=np.where(np.isfinite(sigma), sigma, _LIVE), source='guide',
+    )
+
+
+@dataclass
+class Guide:
+    """Follows a board: how near the wanted view is, and whether it stands still there.
+
+    orders (T, N): the orders of points that the board's print does not tell apart.
+    score: from 0 to 1, of the last image; thinking: a photograph is taken and not considered yet.
+    """
+
+    session: Session
+    orders: Index
+    stand: Stand | None = None
+    score: float = 0.0
+    thinking: bool = True
+    place: int = 0
+    _since: float | None = None
+    _last: deque[Seen] = field(default_factory=lambda: deque(maxlen=_KEPT))
+
+    @property
+    def outline(self) -> Array | None:
+        """The points of the wanted view (N, 2), px; None while there is none."""
+        if self.stand is None or self.thinking or self.done:
+            return None
+        return self.stand.outline[self.place]
+
+    @property
+    def done(self) -> bool:
+        """Whether no further photograph is wanted."""
+        return self.stand is not None and (self.stand.settled or len(self.session.taken) >= MOST)
+
+    def adopt(self, stand: Stand) -> None:
+        """Go on with what has been considered."""
+        self.session = replace(self.session, latest=stand.latest)
+        self.stand, self.thinking, self.place, self._since = stand, False, 0, None
+        self.score = 0.0
+
+    def look(self, t: float, seen: Seen | None) -> bool:
+        """Take note of an image at a time, s; return whether it is taken as a photograph."""
+        outline = self.outline
+        if outline is None:
+            self._last.clear()
+            return False
+        if self._since is None or t < self._since:
+            self._since = t
+            self._last.clear()
+        self.score = 0.0 if seen is None else self._likeness(seen, outline)
+        if seen is not None and self._stands(seen) and self.score >= ENOUGH:
+            self.session = replace(self.session, taken=(*self.session.taken, seen))
+            self.thinking = True
+            return True
+        if t - self._since > _PATIENCE:
+            self._give_up()
+        return False
+
+    def _likeness(self, seen: Seen, outline: Array) -> float:
+        """Return 1 / (1 + d / r): d apart, r the size of the wanted view, root mean squares."""
+        size = np.sqrt(((outline - outline.mean(axis=0)) ** 2).sum(axis=1).mean())
+        apart = [np.sqrt(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1).mean())
+                 for order in self.orders]
+        return float(1 / (1 + min(apart) / size))
+
+    def _stands(self, seen: Seen) -> bool:
+        """Whether the board has stood still long enough."""
+        last = self._last
+        last.append(seen)
+        while seen.t - last[0].t > _STANDS and len(last) > 2 and seen.t - last[1].t >= _STANDS:
+            last.popleft()
+        if seen.t - last[0].t < _STANDS:
+            return False
+        most = _STILL * self.session.lens.width
+        for one in last:
+            _, mine, theirs = np.intersect1d(seen.ids, one.ids, return_indices=True)
+            moved = np.abs(seen.uv[mine] - one.uv[theirs])
+            if not moved.size or moved.max() > most:
+                return False
+        return True
+
+    def fail(self) -> None:
+        """Go on without the last photograph, which cannot be used with the others, and think."""
+        room = self.session.room._replace(taken=np.zeros((0, 3)))
+        self.session = replace(self.session, taken=self.session.taken[:-1], room=room, latest=None)
+        self.thinking = True
+
+    def _give_up(self) -> None:
+        """Ask for another view; where the board would have been it cannot be."""
+        assert self.stand is not None
+        wanted, session, self._since = self.stand.wanted, self.session, None
+        middle = wanted.shots.camera.take(self.place).into_body(wanted.board.points).mean(axis=0)
+        room = session.room._replace(taken=np.vstack([session.room.taken, middle]))
+        self.session, self.place = replace(session, room=room), self.place + 1
+        self.thinking = self.place == len(self.stand.outline)
+
+
+def start_session(
+    lens: Lens, points: Array, room: tuple[float, float], number: str, goal: float
+) -> Session:
+    """Return a session without photographs.
+
+    lens: of Kannala-Brandt's form; views are wanted within its field alone; room: nearest and
+    furthest distance of the board, m.
+    """
+    open_lens = replace(lens, max_incidence=field_of_view(lens))
+    return Session(open_lens, points, Room(*room, field=lens.max_incidence), number, goal)
