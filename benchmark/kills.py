@@ -316,11 +316,12 @@ def main() -> int:
     """Kill everything, write the section; return 1 where anything is at fault."""
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.kills')
     parser.add_argument('--kills', type=int, default=20, help='of each command by each signal')
-    parser.add_argument('--only', default='', help='commands and nodes whose names contain this')
+    parser.add_argument('--without', nargs='*', default=[], choices=[*COMMANDS, *NODES])
     parser.add_argument('--seed', type=int, default=0)
     asked = parser.parse_args()
-    commands = {name: words for name, words in COMMANDS.items() if asked.only in name}
-    nodes = {name: words for name, words in NODES.items() if asked.only in name}
+    commands = {name: words for name, words in COMMANDS.items()
+                if name not in asked.without}
+    nodes = {name: words for name, words in NODES.items() if name not in asked.without}
     ended: dict[str, Outcome] = {}
     stopped: dict[str, Outcome] = {}
     kept_out: dict[str, Outcome] = {}
@@ -344,15 +345,15 @@ def main() -> int:
                 rng = random.Random(f'{asked.seed} {name}')
                 stopped[name] = killed_node(template, folder, asked.kills, rng)
                 advance()
-    text = section(ended, stopped, kept_out, f'python -m benchmark.kills --kills {asked.kills}')
+    said = ' '.join(['python -m benchmark.kills', *sys.argv[1:]])
+    text = section(ended, stopped, kept_out, said)
     print(text)
     told = [f'{name}: {line}' for group in (ended, stopped, kept_out)
             for name, one in group.items() for line in one.told[:5]]
     print(*told, sep='\n')
-    if not asked.only:
-        between = f'{_BEGIN}\n{text}\n{_END}'
-        old = _DOC.read_text()
-        _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
+    between = f'{_BEGIN}\n{text}\n{_END}'
+    old = _DOC.read_text()
+    _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
     return int(bool(told))
 
 
