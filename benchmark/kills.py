@@ -4,7 +4,7 @@ Every command that writes, and nodes, get SIGTERM or SIGKILL at random moments o
 of them while they write.  Then: are the files of the set all there, as a whole run writes them, or
 none?  Is a temporary file left, a process?  Does the same command go through afterwards?  Disks
 that are full at some point of a run, folders that are read-only or another user's, need root.
-Writes docs/reliability.md.
+Ctrl-C ends it early and reports what was tried.  Writes docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -328,22 +328,20 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as place:
         Path(place).chmod(0o755)
         given = prepare(Path(place))
-        with progress('killing', len(commands) + len(nodes)) as advance:
+        total = len(commands) + len(nodes)
+        with suppress(KeyboardInterrupt), progress('killing', total) as advance:
+            for name, template in nodes.items():
+                stopped[name] = killed_node(template, _made(place, name), asked.kills,
+                                            random.Random(f'{asked.seed} {name}'))
+                advance()
             for name, template in commands.items():
                 words = [word.format(out='{out}', **given) for word in template]
-                folder = Path(place, name)
-                folder.mkdir()
-                rng = random.Random(f'{asked.seed} {name}')
-                ended[name] = killed(words, folder, asked.kills, rng)
+                folder = _made(place, name)
+                ended[name] = killed(words, folder, asked.kills,
+                                     random.Random(f'{asked.seed} {name}'))
                 if os.geteuid() == 0:
                     size = sum(files(folder / 'whole').values())
                     kept_out[name] = refused(words, folder, size)
-                advance()
-            for name, template in nodes.items():
-                folder = Path(place, name)
-                folder.mkdir()
-                rng = random.Random(f'{asked.seed} {name}')
-                stopped[name] = killed_node(template, folder, asked.kills, rng)
                 advance()
     said = ' '.join(['python -m benchmark.kills', *sys.argv[1:]])
     text = section(ended, stopped, kept_out, said)
@@ -355,6 +353,12 @@ def main() -> int:
     old = _DOC.read_text()
     _DOC.write_text(re.sub(f'{_BEGIN}.*{_END}', lambda _: between, old, flags=re.DOTALL))
     return int(bool(told))
+
+
+def _made(place: str, name: str) -> Path:
+    folder = Path(place, name)
+    folder.mkdir()
+    return folder
 
 
 if __name__ == '__main__':
