@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.diagnosis.model import (
     Linearised,
@@ -45,7 +45,7 @@ _STILL, _STANDS = 0.003, 0.5  # of the image's width, and s
 _KEPT = 200  # images
 _PATIENCE = 20.0  # s; then a view is one that cannot be had
 _LIVE = 0.1  # px, noise where the detector does not say
-_HOPE = 0.5  # that some more photographs tell two causes apart, below which none will
+_HOPE = 0.3  # that a few more photographs tell two causes apart, below which none will
 _EFFECT = ViewpointShiftEffect(1)
 
 NUMBERS = (_EFFECT.parameters[0].name, *INTRINSICS, 'k1', 'k2', 'k3', 'k4')
@@ -81,10 +81,10 @@ class Session:
 class Stand(NamedTuple):
     """Where matters stand.
 
-    wanted: views, best first; outline: of each, its points (N, 2), px; value, stderr: of the
-    number, None as long as it is not measured; named: causes, by a diagnosis; alike: what the
-    cause of the number may be as well; settled: no doubt is left that photographs could take
-    away; latest: lens and e0, for the next session.
+    wanted: views, best first; outline: of each, its points (N, 2), px, NaN outside the field;
+    value, stderr: of the number, None as long as it is not measured; named: causes, by a
+    diagnosis; alike: what the cause of the number may be as well; settled: no doubt is left that
+    photographs could take away; latest: lens and e0, for the next session.
     """
 
     wanted: Next
@@ -118,8 +118,7 @@ def _considered(session: Session) -> Stand:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
             return _judged(session, posable(table, lens)[0], lens)
     wanted = next_photographs(linear, (), _noise(linear), _AHEAD, number, room)
-    return _stand(session, ForwardModel(lens, linear.state.terms), wanted,
-                  _value(linear, number), wanted.answers[0])
+    return _stand(session, _model(linear), wanted, _value(linear, number), wanted.answers[0])
 
 
 def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
@@ -136,7 +135,8 @@ def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
             continue
         wanted = next_photographs(found.after, (cause,), found.noise_px, _AHEAD, room=room)
         if wanted.answers[-1] > _HOPE:
-            return _stand(session, _model(found), wanted, named=(cause.effect,), alike=names[1:])
+            return _stand(session, _model(found.after), wanted, named=(cause.effect,),
+                          alike=names[1:])
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
         found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(left_out=alike))
@@ -147,13 +147,15 @@ def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
-    return _stand(session, _model(found), wanted, value, stderr,
+    return _stand(session, _model(found.after), wanted, value, stderr,
                   tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
 
 
-def _model(found: Diagnosis) -> ForwardModel:
-    state = found.after.state
-    return ForwardModel(state.lens, state.terms)
+def _model(linear: Linearised) -> ForwardModel:
+    """Return how the lens images a board that is as it should be."""
+    terms = [term for term in linear.state.terms
+             if term[0].stage in ('ray', 'image') and not term[0].of_target]
+    return ForwardModel(linear.state.lens, terms)
 
 
 def _stand(
@@ -161,10 +163,9 @@ def _stand(
     stderr: float | None = None, named: tuple[str, ...] = (), alike: tuple[str, ...] = (),
     settled: bool = False,
 ) -> Stand:
-    board, count = wanted.board, len(wanted.shots.distance)
-    views = blank_views(board.landmark, board.points, count, board=board.board)
-    outline = np.full((count, len(session.points), 2), np.nan)
-    outline[:, board.landmark] = model.predict(wanted.shots.camera, views).uv
+    count = len(session.points)
+    views = blank_views(np.arange(count), session.points, len(wanted.shots.distance))
+    outline = model.predict(wanted.shots.camera, views).uv
     return Stand(wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
 
 
@@ -271,10 +272,10 @@ class Guide:
 
     def _likeness(self, seen: Seen, outline: Array) -> float:
         """Return 1 / (1 + d / r): d apart, r the size of the wanted view, root mean squares."""
-        size = np.sqrt(((outline - outline.mean(axis=0)) ** 2).sum(axis=1).mean())
-        apart = [np.sqrt(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1).mean())
+        size = np.nanvar(outline, axis=0).sum()
+        apart = [np.nanmean(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1))
                  for order in self.orders]
-        return float(1 / (1 + min(apart) / size))
+        return float(1 / (1 + np.sqrt(min(apart) / size)))
 
     def _stands(self, seen: Seen) -> bool:
         """Whether the board has stood still long enough."""

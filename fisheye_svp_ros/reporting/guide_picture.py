@@ -64,7 +64,7 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: Seen | None) -> NDArray[np.ui
     outline = guide.outline
     if outline is not None:
         colour = _READY if guide.score >= ENOUGH else _WANTED
-        wanted = _places(outline, zoom)
+        wanted = _places(outline[np.isfinite(outline).all(axis=1)], zoom)
         hull = cv2.convexHull(wanted)
         filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FIXED)
         picture = cv2.addWeighted(filled, 0.25, picture, 0.75, 0)
@@ -82,8 +82,7 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: Seen | None) -> NDArray[np.ui
 
 def _places(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:
     """Return image points in the fixed point numbers of OpenCV's drawing."""
-    # What is not finite, or far outside, is drawn outside.
-    places = np.clip(np.nan_to_num((uv + 0.5) * zoom - 0.5, nan=-1e4), -1e4, 1e4)
+    places = np.clip((uv + 0.5) * zoom - 0.5, -1e4, 1e4)
     return np.round(places * (1 << _FIXED)).astype(np.int32)
 
 

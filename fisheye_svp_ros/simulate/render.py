@@ -221,7 +221,8 @@ def _reflectance(printed: Print, places: Array, slope: tuple[Array, Array]) -> A
 
 def _inside(places: Array, low: Any, high: Any, width: Array) -> Array:
     depth = np.minimum(places - low, high - places) / width
-    return np.asarray(np.clip(depth + 0.5, 0.0, 1.0).prod(axis=-1))
+    share = np.clip(depth + 0.5, 0.0, 1.0)
+    return np.asarray(share[..., 0] * share[..., 1])
 
 
 def _blurred(

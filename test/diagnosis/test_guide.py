@@ -124,6 +124,20 @@ def test_one_photograph_moves_the_data_sheet_no_further_than_it_must(first):
     assert [held.lens.parameters[name] for name in free] == pytest.approx(sheet, abs=1e-6)
 
 
+def test_of_a_board_seen_in_part_the_whole_is_wanted(first):
+    seen = present(LENS, first, np.random.default_rng(1))
+    part = np.arange(18)
+    seen = Seen(0.0, part, seen.uv[part], seen.sigma[part])
+    stand = consider(replace(session(), taken=(seen,)))
+    assert np.shape(stand.outline) == (len(stand.outline), len(POINTS), 2)
+    guide = guided(stand)
+    there = wanted_view(guide)
+    finite = np.isfinite(there.uv).all(axis=1)
+    assert finite[part].all()
+    guide.look(0.0, Seen(0.0, there.ids[part], there.uv[part], there.sigma[part]))
+    assert guide.score == pytest.approx(1)
+
+
 def test_from_a_data_sheet_to_a_settled_shift(first):
     """Somebody presents the wanted views, a little off; the shift is 3 mm, the goal 0.3 mm."""
     guide, rng = guided(first), np.random.default_rng(5)
