@@ -52,7 +52,7 @@ setup(
     extras_require={
         'standalone': ['cyclonedds>=11.0.1'],
         'fast': ['numba>=0.59'],
-        'parquet': ['pyarrow>=14'],
+        'parquet': ['pyarrow>=15'],
         'dask': ['distributed>=2023.7'],
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.

@@ -157,7 +157,7 @@ def _view(rng: np.random.Generator, target: Target, lens: Lens, calm: float
         off = 0.5 * lens.theta_max * rng.normal(0, 0.6, 2).clip(-1, 1)
     else:
         centre = rng.uniform(-0.25, 0.25, 3)
-        aim = Rotation.identity() if calm < 1 else Rotation.random(rng=rng)
+        aim = Rotation.identity() if calm < 1 else Rotation.random(random_state=rng)
         off = rng.uniform(-1, 1, 2)
     roll = Rotation.from_rotvec([0, 0, calm * rng.uniform(-np.pi, np.pi)])
     return centre, aim * Rotation.from_rotvec([*off, 0]) * roll

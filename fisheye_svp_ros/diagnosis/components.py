@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy import linalg, stats
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.mixed import Equations, factored, solve
+from fisheye_svp_ros.diagnosis.mixed import (
+    Equations,
+    factored,
+    posterior,
+    solve,
+    solve_lower,
+)
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import (
     GONE,
@@ -61,11 +67,13 @@ def _without_chance(eq: Equations, now: Variances) -> Variances:
     One at a time: two that do the same are each dispensable, but not both.
     """
     while doubtful := _hardly_known(now):
-        found = significance(eq, now, doubtful)
-        doubtful = [name for name in doubtful if found[name] > _CHANCE]
-        if not doubtful:
+        full, ratios = likelihood_ratios(eq, now, doubtful)
+        if _chance(min(ratios.values())) <= _CHANCE:
+            ratios = _followed(eq, now, full, ratios)
+        name = min(ratios, key=ratios.__getitem__)
+        if _chance(ratios[name]) <= _CHANCE:
             break
-        now, _ = estimate(eq, without(now, max(doubtful, key=found.__getitem__)), _WARM)
+        now, _ = estimate(eq, without(now, name), _WARM)
     return now
 
 
@@ -149,18 +157,54 @@ def significance(
     Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
     JASA 82 (1987)); the other variances follow.
     """
-    full = _deviance(eq, now)
+    full, ratios = likelihood_ratios(eq, now, names)
+    return {n: _chance(ratio) for n, ratio in _followed(eq, now, full, ratios).items()}
+
+
+def _chance(ratio: float) -> float:
+    return float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
+
+
+def likelihood_ratios(
+    eq: Equations, now: Variances, names: Sequence[str]
+) -> tuple[float, dict[str, float]]:
+    """Return the deviance, and by how much it rises without each component that is there.
+
+    The other variances stay; from the posterior of the component's coefficients b with covariance
+    S: what is left grows by b' inv(S) b, the determinant by that of S.
+    """
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    solution, known = solve(f, spread=False), posterior(f)
+    blocks, freedom = f.equations.blocks, f.equations.rows - f.equations.poses
+    freedom -= len(solution.values)
     found = {}
     for name in names:
-        if not now.alive[NAMES.index(name)]:
+        kind = NAMES.index(name)
+        if not now.alive[kind]:
             continue
-        rest = without(now, name)
-        ratio = _deviance(eq, rest) - full
-        # The other variances only ever take up a part of it.
+        e, r = blocks.e_label == kind, blocks.r_label == kind
+        values, prior = (np.concatenate([of_e[e], of_r[r]]) for of_e, of_r in (
+            (solution.e, solution.r), f.precision))
+        root = linalg.cholesky(known.covariance(f.equations, kind), lower=True)
+        half = solve_lower(root, values)
+        growth = np.log1p(float(half @ half) / solution.variance / max(freedom, 1))
+        logs = 2 * np.log(np.diag(root)).sum() + np.log(prior).sum()
+        found[name] = float(freedom * growth + logs)
+    return solution.deviance, found
+
+
+def _followed(
+    eq: Equations, now: Variances, full: float, ratios: dict[str, float]
+) -> dict[str, float]:
+    """Return likelihood ratios once the other variances have taken up what they can.
+
+    They only ever take up a part of it, so that only doubtful ones are asked for.
+    """
+    found = dict(ratios)
+    for name, ratio in ratios.items():
         if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
-            rest, _ = estimate(eq, rest, steps=1)
-            ratio = _deviance(eq, rest) - full
-        found[name] = float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
+            rest, _ = estimate(eq, without(now, name), steps=1)
+            found[name] = _deviance(eq, rest) - full
     return found
 
 

@@ -269,8 +269,10 @@ def solve(f: Factored, spread: bool = True) -> Solution:
     deviance = _deviance(f, root, freedom, variance)
     if not spread:
         return Solution(values, variance, e, r, np.zeros(0), np.zeros(0), deviance)
-    spread_e, spread_r = _spread(f, root)
-    return Solution(values, variance, e, r, spread_e, spread_r, deviance)
+    known = posterior(f)
+    spread_e = np.diagonal(known.block, axis1=-2, axis2=-1) + np.reshape(
+        (known.e**2).sum(axis=1), e.shape)
+    return Solution(values, variance, e, r, spread_e, (known.r**2).sum(axis=1), deviance)
 
 
 def _back(factor: Array, right: Array) -> Array:
@@ -281,25 +283,46 @@ def _back(factor: Array, right: Array) -> Array:
     )
 
 
-def _spread(f: Factored, root: Array) -> tuple[Array, Array]:
-    """Return the diagonal of the inverse of the whole matrix."""
+class Posterior(NamedTuple):
+    """Roots of the covariance of the coefficients, over the noise variance.
+
+    Of the rest it is r r', of the blocks e e' and, within each block, block (E, k, k);
+    e (E k, C), r (R, C).
+    """
+
+    block: Array
+    e: Array
+    r: Array
+
+    def covariance(self, eq: Equations, kind: int) -> Array:
+        """Return the covariance (n, n) of the coefficients of a component."""
+        chosen = eq.blocks.r_label == kind
+        if chosen.any():
+            return np.asarray(self.r[chosen] @ self.r[chosen].T)
+        block, column = np.nonzero(eq.blocks.e_label == kind)
+        root = self.e[block * self.block.shape[1] + column]
+        own = self.block[block[:, None], column[:, None], column]
+        return np.asarray(root @ root.T + np.where(block[:, None] == block, own, 0.0))
+
+
+def posterior(f: Factored) -> Posterior:
+    """Return the covariance of all coefficients; the border must be of full rank."""
     inverse_t = np.swapaxes(f.inverse, -1, -2)
-    e = (f.inverse**2).sum(axis=-2)
-    r = np.zeros(len(f.factor))
-    shape = e.shape
     by_border = _back(f.factor, f.border[:, :-1])
-    bent = f.block_border[..., :-1] - f.coupled @ by_border
+    bent = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
+    e = np.zeros((bent.shape[0] * bent.shape[1], 0))
+    r = np.zeros((len(f.factor), 0))
     if len(f.factor):
         inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
-        r = (inverse**2).sum(axis=0)
-        flat = (inverse_t @ f.coupled).reshape(e.size, len(inverse))
-        through = linalg.blas.dtrmm(1.0, inverse, flat.T, lower=1)
-        e = e + (through**2).sum(axis=0).reshape(shape)
-    if len(root):
+        flat = (inverse_t @ f.coupled).reshape(len(e), len(inverse))
+        e, r = linalg.blas.dtrmm(1.0, inverse, flat.T, lower=1).T, inverse.T
+    info = f.information[:-1, :-1]
+    if len(info):
+        root = linalg.cholesky(info, lower=True, check_finite=False)
         fixed = linalg.lapack.dtrtri(root, lower=1)[0].T
-        r = r + ((by_border @ fixed) ** 2).sum(axis=1)
-        e = e + (((inverse_t @ bent) @ fixed) ** 2).sum(axis=-1)
-    return e, r
+        e = np.concatenate([e, bent.reshape(len(e), -1) @ fixed], axis=1)
+        r = np.concatenate([r, by_border @ fixed], axis=1)
+    return Posterior(inverse_t @ f.inverse, e, r)
 
 
 def _deviance(f: Factored, root: Array, freedom: int, variance: float) -> float:

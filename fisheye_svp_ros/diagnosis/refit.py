@@ -65,9 +65,14 @@ class Local(NamedTuple):
 
 
 def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> Fitted:
-    """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance."""
+    """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance.
+
+    The columns of the random parts are those of the first step: they change with the square of it.
+    """
+    random: Design | None = None
     for _ in range(_ROUNDS):
-        fitted = fit_linear(Linearised(data, state, free), variances)
+        fitted = fit_linear(Linearised(data, state, free), variances, random)
+        random = fitted.design
         change = _steps(fitted)
         moves = fitted.linear.frame_columns @ change[0][..., None]
         moves = moves[..., 0] + fitted.linear.shared_columns @ change[1]
@@ -77,10 +82,13 @@ def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -
     return fitted._replace(state=state)
 
 
-def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
-    """Solve the mixed-model equations of one linearisation."""
-    finest = bool(variances.alive[NAMES.index('image_finest')])
-    random = design(linear, finest).kept(variances.alive)
+def fit_linear(
+    linear: Linearised, variances: Variances, random: Design | None = None
+) -> Fitted:
+    """Solve the mixed-model equations of one linearisation; random: its design, if it is known."""
+    if random is None:
+        finest = bool(variances.alive[NAMES.index('image_finest')])
+        random = design(linear, finest).kept(variances.alive)
     scale = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate(

@@ -23,6 +23,7 @@ from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000
+_OLDEST = 15  # of pyarrow: from there on pages have checksums
 _NAMES = b'fisheye_svp_ros: CRC of the names'  # the foot of a Parquet file has no checksum
 
 _WHOLE = re.compile(r'[+-]?[0-9]{1,18}')
@@ -37,6 +38,8 @@ def arrow() -> tuple[Any, str]:
     try:
         pyarrow = import_module('pyarrow')
         import_module('pyarrow.parquet')
+        if _major(pyarrow) < _OLDEST:
+            raise ImportError(f'{pyarrow.__version__} is older than {_OLDEST}')
     except Exception as cause:  # beside an older NumPy it ends in more than one way
         return None, f'no Parquet file, the CSV file has it all: pyarrow is not usable ({cause})'
     return pyarrow, ''
@@ -194,9 +197,7 @@ def _to_parquet(
         if writer is None:
             names = pending[0].schema.names
             schema = pending[0].schema.with_metadata({_NAMES: _checksum(names)})
-            # pyarrow writes page checksums from 15 on.
-            checked = {'write_page_checksum': True} if _major(pyarrow) >= 15 else {}
-            writer = pyarrow.parquet.ParquetWriter(path, schema, **checked)
+            writer = pyarrow.parquet.ParquetWriter(path, schema, write_page_checksum=True)
         if sum(map(len, pending)) >= _ROWS:
             table = pyarrow.concat_tables(pending)
             whole = len(table) // _ROWS * _ROWS

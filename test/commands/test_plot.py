@@ -58,7 +58,7 @@ def test_a_picture_shows_no_more_curves_than_can_be_told_apart(
     labels = [line.get_label() for line in figure.axes[0].lines]
     assert labels == [f'shift_scale {i}, environment {name}' for i in (0, 2, 4, 6)
                       for name in 'ac']
-    assert '4 of 7 values of shift_scale; 2 of 3 values of environment' in figure.get_suptitle()
+    assert '4 of 7 values of shift_scale; 2 of 3 values of environment' in str(figure.texts)
 
 
 def test_a_grid_holds_magnitudes() -> None:
