@@ -12,7 +12,7 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import Step
-from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses
+from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses, thinned
 from fisheye_svp_ros.diagnosis.measured import Fit, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import (
@@ -111,14 +111,14 @@ def diagnose(
     observations: Observations, lens: Lens | Mapping[str, Lens], *,
     free_intrinsics: bool | None = None,
     poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
-    wanted: Wanted | None = None, progress: Callable[[str], None] = lambda _: None,
+    wanted: Wanted | None = None, progress: Callable[[str, float], None] = lambda *_: None,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
     lens: of every camera, or the lenses of a rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
     poses: true poses by frame; held_out: other frames of the same camera and target; wanted:
-    causes to take in or leave out; progress: told what is being done.
+    causes to take in or leave out; progress: told what is being done, and which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     lenses = rig_lenses(observations, lens)
@@ -128,7 +128,9 @@ def diagnose(
         raise ObservationError(f'{held_out.source}: its cameras are not those of the rig, '
                                + ', '.join(observations.cameras))
     wanted = wanted or Wanted()
-    progress('fitting the simulation as it is')
+    if wanted.quick:
+        observations = thinned(observations)
+    progress('fitting the simulation as it is', 0.0)
     everything = prepare(observations, poses)
     data, gross = find_gross_errors(everything, start(everything, first, others))
     base = fit(data, start(data, first, others), free)
@@ -146,7 +148,7 @@ def diagnose(
     found = search(data, base, free, wanted, gross, progress)
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
-    progress('measuring the gain on held-out data')
+    progress('measuring the gain on held-out data', 0.8)
     return _judged(
         observations, lenses, found, Measured(found, free, held_out, wanted.quick, medium),
         noise_causes, held_out,

@@ -61,6 +61,19 @@ def posable(
     return observations.take(kept), tuple(sorted(left_out))
 
 
+def thinned(observations: Observations, most: int = 1500, fewest: int = 24) -> Observations:
+    """Return about `most` points of many: every second landmark, every third ...
+
+    A view that would be left with less than `fewest` stays whole.
+    """
+    step = max(len(observations) // most, 1)
+    views = np.stack([observations.frame, observations.camera])
+    _, view, points = np.unique(views, axis=1, return_inverse=True, return_counts=True)
+    place = np.unique(observations.landmark, return_inverse=True)[1].reshape(-1)
+    whole = points[view.reshape(-1)] < fewest * step
+    return observations.take(whole | (place % step == 0))
+
+
 def poses_by_frame(
     observations: Observations, frame: Index, pose: Pose, source: str
 ) -> dict[int, Pose]:

@@ -76,7 +76,7 @@ class Measured:
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
             solved = start_poses(test, self._there(test, found.state))
-            self.test, self.test_gross = find_gross_errors(test, self._there(test, solved))
+            self.test, self.test_gross = find_gross_errors(test, solved)
             self.test_pose = start_poses(self.test, self._there(test, found.state)).pose
 
     @cached_property

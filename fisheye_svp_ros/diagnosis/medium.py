@@ -120,7 +120,7 @@ class Medium:
 
 def find_medium(
     everything: Data, data: Data, lens: Lens, base: State, free: Sequence[str],
-    progress: Callable[[str], None],
+    progress: Callable[[str, float], None],
 ) -> Medium | None:
     """Ask whether the camera looks through a flat port into another medium than air.
 
@@ -132,7 +132,7 @@ def find_medium(
     air = Linearised(data, base, free)
     if not (_magnified(air, lens, base) if free else _rms_px(air) > _SUSPECT):
         return None
-    progress('asking whether the camera looks into another medium')
+    progress('asking whether the camera looks into another medium', 0.02)
     curve = _free_curve(data, base)
     if not (_magnified(air, lens, curve) or _rms_px(Linearised(data, curve, ())) > _SUSPECT):
         return None

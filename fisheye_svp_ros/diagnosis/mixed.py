@@ -98,6 +98,16 @@ class Equations:
             b.ex.reshape(len(flat), len(b.xx)).T @ flat + b.rx.T @ r,
         )
 
+    def placed(self, frame: Array, landmark: Array, shared: Array) -> tuple[Array, Array]:
+        """Put what belongs to coefficients where they stand: e (E, k), r (R,); see `sorted`.
+
+        frame (F, b), landmark (L, 3) of all landmarks, shared (Q,).
+        """
+        landmark = landmark[self.landmarks]
+        if self.by_frame:
+            return frame, np.concatenate([shared, landmark.ravel()])
+        return landmark, np.concatenate([frame.ravel(), shared])
+
     def sorted(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
         """Sort coefficients (E, k, ...), (R, ...): by frame (F, b, ...), by landmark, shared."""
         if self.by_frame:
@@ -320,7 +330,7 @@ def posterior(f: Factored) -> Posterior:
     if len(info):
         root = linalg.cholesky(info, lower=True, check_finite=False)
         fixed = linalg.lapack.dtrtri(root, lower=1)[0].T
-        e = np.concatenate([e, bent.reshape(len(e), -1) @ fixed], axis=1)
+        e = np.concatenate([e, bent.reshape(len(e), len(fixed)) @ fixed], axis=1)
         r = np.concatenate([r, by_border @ fixed], axis=1)
     return Posterior(inverse_t @ f.inverse, e, r)
 

@@ -219,14 +219,18 @@ class Linearised:
         with np.errstate(invalid='ignore'):
             offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
         self.residual = data.blocks(offset * self.weight[..., None])
-        frame, rig = self._pose_columns(pose)
-        self.frame_columns = self.whitened(frame)
-        shared = [rig, self.model.lens_columns(self.linear, state.own_names(free))]
+        self.frame_columns = self.whitened(self._frame_columns(pose))
+
+    @cached_property
+    def shared_columns(self) -> Array:
+        """Whitened columns (F, M, K) of what all frames share."""
+        free = self.state.own_names(self.free)
+        shared = [self._rig_columns(), self.model.lens_columns(self.linear, free)]
         shared += [
             self.model.effect_columns(effect, self.scene, self.linear)
-            for effect, _ in state.terms if is_shared(effect)
+            for effect, _ in self.state.terms if is_shared(effect)
         ]
-        self.shared_columns = self.whitened(np.concatenate(shared, axis=-1))
+        return self.whitened(np.concatenate(shared, axis=-1))
 
     @cached_property
     def used(self) -> Mask:
@@ -242,19 +246,21 @@ class Linearised:
         """Whitened columns (F, M, P) by the parameters of one more effect."""
         return self.whitened(self.model.effect_columns(effect, self.scene, self.linear))
 
-    def _pose_columns(self, pose: Pose) -> tuple[Array, Array]:
+    def _frame_columns(self, pose: Pose) -> Array:
         d_place, d_turn = self.linear.d_pose[..., :3], self.linear.d_pose[..., 3:]
         # The frame turns about the rig's body: a camera off its origin also moves.
         arm = pose.position - self.state.pose.position[self.data.frame_of]
         lever = d_place @ -cross_matrix(arm)[:, None]
         frame = np.concatenate([d_place, d_turn + lever], axis=-1)
-        if self.data.poses is not None:
-            frame = np.zeros_like(frame)
+        return frame if self.data.poses is None else np.zeros_like(frame)
+
+    def _rig_columns(self) -> Array:
+        d_place, d_turn = self.linear.d_pose[..., :3], self.linear.d_pose[..., 3:]
         body = self.state.pose.rotation[self.data.frame_of][:, None]
         rig = np.concatenate([d_place @ body, d_turn @ body], axis=-1)
         mine = self.data.camera_of[:, None] == np.arange(1, self.data.cameras)
         columns = rig[..., None, :] * mine[:, None, None, :, None]
-        return frame, columns.reshape(*rig.shape[:3], -1)
+        return np.asarray(columns.reshape(*rig.shape[:3], -1))
 
 
 def is_shared(effect: Effect) -> bool:
@@ -341,8 +347,12 @@ class _Fit:
         if not len(index):
             return np.zeros(0), ()
         linear = Linearised(self._data, self.unpack(state), self._free)
-        # A column of zeros leaves its parameter where it is.
-        shared = linear.shared_columns * (0.0 if self._poses_only else 1.0)
+        if self._poses_only:
+            # A column of zeros leaves its parameter where it is.
+            count = 6 * (self._data.cameras - 1) + state[-1].shape[-1]
+            shared = np.zeros((*linear.residual.shape, count))
+        else:
+            shared = linear.shared_columns
         cost, normal = _equations(linear.residual, linear.frame_columns, shared)
         if self._prior is not None:
             off = (state[-1][0] - self._prior.mean) / self._prior.stderr

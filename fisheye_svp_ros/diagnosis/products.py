@@ -71,6 +71,14 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
     )
 
 
+def multiplied_by(design: Design, pose: Array, residual: Array) -> tuple[Array, Array, Array]:
+    """Multiply a residual (F, M) by all columns: by frame (F, B), landmark (L, 3), shared (Q,)."""
+    own = np.concatenate([pose, design.frame], axis=-1)
+    flat = residual.ravel()
+    return (np.einsum('fmb,fm->fb', own, residual), (design.offsets.T @ flat).reshape(-1, 3),
+            design.shared.T @ flat)
+
+
 def arranged(
     p: Products, f_label: Index, l_label: Index, s_label: Index, by_frame: bool
 ) -> Blocks:

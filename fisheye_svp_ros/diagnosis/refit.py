@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis.mixed import (
     solve,
 )
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
+from fisheye_svp_ros.diagnosis.products import multiplied_by
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
     NAMES,
@@ -34,7 +35,7 @@ _SETTLED = 3e-3  # of the noise: what a step moves predictions by
 
 
 class Fitted(NamedTuple):
-    """A state fitted under a null model, with the equations that it solves."""
+    """A state under a null model, with the equations around it and their solution."""
 
     state: State
     linear: Linearised
@@ -64,31 +65,35 @@ class Local(NamedTuple):
         return replace(data, views=views._replace(points=points, uv=uv))
 
 
-def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> Fitted:
+def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> State:
     """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance.
 
-    The columns of the random parts are those of the first step: they change with the square of it.
+    All steps are solved with the equations of the first: its columns change little.
     """
-    random: Design | None = None
-    for _ in range(_ROUNDS):
-        fitted = fit_linear(Linearised(data, state, free), variances, random)
-        random = fitted.design
-        change = _steps(fitted)
-        moves = fitted.linear.frame_columns @ change[0][..., None]
-        moves = moves[..., 0] + fitted.linear.shared_columns @ change[1]
+    fitted = fit_linear(Linearised(data, state, free), variances)
+    linear, eq = fitted.linear, fitted.factored.equations
+    e, r, values = fitted.solution.e, fitted.solution.r, fitted.solution.values
+    for turn in range(_ROUNDS):
+        frame, _, _ = eq.sorted(e, r)
+        change = frame[:, :6] / eq.pose_scale, values / fitted.scale
+        moves = (linear.frame_columns @ change[0][..., None])[..., 0]
+        moves += linear.shared_columns @ change[1]
         state = moved(data, state, free, *change)
-        if np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
+        if turn == _ROUNDS - 1 or np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
             break
-    return fitted._replace(state=state)
+        residual = Linearised(data, state, free).residual
+        pose = linear.frame_columns / eq.pose_scale[:, None]
+        e, r = eq.placed(*multiplied_by(fitted.design, pose, residual))
+        x = np.einsum('fmk,fm->k', linear.shared_columns, residual) / fitted.scale
+        parts = fitted.factored.solved(e[..., None], r[:, None], x[:, None])
+        e, r, values = (part[..., 0] for part in parts)
+    return state
 
 
-def fit_linear(
-    linear: Linearised, variances: Variances, random: Design | None = None
-) -> Fitted:
-    """Solve the mixed-model equations of one linearisation; random: its design, if it is known."""
-    if random is None:
-        finest = bool(variances.alive[NAMES.index('image_finest')])
-        random = design(linear, finest).kept(variances.alive)
+def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
+    """Solve the mixed-model equations of one linearisation."""
+    finest = bool(variances.alive[NAMES.index('image_finest')])
+    random = design(linear, finest).kept(variances.alive)
     scale = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate(
@@ -114,13 +119,6 @@ def _solved(
     eq = replace(eq, blocks=eq.blocks._replace(xx=eq.blocks.xx + np.diag(ridge)))
     f = factored(eq, variances.lam, variances.weight)
     return Fitted(linear.state, linear, random, f, solve(f, spread=False), scale)
-
-
-def _steps(fitted: Fitted) -> tuple[Array, Array]:
-    """Return the change of the poses (F, 6) and of what is shared (K,)."""
-    eq, solution = fitted.factored.equations, fitted.solution
-    frame, _, _ = eq.sorted(solution.e, solution.r)
-    return frame[:, :6] / eq.pose_scale, solution.values / fitted.scale
 
 
 def local_offsets(fitted: Fitted) -> Local:

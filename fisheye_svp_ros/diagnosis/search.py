@@ -43,6 +43,7 @@ from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError
 
 _ROUNDS = 6
+_PACE = 0.6  # of the work left before a round, what is left after it
 _RIPPLES = 4.0  # standard errors
 _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a round
 
@@ -72,7 +73,7 @@ class Found:
 
 def search(
     data: Data, state: State, free: Sequence[str], wanted: Wanted, gross: Gross,
-    progress: Callable[[str], None],
+    progress: Callable[[str, float], None],
 ) -> Found:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
     trace: list[Step] = []
@@ -86,7 +87,8 @@ def search(
     known = (*wanted.included, *(effect.name for effect in given))
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
-        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}')
+        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}',
+                 0.8 - 0.75 * _PACE**turn)
         evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
         base, before = base or evidence, evidence.variances
         included, steps = _needed(evidence, known, wanted.quick)
@@ -102,30 +104,29 @@ def search(
             effect, offset, step = found
             trace.append(step)
             state, changed = with_effect(state, effect, offset), True
-        if not changed and growth is None and not cleaned and not wanted.quick:
+        asked = not (changed or wanted.quick)
+        if asked and not cleaned:
             # Once the causes are known: what is far off even beside random errors, and the noise.
-            fitted = fit_of(evidence)
-            data, gross, growth, changed = _cleaned(data, fitted, gross, wanted)
+            data, gross, growth, changed = _cleaned(data, fit_of(evidence), gross, wanted)
             cleaned = True
             if growth is not None:
                 state = with_noise_growth(state, growth.value)
-        if not changed and not finest and cleaned and (
-            ripples(fit_of(evidence)) > _RIPPLES
-        ):
+        if asked and not finest and ripples(fit_of(evidence)) > _RIPPLES:
             # Points of different frames err alike where they fall on the same place.
-            finest = changed = True
-            continue
-        if not changed:
+            finest = True
+            if not changed:
+                continue
+        elif not changed:
             break
-        state = refit(data, state, free, before).state
+        state = refit(data, state, free, before)
         if wanted.quick or (cleaned and settled):
             break
         settled = cleaned
-    if changed:
+    if changed and not wanted.quick:
         evidence = gather_evidence(data, state, free, before, wanted.left_out, finest)
     while True:
         # The last variances weigh the last fit.
-        state = refit(data, state, free, evidence.variances).state
+        state = refit(data, state, free, evidence.variances)
         evidence = evidence.around(data, state, free, wanted.left_out, finest)
         included, steps = _needed(evidence, known, wanted.quick)
         if not steps:

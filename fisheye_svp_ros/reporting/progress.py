@@ -22,10 +22,10 @@ def progress(description: str, total: int | None = None) -> Iterator[Callable[..
 
 
 @contextmanager
-def stages(description: str) -> Iterator[Callable[[str], None]]:
-    """Show that the work goes on while the block runs; call what it yields with its stage."""
-    with _bar(description, None) as update:
-        yield lambda stage: update(description=f'{description}: {stage}')
+def stages(description: str) -> Iterator[Callable[[str, float], None]]:
+    """Show a bar while the block runs; call what it yields with the stage and the share done."""
+    with _bar(description, 1) as update:
+        yield lambda stage, done: update(description=f'{description}: {stage}', completed=done)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.inputs import thinned
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
 from fisheye_svp_ros.diagnosis.noise import Gross, quantisation_step
 from fisheye_svp_ros.diagnosis.search import search
@@ -15,6 +16,7 @@ from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.scene.observations import Observations
 
 SIGMA = 0.2
 
@@ -240,7 +242,7 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     table = replace(table, xyz=views.points[0][table.landmark])
     data = prepare(table)
     gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
-    found = search(data, fit(data, start(data, lens()), ()), (), Wanted(), gross, lambda _: None)
+    found = search(data, fit(data, start(data, lens()), ()), (), Wanted(), gross, lambda *_: None)
     own = np.arange(found.evidence.own)
     information = found.evidence.information
     step = np.linalg.solve(information[np.ix_(own, own)], information[own, -1])
@@ -301,3 +303,16 @@ def test_a_rig_needs_a_lens_for_each_camera():
         diagnose(table, {'left': lenses['left']})
     with pytest.raises(ObservationError, match='not those of the rig'):
         diagnose(table, lenses, held_out=replace(table, cameras=('a', 'b')))
+
+
+def test_a_quick_diagnosis_takes_a_part_of_many_points() -> None:
+    """Small views stay whole, or nothing could be said of their frames."""
+    frame = np.repeat([0, 1, 2], [2400, 2100, 30])
+    landmark = np.concatenate([np.arange(2400), np.arange(2100), np.arange(30)])
+    none = np.full(len(frame), np.nan)
+    table = Observations(frame, landmark, np.zeros((len(frame), 2)), np.zeros((len(frame), 3)),
+                         np.zeros_like(frame), np.zeros_like(frame), none, none)
+    kept = thinned(table)
+    assert np.bincount(kept.frame).tolist() == [800, 700, 30]
+    assert set(kept.landmark[kept.frame == 1]) == set(range(0, 2100, 3))
+    assert len(thinned(kept)) == len(kept)

@@ -32,7 +32,7 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         begin = start(data, lens())
         state = fit(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
         evidence = gather_evidence(data, state, ())
-        fitted = refit(data, state, (), evidence.variances).state
+        fitted = refit(data, state, (), evidence.variances)
         error, = standard_errors(evidence)
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
