@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 from time import sleep
+from typing import Any
 
 import cv2
 import numpy as np
@@ -109,8 +110,10 @@ class TestCorners:
 
     @pytest.mark.parametrize('detector', ['saddle', 'sb', 'classic'])
     def test_every_detector_keeps_the_order(self, detector: str) -> None:
-        # SB wants the whole board in view; in the fourth of these poses a corner is beyond it.
-        for i in range(3 if detector == 'sb' else 4):
+        # The fourth of these poses is too hard for SB and for OpenCV before 4.7, which may find a
+        # grid that is a square off.
+        old = cv2.__version__ < '4.7'
+        for i in range(3 if detector == 'sb' or old else 4):
             pose = poses(4, 2).take(i)
             points = find_points(photograph(pose), PATTERN, detector)
             assert not isinstance(points, str)
@@ -130,8 +133,18 @@ class TestCorners:
             find_points(photograph(poses(1).take(0)), parse_pattern('chessboard:9x8:30mm'),
                         'saddle'), str)
 
+    def test_a_grid_that_lies_a_square_off_is_no_board(self, monkeypatch: Any) -> None:
+        pose = poses(4, 2).take(0)
+        grid = true_corners(pose).reshape(PATTERN.rows, PATTERN.columns, 2)
+        beyond = 2 * grid[:, -1:] - grid[:, -2:-1]
+        off = np.concatenate([grid[:, 1:], beyond], axis=1).reshape(-1, 2)
+        found = np.arange(len(off)), off
+        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
+            'saddle': (('chessboard',), lambda *_: found)})
+        assert 'a square off' in str(find_points(photograph(pose), PATTERN, 'saddle'))
+
     def test_sixteen_bits(self) -> None:
-        pose = poses(1).take(0)
+        pose = poses(4, 2).take(0)
         image = photograph(pose).astype(np.uint16) * 16
         points = find_points(image, PATTERN, 'saddle')
         assert not isinstance(points, str)

@@ -46,7 +46,7 @@ def test_corners_are_where_the_lens_projects_them(printed: Print) -> None:
 
 
 def test_the_viewpoint_shift_is_in_the_picture() -> None:
-    pose = poses(1).take(0)
+    pose = poses(4, 2).take(0)
     moved = replace(LENS, viewpoint_shift=None)
     points = find_points(photograph(pose), PATTERN, 'saddle')
     assert not isinstance(points, str)
