@@ -173,7 +173,7 @@ def killed(
     for number, moment in enumerate(moments(2 * count, rng)):
         how = signal.SIGTERM if number // 2 % 2 else signal.SIGKILL
         out = folder / str(number)
-        _kill(words, out, how, moment * length, whole, outcome)
+        kill(words, out, how, moment * length, whole, outcome)
         # The next one goes through where this one was killed.
         status, said = done([word.format(out=out) for word in words])
         if status or not _same(files(out), whole):
@@ -182,10 +182,11 @@ def killed(
     return outcome
 
 
-def _kill(
+def kill(
     words: Sequence[str], out: Path, how: signal.Signals, after: float, whole: dict[str, int],
     outcome: Outcome,
 ) -> None:
+    """Kill a command after some seconds; whole: the sizes of its files in `out`, if it ends."""
     process = call([word.format(out=out) for word in words])
     with process:
         try:
@@ -232,8 +233,8 @@ def killed_node(words: Sequence[str], folder: Path, count: int, rng: random.Rand
         how = signal.SIGTERM if number % 2 else signal.SIGKILL
         out = folder / str(number)
         out.mkdir()
-        _kill([word.format(out=out) for word in words], out, how, rng.uniform(0.1, 6.0), {},
-              outcome)
+        kill([word.format(out=out) for word in words], out, how, rng.uniform(0.1, 6.0), {},
+             outcome)
         shutil.rmtree(out)
     return outcome
 

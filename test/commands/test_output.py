@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.nodes import ROOT
 from helpers.targets import plane, poses_around
 
+from benchmark import kills
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import OutputError
@@ -171,20 +171,36 @@ def test_a_command_that_is_told_to_end_leaves_nothing(
 def test_a_command_that_is_killed_leaves_all_or_nothing(
     given: dict[str, Path], tmp_path: Path
 ) -> None:
-    def start(number: int) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, '-m', 'fisheye_svp_ros.cli',
-             *words('localize', given, tmp_path / str(number))], cwd=ROOT,
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-
     begun = time.monotonic()
-    assert start(0).wait() == 0
-    whole, length = results(tmp_path / '0'), time.monotonic() - begun
+    assert kills.done(words('localize', given, tmp_path / 'whole')) == (0, '')
+    length, outcome = time.monotonic() - begun, kills.Outcome()
+    whole = kills.files(tmp_path / 'whole')
     assert 'localize.json' in whole
-    for number, part in enumerate((0.5, 0.9, 0.97), start=1):
-        process = start(number)
-        time.sleep(part * length)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        left = [name for name in results(tmp_path / str(number)) if not name.startswith('.')]
-        assert left in ([], whole)
+    for number, (how, part) in enumerate((
+        (signal.SIGTERM, 0.5), (signal.SIGTERM, 0.95), (signal.SIGKILL, 0.9),
+        (signal.SIGKILL, 0.97),
+    )):
+        out = tmp_path / str(number)
+        kills.kill(words('localize', given, out), out, how, part * length, whole, outcome)
+    assert not outcome.told
+
+
+def test_what_a_kill_can_leave_is_seen(tmp_path: Path) -> None:
+    (tmp_path / '.a.csv.x1.csv').write_text('half')
+    (tmp_path / 'parts').mkdir()
+    (tmp_path / 'parts' / '0.json').write_text('kept for --resume')
+    outcome = kills.Outcome()
+    script = """
+import os, subprocess
+os.setsid()
+subprocess.Popen(['sleep', '60'], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+print(os.getpid())
+"""
+    lost = subprocess.run([sys.executable, '-c', script], stdout=subprocess.PIPE, text=True,
+                          check=True)
+    orphans = kills.left_running(int(lost.stdout))
+    assert len(orphans) == 1
+    os.kill(orphans[0], signal.SIGKILL)
+    assert kills.temporary([*kills.files(tmp_path)]) == ['.a.csv.x1.csv']
+    outcome.fault('part', 'SIGKILL after 1 s')
+    assert '| plan | 0 | 0 | 0 | 0 | 1 |' in kills.section({'plan': outcome}, {}, {}, 'so')
