@@ -24,6 +24,7 @@ from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000
 _OLDEST = 15  # of pyarrow: from there on pages have checksums
+_LARGEST = 2**63 - 1  # whole number of a Parquet table
 _NAMES = b'fisheye_svp_ros: CRC of the names'  # the foot of a Parquet file has no checksum
 
 _WHOLE = re.compile(r'[+-]?[0-9]{1,18}')
@@ -90,6 +91,8 @@ class Parts:
             for name, kind in self._types.items():
                 if not all(type(cell) in (kind, type(None)) for cell in part[name]):
                     raise ValueError(f'{name} holds other values than {kind.__name__}')
+                if kind is int and any(abs(cell or 0) > _LARGEST for cell in part[name]):
+                    raise ValueError(f'{name} holds a number above {_LARGEST}')
         except (OutputError, ValueError, TypeError) as cause:
             raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
                               'compute it anew') from cause

@@ -103,7 +103,9 @@ def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
                 yield _contents(body, f'the chunk at byte {place}', note)
             break
         if opcode == Opcode.FOOTER:
-            return
+            if stream.read(len(_MAGIC) + 1) == _MAGIC:
+                return
+            break
         # What the summary repeats of the data is not looked at.
         data = data and opcode != Opcode.DATA_END
         if opcode == Opcode.CHUNK and data:

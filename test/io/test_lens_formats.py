@@ -187,6 +187,8 @@ def test_boofcv() -> None:
     ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
     ("'LENSMODEL_CAHVORE'" + '-1' * 120_000, 'more than 100000 values'),
+    ("{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0...37', 'intrinsics': " + str([1.0] * 12)
+     + ", 'imagersize': [2, 2]}", 'can be read'),
     ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}", 'can be read'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
     ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'

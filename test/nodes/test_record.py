@@ -183,6 +183,18 @@ def test_no_flipped_bit_changes_a_table_in_silence(tmp_path: Path) -> None:
     assert told > 200, 'most of the file is messages'
 
 
+def test_a_chunk_that_became_a_footer_is_no_end(tmp_path: Path) -> None:
+    write_results(tmp_path / 'bag', 3)
+    file, = (tmp_path / 'bag').glob('*.mcap')
+    data = bytearray(file.read_bytes())
+    chunk = 8 + 9 + int.from_bytes(data[9:17], 'little')
+    assert data[chunk] == 6
+    data[chunk] = 2
+    file.write_bytes(data)
+    with pytest.raises(BagError, match=f'from byte {chunk} on it cannot be followed'):
+        list(Bag(tmp_path / 'bag').records(is_tabulated))
+
+
 def test_what_is_whole_after_the_damage_is_read_once_and_the_place_is_named(
     tmp_path: Path
 ) -> None:

@@ -395,6 +395,8 @@ def test_a_damaged_part_is_named(tmp_path: Path) -> None:
         parts.write(number, {'n': [number], 'x': [None], 'note': ['']})
     parts.join(tmp_path / 'whole')
     assert (tmp_path / 'whole.csv').read_text() == 'n,x,note\n0,,\n1,,\n2,,\n'
-    (tmp_path / 'parts' / '000000001.json').write_text('{"n": [1], "x": [], "note": [""]}')
-    with pytest.raises(OutputError, match=r'000000001.json: a part of the table is damaged'):
-        parts.join(tmp_path / 'whole')
+    for damaged in ('{"n": [1], "x": [], "note": [""]}',
+                    '{"n": [9223372036854775808], "x": [1.0], "note": [""]}'):
+        (tmp_path / 'parts' / '000000001.json').write_text(damaged)
+        with pytest.raises(OutputError, match=r'000000001.json: a part of the table is damaged'):
+            parts.join(tmp_path / 'whole')

@@ -19,7 +19,8 @@ from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 
-_LINEARITY = re.compile(r'LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)$')
+_LINEARITY = re.compile(
+    r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$')
 _MOST_TOKENS = 100_000
 _AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
 _TERMS, _GRID, _TOLERANCE = 3, 400, 0.01
