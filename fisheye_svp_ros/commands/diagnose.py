@@ -6,7 +6,7 @@ import argparse
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import together
@@ -40,6 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--held-out', metavar='TEST',
                         help='other observations of the same camera and target to measure the '
                         'gain on; by default frames of OBS in turn')
+    parser.add_argument('--against', metavar='OTHER',
+                        help='other observations of the same camera, of another target or another '
+                        'day: what moves with the lens must hold there too')
     parser.add_argument('--with', dest='included', action='append', default=[], metavar='NAME',
                         help='a cause that is known to be there: it is fitted without a test')
     parser.add_argument('--without', dest='left_out', action='append', default=[], metavar='NAME',
@@ -66,6 +69,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.diagnosis.diagnosis import diagnose
     from fisheye_svp_ros.diagnosis.inputs import free_names, poses_by_frame, rig_lenses
     from fisheye_svp_ros.diagnosis.known_truth import known_errors
+    from fisheye_svp_ros.diagnosis.two_sets import diagnose_against
     from fisheye_svp_ros.diagnosis.wanted import Wanted
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.reporting.progress import stages
@@ -82,12 +86,17 @@ def run(args: argparse.Namespace) -> None:
     poses = None
     if args.poses:
         poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
+    other = _read(args.against, args, given)[0] if args.against else None
     with stages('diagnosing') as progress:
-        diagnosis = diagnose(
-            observations, lens, free_intrinsics=free, poses=poses, held_out=held_out,
-            wanted=Wanted(tuple(args.included), tuple(args.left_out), args.quick),
-            progress=progress,
-        )
+        settings: dict[str, Any] = {
+            'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
+            'wanted': Wanted(tuple(args.included), tuple(args.left_out), args.quick),
+            'progress': progress,
+        }
+        if other is None:
+            diagnosis = diagnose(observations, lens, **settings)
+        else:
+            diagnosis = diagnose_against(observations, other, lens, **settings)
         progress('errors where the truth is known', 0.88)
         known = known_errors(diagnosis.before, diagnosis.after, names)
         wanted = _wanted(args, diagnosis) if args.count else None
@@ -127,12 +136,13 @@ def _print(
     diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None, wanted: Next | None
 ) -> None:
     from fisheye_svp_ros.reporting import diagnosis_text as text
-    from fisheye_svp_ros.reporting import shot_list
+    from fisheye_svp_ros.reporting import external_text, shot_list
     from fisheye_svp_ros.reporting.tables import print_paragraphs, print_table
 
-    print_paragraphs(
-        text.VERDICTS[diagnosis.verdict], text.verdict_sentences(diagnosis, known)
-    )
+    external = external_text.sections(diagnosis)
+    print_paragraphs(text.VERDICTS[diagnosis.verdict], [
+        *text.verdict_sentences(diagnosis, known), *(one.sentence for one in external)
+    ])
     print_table(
         'variance budget', text.BUDGET_HEADER, text.budget_rows(diagnosis), words=text.BUDGET_WORDS
     )
@@ -142,6 +152,10 @@ def _print(
             f'{diagnosis.base.heldout_rms_px:.4f} px without any cause',
             text.CAUSE_HEADER, text.cause_rows(diagnosis), words=text.CAUSE_WORDS,
         )
+    for one in external:
+        if one.carried:
+            print_table(one.title, external_text.CARRIED_HEADER, one.carried,
+                        words=external_text.CARRIED_WORDS)
     if wanted:
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)

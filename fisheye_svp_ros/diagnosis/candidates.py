@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera
+from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 
 _GAPS = 4
@@ -23,12 +23,13 @@ _GAPS = 4
 class Forms:
     """Effects in all their forms.
 
-    effects: every form; at: the columns of each; columns (F, M, K), whitened; generic (K,): those
-    of the richest forms; count: forms by name; untestable: why, by name.
+    effects: every form; at: the columns of each (a form of several cameras has those of each);
+    columns (F, M, K), whitened; generic (K,): those of the richest forms; count: forms by name;
+    untestable: why, by name.
     """
 
     effects: tuple[Effect, ...]
-    at: tuple[slice, ...]
+    at: tuple[Index, ...]
     columns: Array
     generic: Index
     count: dict[str, int]
@@ -61,18 +62,30 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
         for own in by_lens:
             if name == SessionStepEffect.name:
                 richest += _longest_pauses(own)
-            else:
-                richest.append(max(own, key=lambda form: len(form.parameters)))
-    at, start = [], 0
-    for effect in effects:
-        at.append(slice(start, start + len(effect.parameters)))
-        start = at[-1].stop
+            elif lasting := [form for form in own if not form.per_frame]:
+                # What every frame has anew would take up the frames' own variance.
+                richest.append(max(lasting, key=lambda form: len(form.parameters)))
+    ends = np.cumsum([0, *(len(effect.parameters) for effect in effects)])
+    at = [np.arange(*ends[i : i + 2]) for i in range(len(effects))]
     blocks = [linear.effect_columns(effect) for effect in effects]
     columns = np.concatenate([np.zeros((*linear.residual.shape, 0)), *blocks], axis=-1)
-    generic = [np.arange(s.start, s.stop) for e, s in zip(effects, at, strict=True)
-               if any(e is r for r in richest)]
+    generic = [own for e, own in zip(effects, at, strict=True) if any(e is r for r in richest)]
     where = np.concatenate([np.zeros(0, dtype=np.int64), *generic])
+    for both, theirs in _of_all_cameras(effects, at, linear.data.cameras):
+        effects.append(both)
+        at.append(theirs)
+        count[both.name] += 1
     return Forms(tuple(effects), tuple(at), columns, where, count, untestable)
+
+
+def simplest_form(kind: type[Effect], scene: Scene, labels: Sequence[str]) -> Effect:
+    """Return the simplest form of an effect, of every camera of a rig where lenses have it.
+
+    Raises Untestable where there is none.
+    """
+    first = [forms[0] for forms in _forms(kind, scene, labels)]
+    own = [effect for effect in first if isinstance(effect, OfCameras)]
+    return together(own) if own else first[0]
 
 
 def _forms(
@@ -95,6 +108,23 @@ def _forms(
     if not found:
         raise reason
     return found
+
+
+def _of_all_cameras(
+    effects: Sequence[Effect], at: Sequence[Index], cameras: int
+) -> list[tuple[Effect, Index]]:
+    """Return forms that every camera of a rig has alike, with the columns of each camera's own.
+
+    What lenses of one kind have in common they show together before one of them shows it.
+    """
+    alike: dict[str, list[tuple[OfCameras, Index]]] = {}
+    for effect, own in zip(effects, at, strict=True):
+        if isinstance(effect, OfCameras):
+            alike.setdefault(effect.parts[0][2].key, []).append((effect, own))
+    return [
+        (together([effect for effect, _ in forms]), np.concatenate([own for _, own in forms]))
+        for forms in alike.values() if len(forms) == cameras
+    ]
 
 
 def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:

@@ -120,10 +120,10 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
     information = evidence.restored(evidence.information, rest)
     left = swept(information, rest)
     strength = evidence.score(left, columns).statistic
-    known = {effect.name for effect, _ in evidence.linear.state.terms}
+    known = {one for effect, _ in evidence.linear.state.terms for one in effect.kinds}
     same: list[str] = []
     for other in candidates(evidence, rest):
-        if other.effect.name in known or other.effect.name in same:
+        if known & set(other.effect.kinds) or other.effect.name in (name, *same):
             continue
         if other.score.statistic < CLASS_STRENGTH * strength:
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
+from itertools import takewhile
 
 import numpy as np
 
@@ -16,7 +17,7 @@ SIGNIFICANCE = 0.01
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
-_BETTER = 6.0  # by so much another effect must describe the data better to take a cause's place
+_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
 _ABSURD = 30.0  # times what would be a large value of a parameter
 _HELD_OUT = 1.5  # standard errors by which held-out frames must be predicted better
 
@@ -159,12 +160,12 @@ def choose(
     """
     choice, failed = Choice([], []), set()
     while len(choice.forms) < most:
-        best = next((
-            c for c in eligible(evidence, included)
-            if c.form not in failed and c.effect.name not in refused
-        ), None)
+        left = (c for c in eligible(evidence, included)
+                if c.form not in failed and c.effect.name not in refused)
+        best = next(left, None)
         if best is None:
             break
+        best = _likelier(best, left)
         columns = evidence.columns_of(best.form)
         gain = HeldOutGain(np.inf, 0.0)
         if not (best.effect.per_frame or quick):
@@ -176,6 +177,16 @@ def choose(
         else:
             failed.add(best.form)
     return choice
+
+
+def _likelier(best: Candidate, others: Iterator[Candidate]) -> Candidate:
+    """Return what stands for the best candidate: the same of a look-alike that is more common."""
+    near = takewhile(lambda c: c.merit > best.merit - _ODDS, others)
+    if not best.effect.rarer_than:
+        return best
+    size = len(best.effect.parameters)
+    return next((c for c in near if c.effect.name == best.effect.rarer_than
+                 and len(c.effect.parameters) == size), best)
 
 
 def _step(candidate: Candidate, gain: HeldOutGain) -> Step:

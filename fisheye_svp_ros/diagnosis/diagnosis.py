@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from fisheye_svp_ros.diagnosis.refit import Local
 from fisheye_svp_ros.diagnosis.search import Found, search
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
 from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
+from fisheye_svp_ros.diagnosis.two_cameras import TwoCameras, agreed
 from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
@@ -40,6 +41,9 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.two_sets import TwoSets
+
 # A step this small beside the noise is how numbers are written, not a cause.
 _STEP_OVER_NOISE = 0.1
 
@@ -48,7 +52,8 @@ _STEP_OVER_NOISE = 0.1
 class Diagnosis:
     """The answer; `before` and `after` are the linearised states for whoever draws them.
 
-    errors: of poses and image points by the extended lens.
+    errors: of poses and image points by the extended lens; cameras: what each two cameras of a rig
+    say of each other; against: what another data set of the camera says.
     """
 
     verdict: str
@@ -71,8 +76,10 @@ class Diagnosis:
     lenses: dict[str, Lens]
     local: Local
     errors: ModelError
+    cameras: list[TwoCameras]
     before: Linearised
     after: Linearised
+    against: TwoSets | None = None
 
     @property
     def lens(self) -> Lens:
@@ -85,6 +92,11 @@ class Diagnosis:
         def plain(fit: Fit) -> dict[str, Any]:
             return {name: value for name, value in asdict(fit).items() if value is not None}
 
+        external: dict[str, Any] = {}
+        if self.cameras:
+            external['cameras'] = [pair.to_dict() for pair in self.cameras]
+        if self.against is not None:
+            external['sets'] = self.against.to_dict()
         return {
             'verdict': self.verdict,
             'noise_px': self.noise_px,
@@ -104,6 +116,7 @@ class Diagnosis:
             'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
             'uncertainty': self.errors.summary(self.after),
             'trace': [asdict(step) for step in self.trace],
+            **({'external': external} if external else {}),
         }
 
 
@@ -146,12 +159,14 @@ def diagnose(
         # Index and lens curve look alike: the intrinsics stay as they were in air.
         data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
+    found, cameras = agreed(found, free, wanted, lambda less: search(
+        data, base, free, less, gross, progress), progress)
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data', 0.8)
     return _judged(
         observations, lenses, found, Measured(found, free, held_out, wanted.quick, medium),
-        noise_causes, held_out,
+        noise_causes, cameras, held_out,
     )
 
 
@@ -163,7 +178,7 @@ def _residual_px(linear: Linearised) -> float:
 
 def _judged(
     observations: Observations, lenses: Mapping[str, Lens], found: Found, measured: Measured,
-    noise_causes: list[Cause], held_out: Observations | None,
+    noise_causes: list[Cause], cameras: list[TwoCameras], held_out: Observations | None,
 ) -> Diagnosis:
     evidence = found.evidence
     components = measured.components({c.effect: c.p_value for c in noise_causes})
@@ -198,6 +213,7 @@ def _judged(
         lenses=extended_lenses(lenses, found.state, observations),
         local=measured.local,
         errors=ModelError.of(evidence),
+        cameras=cameras,
         before=measured.before,
         after=evidence.linear,
     )

@@ -21,9 +21,10 @@ from fisheye_svp_ros.diagnosis.fields import mean_fields
 from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
-from fisheye_svp_ros.diagnosis.random_effects import Design, design
-from fisheye_svp_ros.diagnosis.reml import Variances, start_variances
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
+from fisheye_svp_ros.diagnosis.reml import Variances, nothing_random, start_variances
 from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
@@ -129,8 +130,7 @@ class Evidence:
 
     def columns_of(self, form: int) -> Index:
         """Return the border's columns of a form."""
-        at = self.forms.at[form]
-        return np.arange(at.start, at.stop) + self.own
+        return self.forms.at[form] + self.own
 
     def score(self, left: Array, columns: Index) -> Score:
         """Test columns by the information `left` once what is in the model is swept out."""
@@ -184,6 +184,18 @@ def gather_evidence(
     free_ones = np.concatenate([own, bare.own + bare.forms.generic])
     basis = identifiable(bare.linear.frame_columns, bare.border[..., :-1], free_ones)
     return replace(bare, variances=find_variances(bare.full.bordered(basis), before))
+
+
+def bare_evidence(
+    data: Data, state: State, free: Sequence[str], variances: Variances | None = None
+) -> Evidence:
+    """Return the evidence around a state with nothing to be added.
+
+    variances: of the null model; None for nothing random.
+    """
+    finest = variances is not None and bool(variances.alive[NAMES.index('image_finest')])
+    bare = _multiplied(data, state, free, tuple(CATALOGUE), finest)
+    return replace(bare, variances=variances or nothing_random(len(bare.design.landmark)))
 
 
 def _multiplied(

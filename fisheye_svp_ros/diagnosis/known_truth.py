@@ -46,7 +46,7 @@ def known_errors(
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_trained(linear, free)) for linear in (before, after)] if measured else []
     return {
-        name: _compared(*(
+        name: compared(*(
             np.concatenate([errors(held_out, state) for held_out, state in folds])
             for folds in pairs
         ))
@@ -109,7 +109,8 @@ def _shared(data: Data, view: int) -> tuple[Array, Array, Array]:
     return data.views.points[view, i], uv[view, i], uv[other].reshape(-1, 2)[j]
 
 
-def _compared(base: Array, extended: Array) -> Compared:
+def compared(base: Array, extended: Array) -> Compared:
+    """Compare the errors (F,) of frames, NaN where there is none."""
     known = np.isfinite(base) & np.isfinite(extended)
     both = np.stack([base[known], extended[known]])
     rows = np.random.default_rng(0).integers(0, both.shape[1], (_RESAMPLES, both.shape[1]))

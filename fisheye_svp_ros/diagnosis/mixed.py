@@ -23,6 +23,7 @@ from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design
 FIXED, ABSENT = -1, -2  # labels: without a prior; not there
 _RIDGE = 1e-10  # of a pose's normalised columns: known poses have none
 _NEVER = 1e12
+_UNTOLD = 1e-5  # of a column's own information, where rounding has made the whole indefinite
 
 
 def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
@@ -270,7 +271,7 @@ class Solution(NamedTuple):
 def solve(f: Factored, spread: bool = True) -> Solution:
     """Solve for all coefficients; the border must be of full rank."""
     info, gradient = f.information[:-1, :-1], f.information[:-1, -1]
-    root = linalg.cholesky(info, lower=True, check_finite=False)
+    root = _root(info)
     half = solve_lower(root, gradient)
     values = solve_lower(root, half, trans=1)
     freedom = f.equations.rows - f.equations.poses - len(values)
@@ -283,6 +284,14 @@ def solve(f: Factored, spread: bool = True) -> Solution:
     spread_e = np.diagonal(known.block, axis1=-2, axis2=-1) + np.reshape(
         (known.e**2).sum(axis=1), e.shape)
     return Solution(values, variance, e, r, spread_e, (known.r**2).sum(axis=1), deviance)
+
+
+def _root(info: Array) -> Array:
+    """Return the lower root; what random parts have all but taken up stays where it is."""
+    try:
+        return np.asarray(np.linalg.cholesky(info))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.cholesky(info + _UNTOLD * np.diag(np.diag(info))))
 
 
 def _back(factor: Array, right: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -284,18 +284,21 @@ class Prior(NamedTuple):
     stderr: Array
 
 
-def fit(data: Data, state: State, free: Sequence[str], prior: Prior | None = None) -> State:
+def fit(
+    data: Data, state: State, free: Sequence[str], prior: Prior | None = None,
+    held: Collection[str] = (),
+) -> State:
     """Refit poses, rig, free intrinsics and effect values together by least squares.
 
-    The frames are the blocks of one arrow.
+    The frames are the blocks of one arrow.  held: effects whose values stay what they are.
     """
-    problem = _Fit(data, state, free, prior=prior)
+    problem = _Fit(data, state, free, held, prior)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
 def fit_poses(data: Data, state: State) -> State:
     """Refit the poses of the frames alone."""
-    problem = _Fit(data, state, (), poses_only=True)
+    problem = _Fit(data, state, (), held=None)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
@@ -311,11 +314,16 @@ class _Fit:
     """One arrow system: frames are the blocks; rig, intrinsics and effects are shared."""
 
     def __init__(
-        self, data: Data, template: State, free: Sequence[str], poses_only: bool = False,
-        prior: Prior | None = None,
+        self, data: Data, template: State, free: Sequence[str],
+        held: Collection[str] | None = (), prior: Prior | None = None,
     ) -> None:
+        """Take what to fit; held: effects that stay as they are, None for all but the poses."""
         self._data, self._template, self._free = data, template, tuple(free)
-        self._poses_only, self._prior = poses_only, prior
+        self._prior = prior
+        moving = [np.full(6 * (data.cameras - 1) + len(self._free), held is not None)]
+        moving += [np.full(len(values), held is not None and effect.name not in held)
+                   for effect, values in template.terms if is_shared(effect)]
+        self._moving = np.concatenate(moving)
 
     def pack(self, state: State) -> Arrays:
         lens = np.concatenate([
@@ -347,12 +355,11 @@ class _Fit:
         if not len(index):
             return np.zeros(0), ()
         linear = Linearised(self._data, self.unpack(state), self._free)
-        if self._poses_only:
+        if self._moving.any():
             # A column of zeros leaves its parameter where it is.
-            count = 6 * (self._data.cameras - 1) + state[-1].shape[-1]
-            shared = np.zeros((*linear.residual.shape, count))
+            shared = linear.shared_columns * self._moving
         else:
-            shared = linear.shared_columns
+            shared = np.zeros((*linear.residual.shape, len(self._moving)))
         cost, normal = _equations(linear.residual, linear.frame_columns, shared)
         if self._prior is not None:
             off = (state[-1][0] - self._prior.mean) / self._prior.stderr

@@ -24,6 +24,7 @@ FAR = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
 FRAME = 'its cameras contradict each other: points in another order, or another moment'
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
+_FRAME = 6.0  # times the median frame: cameras that contradict each other
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _SETTLED = 0.1  # of the scale: how little predictions may move
@@ -69,13 +70,14 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     """
     model = state.cameras
     views, pose = data.views, state.view_poses(data)
+    alone = model.localize(views) if data.cameras > 1 else pose
     scale, offset = _scale(views, _offset(model, pose, views))
     if np.nanmax(offset / scale) > _SUSPECT:
         for _ in range(_ROUNDS):
             before = offset
             fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
             weight = np.where(views.used, views.weight * fading, 0.0)
-            pose = model.localize(views._replace(weight=weight), pose)
+            alone = pose = model.localize(views._replace(weight=weight), pose)
             scale, offset = _scale(views, _offset(model, pose, views))
             if np.nanmax(np.abs(offset - before) / scale) < _SETTLED:
                 break
@@ -86,7 +88,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
     swapped = _fits_another(model, pose, views, far, _GATE * typical)
     gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
-    torn, apart = _torn_frames(data, state, typical)
+    torn, apart = _torn_frames(data, state, alone, typical)
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
     for mask, px, why in ((swapped, offset, SWAPPED), (far & ~swapped, offset, FAR),
@@ -96,18 +98,21 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     return set_aside(data, far | (views.used & (whole | torn)[:, None])), gross
 
 
-def _torn_frames(data: Data, state: State, typical: float) -> tuple[Mask, Array]:
+def _torn_frames(
+    data: Data, state: State, alone: Pose, typical: float
+) -> tuple[Mask, Array]:
     """Return the views (S,) of frames whose cameras contradict each other, and by how much, px.
 
-    Each view alone may fit: a board seen in reversed order is a board turned by half.  But then
-    no pose of the rig explains two of them, whichever is asked to predict the other.
+    Each view alone may fit, its camera posed (S,) by itself: a board seen in reversed order is a
+    board turned by half.  But then no pose of the rig explains two of them, whichever is asked to
+    predict the other, as little as in most frames.
     """
     views, model = data.views, state.cameras
     apart = np.zeros(views.used.shape)
     if data.cameras < 2:
         return np.zeros(len(views.frame), dtype=bool), apart
     place = state.rig.take(data.camera_of)
-    body = model.localize(views).compose(place.inverse())
+    body = alone.compose(place.inverse())
     misfit = np.full(len(views.frame), np.inf)
     several = np.bincount(data.frame_of)[data.frame_of] > 1
     for step in range(1, data.cameras):
@@ -119,7 +124,8 @@ def _torn_frames(data: Data, state: State, typical: float) -> tuple[Mask, Array]
         median = np.nanmedian(np.where(np.isfinite(offset), offset, 1e9), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
         apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
-    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX))
+    usual = float(np.median(misfit[several])) if several.any() else 0.0
+    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
     return np.asarray(torn & (torn.mean() < 0.2)), apart
 
 

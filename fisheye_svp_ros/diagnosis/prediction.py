@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -25,7 +25,12 @@ class HeldOut(NamedTuple):
     @property
     def rms(self) -> float:
         """Root mean square of the 2-D residual norm, px."""
-        return float(np.sqrt(self.squares.sum() / self.counts.sum()))
+        return float(self.rms_of(np.arange(len(self.squares))))
+
+    def rms_of(self, rows: Index) -> Array:
+        """Return the rms (...), px, of the frames (..., F) that count."""
+        return np.asarray(
+            np.sqrt(self.squares[rows].sum(axis=-1) / self.counts[rows].sum(axis=-1)))
 
     def excess(self, noise: float, rows: Index) -> Array:
         """Mean squares (B,) above what noise leaves once each frame has fitted its pose, px^2.
@@ -45,10 +50,29 @@ class Gain(NamedTuple):
     high: float
 
 
+class Less(NamedTuple):
+    """By how much an rms is less, px, and its 95 % interval over frames."""
+
+    value: float
+    low: float
+    high: float
+
+
+def less_between(before: HeldOut, after: HeldOut) -> Less:
+    """Return by how much the rms is less, with a bootstrap interval over frames."""
+    rows = _resampled(before)
+    low, high = np.quantile(before.rms_of(rows) - after.rms_of(rows), (0.025, 0.975))
+    return Less(before.rms - after.rms, float(low), float(high))
+
+
+def _resampled(held_out: HeldOut) -> Index:
+    frames = len(held_out.squares)
+    return np.random.default_rng(0).integers(0, frames, (_RESAMPLES, frames))
+
+
 def gain_between(before: HeldOut, after: HeldOut, noise: float) -> Gain:
     """Return the gain with a bootstrap interval over frames."""
-    rng = np.random.default_rng(0)
-    rows = rng.integers(0, len(before.squares), (_RESAMPLES, len(before.squares)))
+    rows = _resampled(before)
     low, high = np.quantile(_ratio(before, after, noise, rows), (0.025, 0.975))
     whole = np.arange(len(before.squares))[None]
     return Gain(float(_ratio(before, after, noise, whole)[0]), float(low), float(high))
@@ -74,7 +98,7 @@ def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldO
 def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]) -> State:
     """Return the state without some of its effects, the rest fitted anew (one linear step)."""
     linear = evidence.linear
-    kept, change, _ = _refitted(evidence, evidence.information, names)
+    kept, change, _ = _refitted(evidence, evidence.information, names, ())
     shared = np.zeros(evidence.own)
     shared[kept] = change
     state = linear.state
@@ -84,17 +108,20 @@ def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]
 
 
 def _refitted(
-    evidence: Evidence, information: Array, names: Sequence[str]
+    evidence: Evidence, information: Array, names: Collection[str], held: Collection[str]
 ) -> tuple[Index, Array, Array]:
-    """Return the columns that stay without some causes, their change, and (X + 1,) what is left.
+    """Return the columns that are fitted, their change, and (X + 1,) what is left.
 
-    The last is the combination of the border that is the residual once the causes are gone.
+    names: causes that are gone; held: causes that stay as they are.  The last is the combination
+    of the border that is the residual then.
     """
     gone = np.zeros(evidence.own, dtype=bool)
     values = np.zeros(evidence.own)
     for effect, columns, value in evidence.terms:
         if effect.name in names:
             gone[columns], values[columns] = True, value
+        elif effect.name in held:
+            gone[columns] = True
     way = np.zeros(len(information))
     way[-1] = 1.0
     # Without an effect its displacement comes back into the residual.
@@ -107,13 +134,17 @@ def _refitted(
 
 
 def frames_in_turn(
-    evidence: Evidence, without: Sequence[str] = (), local: bool = False
+    evidence: Evidence, without: Collection[str] = (), local: bool = False,
+    held: Collection[str] = (),
 ) -> HeldOut:
-    """Predict frames left out in turn by a fit to the others (linear in all parameters)."""
+    """Predict frames left out in turn by a fit to the others (linear in all parameters).
+
+    without: causes that are left out; held: causes that are not fitted anew.
+    """
     linear, even = evidence.linear, _evenly(evidence.linear)
     residual = np.zeros_like(linear.residual)
     for frame, information in enumerate(evidence.in_turn):
-        _, _, way = _refitted(evidence, information, without)
+        _, _, way = _refitted(evidence, information, without, held)
         rows = evidence.left_out.rows if local else evidence.border
         left, poses = rows[frame] @ way * even[frame], linear.frame_columns[frame]
         poses = poses * even[frame][:, None]

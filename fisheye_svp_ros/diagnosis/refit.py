@@ -29,6 +29,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     design,
 )
 from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
 _ROUNDS = 4
 _SETTLED = 3e-3  # of the noise: what a step moves predictions by
@@ -55,9 +56,7 @@ class Local(NamedTuple):
     def applied(self, data: Data) -> Data:
         """Return data with landmarks where they are predicted and the image field taken out."""
         views = data.views
-        order = np.clip(np.searchsorted(self.landmark, views.landmark), 0, len(self.landmark) - 1)
-        known = (self.landmark[order] == views.landmark) & views.used
-        points = views.points + np.where(known[..., None], self.offset[order], 0.0)
+        points = views.points + at_landmarks(views, self.landmark, self.offset)
         uv = views.uv.copy()
         for grid, values in self.grids:
             mine = views.used & (data.camera_of[:, None] == grid.camera)

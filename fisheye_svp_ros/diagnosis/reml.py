@@ -52,6 +52,11 @@ class Variances:
         return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
 
 
+def nothing_random(landmarks: int, sigma: float = 1.0) -> Variances:
+    """Return variances without any random component."""
+    return Variances(sigma, np.full(len(NAMES), GONE), np.ones(landmarks))
+
+
 def start_variances(eq: Equations, share: float = 0.03) -> Variances:
     """Return variances with which every component adds a share of the noise."""
     squares = _sums(eq, np.diagonal(eq.blocks.ee, axis1=-2, axis2=-1), np.diag(eq.blocks.rr))

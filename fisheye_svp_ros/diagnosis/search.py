@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     HeldOutGain,
@@ -184,7 +185,7 @@ def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) 
     scene = Linearised(data, state, free).scene
     for name in wanted.included:
         try:
-            state = with_effect(state, next(iter(CATALOGUE[name].candidates(scene))))
+            state = with_effect(state, simplest_form(CATALOGUE[name], scene, state.labels))
         except Untestable as why:
             raise ObservationError(f'{data.observations.source}: {name}: {why}') from why
     return refit_by_least_squares(data, state, free)

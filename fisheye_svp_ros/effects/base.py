@@ -112,6 +112,7 @@ class Effect(ABC):
     name: ClassVar[str]
     stage: ClassVar[str]
     of_target: ClassVar[bool] = False  # whether another target would not have it
+    rarer_than: ClassVar[str] = ''  # an effect that does nearly the same and is more common
     signature: ClassVar[str]
     to_separate: ClassVar[str]
 
@@ -186,6 +187,11 @@ class Effect(ABC):
     def per_frame(self) -> bool:
         """Whether parameters belong to single frames, so that other frames say nothing of them."""
         return False
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What it is, once for each camera of a rig that has it for itself."""
+        return (self.name,)
 
     @property
     def key(self) -> str:

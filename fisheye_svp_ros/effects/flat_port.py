@@ -25,6 +25,7 @@ class FlatPortEffect(Effect):
 
     name = 'flat_port'
     stage = 'ray'
+    rarer_than = 'viewpoint_shift'
     signature = (
         'residuals along the radius that grow with the angle and with 1 / range, bounded by the '
         'thickness'

@@ -32,6 +32,10 @@ class OfCameras(Effect):
         return f'{self.name}({forms})'
 
     @property
+    def kinds(self) -> tuple[str, ...]:
+        return tuple(f'{label}.{self.name}' for _, label, _ in self.parts)
+
+    @property
     def of_recording(self) -> bool:
         return any(effect.of_recording for _, _, effect in self.parts)
 
@@ -68,13 +72,18 @@ class OfCameras(Effect):
 @cache
 def of_cameras(kind: type[Effect]) -> type[OfCameras]:
     """Return the class of an effect's forms by camera; it has the effect's name."""
-    words = {name: getattr(kind, name) for name in ('name', 'stage', 'to_separate')}
+    words = {name: getattr(kind, name) for name in ('name', 'stage', 'rarer_than', 'to_separate')}
     return type(f'{kind.__name__}OfCameras', (OfCameras,), words)
 
 
 def by_camera(camera: int, label: str, effects: Iterable[Effect]) -> Sequence[OfCameras]:
     """Return effects as those of one camera."""
     return [of_cameras(type(effect))(((camera, label, effect),)) for effect in effects]
+
+
+def together(effects: Sequence[OfCameras]) -> OfCameras:
+    """Return forms of one effect of different cameras as one, its parameters in their order."""
+    return type(effects[0])(tuple(part for effect in effects for part in effect.parts))
 
 
 def camera_terms(terms: Iterable[Term], camera: int) -> tuple[Term, ...]:

@@ -16,14 +16,14 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.diagnosis.points import PointResiduals
+from fisheye_svp_ros.diagnosis.target_map import BoardMap, board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text, written
 from fisheye_svp_ros.reporting import diagnosis_text as text
-from fisheye_svp_ros.reporting import shot_list
+from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
-from fisheye_svp_ros.reporting.target_map import BoardMap, board_maps
 from fisheye_svp_ros.reporting.uncertainty_plot import draw_uncertainty
 
 _CAPTIONS = {
@@ -93,10 +93,20 @@ def write_report(
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
         next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs),
+        external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
+        extended=_extended(diagnosis, inputs.folder),
     )
     report = inputs.folder / 'report.html'
     write_text(report, page)
     return [report, *pictures]
+
+
+def _extended(diagnosis: Diagnosis, folder: Path) -> dict[str, str]:
+    """Return the extended lens files: as options of a command, and the first one."""
+    files = {camera: folder / camera / text.EXTENDED for camera in diagnosis.lenses}
+    options = [f'--lens {camera}={path}' if camera else f'--lens {path}'
+               for camera, path in files.items()]
+    return {'options': ' '.join(options), 'first': str(next(iter(files.values())))}
 
 
 def _next(wanted: Next | None) -> dict[str, Any]:

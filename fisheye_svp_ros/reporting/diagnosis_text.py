@@ -14,9 +14,9 @@ from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
+from fisheye_svp_ros.diagnosis.target_map import board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import with_error
-from fisheye_svp_ros.reporting.target_map import board_maps
 
 EXTENDED = 'extended_lens.yaml'
 VERDICTS = {
@@ -48,6 +48,8 @@ _MEASURES = {
     'position_error_m': ('position error', 1e3, 'mm'),
     'axis_error_rad': ('error of the viewing axis', 180 / math.pi, 'deg'),
     'depth_error_m': ('stereo error', 1e3, 'mm'),
+    'rig_translation_m': ('translation of the rig', 1e3, 'mm'),
+    'rig_rotation_rad': ('rotation of the rig', 180 / math.pi, 'deg'),
 }
 _UNCERTAIN = {
     'image_px': ('an image point, u or v', 1.0, 'px'),
@@ -218,7 +220,12 @@ def _next(d: Diagnosis) -> str:
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
         return f'Keep the lens as it is{blind}.'
-    steps = [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
+    steps = [
+        f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
+        'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
+        'it until then' for pair in d.cameras if pair.verdict == 'contradict'
+    ]
+    steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
@@ -276,12 +283,16 @@ def _remedy(cause: Cause) -> str:
 
 
 def known_rows(known: Mapping[str, Compared]) -> Iterable[tuple[str, str, str, str]]:
-    """Yield name, mean error before and after, and by how much it is less."""
-    for name, compared in known.items():
-        label, factor, unit = _MEASURES[name]
-        yield (label, f'{factor * compared.base:.3g} {unit}',
-               f'{factor * compared.extended:.3g} {unit}',
-               f'{percent(compared.gain)} ({percent(compared.low)} to {percent(compared.high)})')
+    """Return name, mean error before and after, and by how much it is less."""
+    return (compared_row(name, compared) for name, compared in known.items())
+
+
+def compared_row(name: str, compared: Compared) -> tuple[str, str, str, str]:
+    """Return a mean error's name, its value before and after, and by how much it is less."""
+    label, factor, unit = _MEASURES[name]
+    return (label, f'{factor * compared.base:.3g} {unit}',
+            f'{factor * compared.extended:.3g} {unit}',
+            f'{percent(compared.gain)} ({percent(compared.low)} to {percent(compared.high)})')
 
 
 def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis.target_map import BoardMap
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, round_number
 from fisheye_svp_ros.reporting.plots import picture
-from fisheye_svp_ros.reporting.target_map import BoardMap
 
 _REFUSED = '#cbd5e1'
 

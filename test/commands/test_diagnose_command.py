@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.points import point_residuals
 from fisheye_svp_ros.diagnosis.structure import Structure
+from fisheye_svp_ros.diagnosis.target_map import board_maps
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -26,7 +27,6 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, verdict_sentences
-from fisheye_svp_ros.reporting.target_map import board_maps
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo

@@ -1,0 +1,146 @@
+"""External evidence in words: what the other camera, or another data set, says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from fisheye_svp_ros.diagnosis.carried import Carried
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis.known_truth import Compared
+from fisheye_svp_ros.diagnosis.two_cameras import TwoCameras
+from fisheye_svp_ros.diagnosis.two_sets import TwoSets
+from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quantity
+
+CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
+CARRIED_WORDS = ('found in', 'tried on', 'what')
+_APART, _MOST = 3.0, 4
+SETS_TITLE = 'Another data set of this camera'
+CAMERAS_TITLE = 'The two cameras as each other\'s truth'
+
+
+class Section(NamedTuple):
+    """One kind of external evidence: a sentence, what was carried over, and further rows."""
+
+    title: str
+    sentence: str
+    carried: Sequence[tuple[str, ...]]
+    header: Sequence[str]
+    rows: Sequence[tuple[str, ...]]
+
+
+def sections(diagnosis: Diagnosis) -> list[Section]:
+    """Return the external evidence that a diagnosis has."""
+    found = [_of_cameras(pair) for pair in diagnosis.cameras]
+    return found if diagnosis.against is None else [*found, _of_sets(diagnosis.against)]
+
+
+def carried_row(one: Carried, what: str) -> tuple[str, ...]:
+    """Return where something was found, tried, what it was, rms without and with it, and less."""
+    less = one.less_px
+    return (one.source, one.to, what, f'{one.without_px:.4f}', f'{one.with_px:.4f}',
+            f'{less.value:.4f} ({less.low:.4f} to {less.high:.4f})')
+
+
+def _of_cameras(pair: TwoCameras) -> Section:
+    rows = [] if not pair.rig else list(_rig_rows(pair.rig))
+    if pair.maps is not None:
+        first, second = (f'{1e3 * rms:.3f} mm rms' for rms in pair.maps.rms_m)
+        rows += [
+            (f'height of {pair.maps.landmarks} landmarks, by {pair.cameras[0]} and by '
+             f'{pair.cameras[1]} alone', first, second,
+             f'correlation {pair.maps.correlation:.2f}'),
+            ('their places along the board', '', '',
+             f'correlation {pair.maps.correlation_along:.2f}'),
+        ]
+    return Section(
+        CAMERAS_TITLE, f'{_agreement(pair)}{_rig(pair)}.',
+        [carried_row(one, 'shape of the target') for one in pair.target],
+        ('', 'before', 'after', ''), rows,
+    )
+
+
+def _agreement(pair: TwoCameras) -> str:
+    both = listed(pair.cameras)
+    if pair.verdict == 'nothing':
+        return f'Neither {listed(pair.cameras, "nor")} calls for another shape of the target'
+    tried = listed([
+        f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
+    ])
+    carried = f'the shape of the target found by one alone takes held-out frames of {tried}'
+    alike = '' if pair.maps is None else f'; their maps correlate by {pair.maps.correlation:.2f}'
+    if pair.verdict == 'agree':
+        return f'{both} bear each other out: {carried}{alike}'
+    if pair.verdict == 'undecided':
+        return f'{both} do not settle it: {carried}, which is not beyond chance in both{alike}'
+    gone = f', so that {listed(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
+    return f'{both} contradict each other about the target: {carried}{alike}{gone}'
+
+
+def _rig(pair: TwoCameras) -> str:
+    if not pair.rig or pair.verdict in ('nothing', 'contradict'):
+        return ''
+    said = []
+    for label, before, after, less in _rig_rows(pair.rig):
+        said.append(f'{label} {before} before and {after} after ({less} less)')
+    return '; found view by view, the rig scatters: ' + listed(said)
+
+
+def _rig_rows(rig: dict[str, Compared]) -> Iterable[tuple[str, str, str, str]]:
+    return (compared_row(f'rig_{name}', value) for name, value in rig.items())
+
+
+def _of_sets(against: TwoSets) -> Section:
+    carried = []
+    for tried in filter(None, against.tried):
+        carried.append(carried_row(tried.lens, 'causes of the lens'))
+        carried += [carried_row(one, f'{name}, beside the others')
+                    for name, one in tried.causes.items()]
+        carried.append(carried_row(tried.whole, 'the whole lens, intrinsics too'))
+        if tried.target is not None:
+            carried.append(carried_row(tried.target, 'shape of the target'))
+    rows = [
+        (name, quantity({'value': one.value, 'stderr': one.stderr, 'unit': one.unit}),
+         quantity({'value': one.other_value, 'stderr': one.other_stderr, 'unit': one.unit}),
+         f'{one.apart:.1f} standard errors apart')
+        for name, one in against.parameters.items()
+    ]
+    return Section(SETS_TITLE, f'{_lens_holds(against)}{_apart(against)}{_follows(against)}.',
+                   carried, ('of the lens', 'here', Path(against.source).name, ''), rows)
+
+
+def _lens_holds(against: TwoSets) -> str:
+    if against.verdict == 'nothing':
+        return f'Neither these data nor {against.source} call for a cause that moves with the lens'
+    tried = listed([
+        f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
+        for one in against.tried if one is not None
+    ])
+    said = {
+        'agree': 'What moves with the lens holds in both sets',
+        'undecided': 'Whether what moves with the lens holds in both sets is not settled',
+        'contradict': 'The two sets contradict each other about the lens',
+    }[against.verdict]
+    gone = f'; {listed(against.withdrawn)} is withdrawn' if against.withdrawn else ''
+    return f'{said}: found in one, it takes held-out frames of {tried}{gone}'
+
+
+def _apart(against: TwoSets) -> str:
+    far = sorted(((abs(one.apart), name, one) for name, one in against.parameters.items()
+                  if abs(one.apart) > _APART), reverse=True)[:_MOST]
+    if not far:
+        return '; its parameters agree within their errors' if against.parameters else ''
+    each = [f'{name} by {apart:.1f} standard errors' for apart, name, _ in far]
+    return ('; its parameters do not agree within their errors (' + listed(each)
+            + '): they are less certain than one set says')
+
+
+def _follows(against: TwoSets) -> str:
+    there = [one.target for one in against.tried if one is not None and one.target is not None]
+    if not there:
+        return ''
+    if any(one.better for one in there):
+        return ('; the correction of the target holds in the other set too: it is the same one, '
+                'or an error of the lens')
+    return '; the correction of the target does not follow to the other one, as it should'

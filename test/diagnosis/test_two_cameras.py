@@ -1,0 +1,58 @@
+"""Two cameras that see one bent board say the same of it, and of where they stand."""
+
+from dataclasses import replace
+
+from benchmark.two_cameras import Hidden, pair
+from fisheye_svp_ros.diagnosis.candidates import simplest_form
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.model import Linearised, prepare, start
+from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.reporting.external_text import sections
+
+SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
+
+
+def test_cameras_bear_each_other_out():
+    seen = pair(SMALL, 1)
+    found = diagnose(seen.table, seen.lenses, wanted=Wanted(quick=True))
+    (said,) = found.cameras
+    assert said.verdict == 'agree' and said.withdrawn == ()
+    assert said.maps.correlation > 0.95
+    assert all(one.with_px < 0.8 * one.without_px for one in said.target)
+    assert {one.source for one in said.target} == {'left', 'right'}
+    assert all(rig.low > 0 and rig.gain > 0.3 for rig in said.rig.values())
+    document = found.to_dict()['external']['cameras'][0]
+    assert set(document['rig']) == {'translation_m', 'rotation_rad'}
+    assert 'bear each other out' in sections(found)[0].sentence
+
+
+def test_cameras_that_see_different_boards_contradict_each_other():
+    seen = pair(replace(SMALL, apart=True, bend=2e-3, reversed_frames=0), 1)
+    found = diagnose(seen.table, seen.lenses, wanted=Wanted(quick=True))
+    (said,) = found.cameras
+    assert said.verdict == 'contradict' and said.withdrawn == ('target_shape',)
+    assert 'target_shape' not in [cause.effect for cause in found.causes]
+    assert 'withdrawn' in sections(found)[0].sentence
+
+
+def test_reversed_frames_are_found_among_cameras_that_fit_badly():
+    rough = Hidden((0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25)
+    seen = pair(rough, 1)
+    data = prepare(seen.table)
+    first, *others = seen.lenses.values()
+    _, gross = find_gross_errors(data, start(data, first, others))
+    torn = {int(data.observations.frame[row]) for row, why in
+            zip(gross.rows, gross.why, strict=True) if why == FRAME}
+    assert torn == set(seen.reversed_frames) and len(torn) == 2
+
+
+def test_what_the_user_knows_of_lenses_each_camera_of_a_rig_has_for_itself():
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    data = prepare(seen.table)
+    first, *others = seen.lenses.values()
+    state = start(data, first, others)
+    effect = simplest_form(ViewpointShiftEffect, Linearised(data, state, ()).scene, state.labels)
+    assert [parameter.name for parameter in effect.parameters] == ['left.e0', 'right.e0']
+    assert effect.kinds == ('left.viewpoint_shift', 'right.viewpoint_shift')

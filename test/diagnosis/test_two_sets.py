@@ -1,0 +1,83 @@
+"""Two data sets of one camera agree about its lens, whatever their boards are like."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import lens, observe, scene
+
+from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.diagnosis.two_sets import Shared, TwoSets, diagnose_against
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.reporting.external_text import sections
+
+SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()
+QUICK = Wanted(quick=True)
+
+
+def table(seed, *terms, bend=0.0):
+    """Return what the camera sees of boards that are bent, and said to be flat."""
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng, frames=8)
+    points = views.points.copy()
+    for board in range(3):
+        mine = views.board == board
+        off = points[mine] - points[mine].mean(axis=0)
+        points[mine] += np.outer(bend * (off**2).sum(axis=1) / 0.04, [0.0, 0.0, 1.0])
+    seen = observe(lens(), terms, pose, views._replace(points=points), 0.1, rng)
+    return replace(seen, xyz=views.points[0][seen.landmark], cameras=('',),
+                   source=f'set {seed}')
+
+
+def test_what_moves_with_the_lens_holds_in_the_other_set():
+    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k)
+                  for k, seed in enumerate((31, 32)))
+    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
+    said = found.against
+    assert said.verdict == 'agree' and not said.withdrawn
+    assert set(said.tried[0].causes) == {'viewpoint_shift'}
+    assert said.tried[0].causes['viewpoint_shift'].better
+    assert said.tried[0].target is None
+    e0 = said.parameters['viewpoint_shift.e0']
+    assert abs(e0.apart) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
+    assert 'holds in both sets' in sections(found)[0].sentence
+    assert found.to_dict()['external']['sets']['against'] == 'set 32'
+
+
+def test_what_the_other_set_refutes_is_withdrawn():
+    one, other = table(33, (SKEW, np.array([0.003]))), table(34, (SKEW, np.array([-0.003])))
+    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
+    assert found.against.withdrawn == ('skew',) and found.against.verdict == 'contradict'
+    assert 'skew' not in [cause.effect for cause in found.causes]
+    assert 'withdrawn' in sections(found)[0].sentence
+
+
+def test_parameters_that_do_not_agree_are_named():
+    said = TwoSets('b.csv', (None, None), {'e0': Shared(2.8e-3, 8e-5, 3.5e-3, 9e-5, 'm')})
+    assert said.verdict == 'nothing'
+    assert said.parameters['e0'].apart == pytest.approx(-5.8, abs=0.1)
+
+
+def test_command(tmp_path, capsys):
+    for name, seed in (('a', 35), ('b', 36)):
+        write_observations(tmp_path / f'{name}.csv', table(seed, (SKEW, np.array([0.003]))))
+    save_lens(lens(), tmp_path / 'lens.yaml')
+    arguments = ['diagnose', str(tmp_path / 'a.csv'), '--lens', str(tmp_path / 'lens.yaml'),
+                 '--free', 'intrinsics', '--quick', '--against', str(tmp_path / 'b.csv')]
+    assert main([*arguments, '-o', str(tmp_path / 'out')]) == 0
+    assert 'Another data set of this camera' in capsys.readouterr().out
+    document = json.loads((tmp_path / 'out/diagnosis.json').read_text())
+    assert document['external']['sets']['verdict'] == 'agree'
+    assert 'Another data set' in (tmp_path / 'out/report.html').read_text()
+
+
+def test_rigs_are_refused():
+    both = replace(table(35), cameras=('left', 'right'))
+    both = replace(both, camera=(np.arange(len(both)) % 2))
+    with pytest.raises(ObservationError, match='one camera'):
+        diagnose_against(both, both, lens())
