@@ -195,18 +195,19 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the pairs, write them and print a line for each."""
+    """Run the pairs, write those that are done and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.two_cameras')
     parser.add_argument('--pairs', type=int, default=10, help='of each kind')
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/two_cameras.json'))
     asked = parser.parse_args(arguments)
     found = []
-    for kind in KINDS:
-        for seed in range(asked.pairs):
+    for seed in range(asked.pairs):
+        for kind in KINDS:
             found.append(tried(kind, seed))
-            sys.stdout.write(json.dumps(found[-1]) + '\n')
+            lines = [json.dumps(one) for one in found]
+            sys.stdout.write(lines[-1] + '\n')
             sys.stdout.flush()
-    write_text(asked.output, json.dumps(found, indent=1) + '\n')
+            write_text(asked.output, '[\n' + ',\n'.join(lines) + '\n]\n')
 
 
 if __name__ == '__main__':

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
 from fisheye_svp_ros.diagnosis.components import find_variances
 from fisheye_svp_ros.diagnosis.fields import mean_fields
@@ -194,14 +194,19 @@ def bare_evidence(
     variances: of the null model; None for nothing random.
     """
     finest = variances is not None and bool(variances.alive[NAMES.index('image_finest')])
-    bare = _multiplied(data, state, free, tuple(CATALOGUE), finest)
-    return replace(bare, variances=variances or nothing_random(len(bare.design.landmark)))
+    there = variances or nothing_random(len(np.unique(data.views.landmark[data.views.used])))
+    bare = _multiplied(data, state, free, tuple(CATALOGUE), finest, there.alive)
+    return replace(bare, variances=there)
 
 
 def _multiplied(
-    data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
+    data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool,
+    alive: Mask | None = None,
 ) -> Evidence:
-    """Return the evidence around a state before any variance is known."""
+    """Return the evidence around a state before any variance is known.
+
+    alive: the components that there are; None for all.
+    """
     linear = Linearised(data, state, free)
     forms = forms_of(linear, left_out)
     fields = mean_fields(linear)
@@ -210,6 +215,8 @@ def _multiplied(
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
     random = design(linear, finest)
+    if alive is not None:
+        random = random.kept(alive)
     full = equations(random, linear.frame_columns, border)
     own = linear.shared_columns.shape[-1]
     probes, at = {}, own + forms.columns.shape[-1]

@@ -127,13 +127,20 @@ def _lens_holds(against: TwoSets) -> str:
 
 
 def _apart(against: TwoSets) -> str:
-    far = sorted(((abs(one.apart), name, one) for name, one in against.parameters.items()
-                  if abs(one.apart) > _APART), reverse=True)[:_MOST]
-    if not far:
-        return '; its parameters agree within their errors' if against.parameters else ''
-    each = [f'{name} by {apart:.1f} standard errors' for apart, name, _ in far]
-    return ('; its parameters do not agree within their errors (' + listed(each)
-            + '): they are less certain than one set says')
+    if not against.parameters:
+        return ''
+    said = ''
+    for of_causes, meaning in (
+        (False, 'the intrinsics are not those of the other set ({}): focus or mount changed in '
+                'between, or they take up what no cause holds'),
+        (True, 'sizes of causes do not agree within their errors ({}): they are less certain than '
+               'one set says'),
+    ):
+        far = sorted(((abs(one.apart), name) for name, one in against.parameters.items()
+                      if ('.' in name) == of_causes and abs(one.apart) > _APART), reverse=True)
+        each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MOST]]
+        said += f'; {meaning.format(listed(each))}' if each else ''
+    return said or '; its parameters agree within their errors'
 
 
 def _follows(against: TwoSets) -> str:

@@ -196,7 +196,13 @@ class TestTerminal:
         assert 'camera right has no lens' in capsys.readouterr().err
         given += ['--lens', f'right={lens}', '--quick', '-o', scene / 'rig']
         assert cli.main([*map(str, given)]) == 0
-        assert 'left/extended_lens.yaml, right/extended_lens.yaml' in capsys.readouterr().out
+        out = capsys.readouterr().out
+        assert 'left/extended_lens.yaml, right/extended_lens.yaml' in out
+        page = (scene / 'rig' / 'report.html').read_text()
+        assert 'The two cameras as each other&#39;s truth' in page
+        assert f'--lens right={scene}/rig/right/extended_lens.yaml' in page
+        document = json.loads((scene / 'rig' / 'diagnosis.json').read_text())
+        assert document['external']['cameras'][0]['cameras'] == ['left', 'right']
         assert load_lens(scene / 'rig' / 'right' / 'extended_lens.yaml').fx == pytest.approx(
             LENS.fx, rel=0.01)
 

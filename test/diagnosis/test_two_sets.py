@@ -1,6 +1,5 @@
 """Two data sets of one camera agree about its lens, whatever their boards are like."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -20,10 +19,10 @@ SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()
 QUICK = Wanted(quick=True)
 
 
-def table(seed, *terms, bend=0.0):
+def table(seed, *terms, bend=0.0, frames=8):
     """Return what the camera sees of boards that are bent, and said to be flat."""
     rng = np.random.default_rng(seed)
-    pose, views = scene(rng, frames=8)
+    pose, views = scene(rng, frames=frames)
     points = views.points.copy()
     for board in range(3):
         mine = views.board == board
@@ -35,7 +34,7 @@ def table(seed, *terms, bend=0.0):
 
 
 def test_what_moves_with_the_lens_holds_in_the_other_set():
-    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k)
+    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
                   for k, seed in enumerate((31, 32)))
     found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
     said = found.against
@@ -69,11 +68,10 @@ def test_command(tmp_path, capsys):
     save_lens(lens(), tmp_path / 'lens.yaml')
     arguments = ['diagnose', str(tmp_path / 'a.csv'), '--lens', str(tmp_path / 'lens.yaml'),
                  '--free', 'intrinsics', '--quick', '--against', str(tmp_path / 'b.csv')]
-    assert main([*arguments, '-o', str(tmp_path / 'out')]) == 0
-    assert 'Another data set of this camera' in capsys.readouterr().out
-    document = json.loads((tmp_path / 'out/diagnosis.json').read_text())
-    assert document['external']['sets']['verdict'] == 'agree'
-    assert 'Another data set' in (tmp_path / 'out/report.html').read_text()
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert 'What moves with the lens holds in both sets' in printed
+    assert 'Another data set of this camera' in printed
 
 
 def test_rigs_are_refused():
