@@ -171,10 +171,10 @@ def _joined(parts: Sequence[Observations]) -> Observations:
         name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
-# The background of the first is as large as the noise, that of the second twice to thrice.
 KINDS = {
     'bent board, shifts of 3 and 1.5 mm': Hidden((0.003, 0.0015), 1e-3),
-    'bent by half, much background': Hidden(
+    'bent by 0.3 mm, shifts of 2 and 1 mm': Hidden((0.002, 0.001), 3e-4),
+    'bent by 0.5 mm, background as large as the noise': Hidden(
         (0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25),
     'two boards': Hidden((0.003, 0.0015), 1e-3, apart=True),
 }
