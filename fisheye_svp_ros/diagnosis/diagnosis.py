@@ -160,7 +160,7 @@ def diagnose(
         data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
     found, cameras = agreed(found, free, wanted, lambda less: search(
-        data, base, free, less, gross, progress), progress)
+        data, base, free, less, gross, lambda stage, _: progress(stage, 0.79)), progress)
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data', 0.8)

@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.cameras import Cameras, Seen
-from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
+from fisheye_svp_ros.effects.base import Effect, Scene, noise_weight
 from fisheye_svp_ros.effects.forward import ForwardModel, Term
 from fisheye_svp_ros.effects.of_cameras import by_camera
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
@@ -266,15 +266,6 @@ class Linearised:
 def is_shared(effect: Effect) -> bool:
     """Whether an effect's parameters stand among the shared ones of a fit: not those of noise."""
     return effect.stage != 'noise'
-
-
-def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
-    """Return the factor (S, N) by which noise effects lower the weight of observations."""
-    scale: Array | float = 1.0
-    for effect, values in terms:
-        if isinstance(effect, NoiseEffect):
-            scale = scale / effect.noise_scale(scene, values)
-    return scale
 
 
 class Prior(NamedTuple):

@@ -25,9 +25,9 @@ from fisheye_svp_ros.diagnosis.carried import (
     without_terms,
 )
 from fisheye_svp_ros.diagnosis.known_truth import Compared, compared
-from fisheye_svp_ros.diagnosis.model import Data, State, chosen_views, fit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
-from fisheye_svp_ros.diagnosis.refit import refit
+from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import Found
 from fisheye_svp_ros.diagnosis.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.diagnosis.wanted import Wanted
@@ -100,7 +100,7 @@ class _Camera(NamedTuple):
 
 def agreed(
     found: Found, free: Sequence[str], wanted: Wanted, again: Callable[[Wanted], Found],
-    progress: Callable[[str], None],
+    progress: Callable[[str, float], None],
 ) -> tuple[Found, list[TwoCameras]]:
     """Ask the cameras of a rig whether they agree on the target; give up what they do not.
 
@@ -108,7 +108,7 @@ def agreed(
     """
     if found.evidence.linear.data.cameras < 2:
         return found, []
-    progress('asking each camera what it says of the other')
+    progress('asking each camera what it says of the other', 0.78)
     said = two_cameras(found, free)
     gone = tuple(e.name for e, _, _ in found.causes
                  if e.stage == 'target' and e.name not in wanted.included)
@@ -142,9 +142,9 @@ def _alone(found: Found, free: Sequence[str], camera: int, known: KnownTarget) -
     state = _single(found.state, pose, at, camera)
     target = None
     if _has_target(found):
-        fitted = refit(own, state, names,
-                       of_landmarks(own, evidence.variances, evidence.design.landmark))
-        state, target = fitted.state, target_of(fitted, known)
+        variances = of_landmarks(own, evidence.variances, evidence.design.landmark)
+        state = refit(own, state, names, variances)
+        target = target_of(fit_linear(Linearised(own, state, names), variances), known)
     return _Camera(data.observations.cameras[camera], _single(base, pose, at, camera), own, state,
                    names, target)
 

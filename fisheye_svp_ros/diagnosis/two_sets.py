@@ -26,7 +26,7 @@ from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.evidence import bare_evidence
 from fisheye_svp_ros.diagnosis.model import State
-from fisheye_svp_ros.diagnosis.refit import refit
+from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import with_effect
 from fisheye_svp_ros.diagnosis.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.diagnosis.wanted import Wanted
@@ -118,7 +118,7 @@ def diagnose_against(
     observations: Observations, other: Observations, lens: Lens | Mapping[str, Lens], *,
     free_intrinsics: bool | None = None, poses: dict[int, Pose] | None = None,
     held_out: Observations | None = None, wanted: Wanted | None = None,
-    progress: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str, float], None] = lambda *_: None,
 ) -> Diagnosis:
     """Diagnose a data set, and ask another one of the same camera whether the lens's causes hold.
 
@@ -134,12 +134,14 @@ def diagnose_against(
 
     def this(wanted: Wanted) -> Diagnosis:
         return diagnose(observations, lens, free_intrinsics=free_intrinsics, poses=poses,
-                        held_out=held_out, wanted=wanted, progress=progress)
+                        held_out=held_out, wanted=wanted,
+                        progress=lambda stage, done: progress(stage, done / 2))
 
     found = this(wanted)
     second = diagnose(other, lens, free_intrinsics=free_intrinsics, wanted=wanted,
-                      progress=lambda text: progress(f'the other set: {text}'))
-    progress('asking each set what it says of the other')
+                      progress=lambda stage, done: progress(
+                          f'the other set: {stage}', 0.4 + done / 2))
+    progress('asking each set what it says of the other', 0.84)
     said = two_sets(found, second, observations.source, other.source)
     gone = tuple(name for name in said.refuted if name not in wanted.included)
     if gone:
@@ -189,7 +191,7 @@ def _target(one: Diagnosis, other: Diagnosis, source: str, to: str) -> Carried |
         and np.abs(known.points - there.points).max() < _SAME
     ):
         return None
-    fitted = refit(one.after.data, one.after.state, one.after.free, one.errors.variances)
+    fitted = fit_linear(one.after, one.errors.variances)
     own, free = other.after.state, other.after.free
     state = without_terms(own, names_of([t for t in own.terms if of_target(t)]))
     moved = less_similarity(known.points, target_of(fitted, known))
@@ -223,7 +225,7 @@ def _with_lens_of(one: Diagnosis, other: Diagnosis) -> State:
 def _estimates(one: Diagnosis, state: State) -> dict[str, tuple[float, float, str]]:
     """Return value, standard error and unit of the intrinsics and the lens's causes."""
     data, free, variances = one.after.data, one.after.free, one.errors.variances
-    state = refit(data, state, free, variances).state
+    state = refit(data, state, free, variances)
     evidence = bare_evidence(data, state, free, variances)
     errors = standard_errors(evidence)
     rig = evidence.own - len(free) - sum(len(values) for _, _, values in evidence.terms)

@@ -263,6 +263,15 @@ class NoiseEffect(Effect):
         return uv
 
 
+def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
+    """Return the factor (S, N) by which noise effects lower the weight of observations."""
+    scale: Array | float = 1.0
+    for effect, values in terms:
+        if isinstance(effect, NoiseEffect):
+            scale = scale / effect.noise_scale(scene, values)
+    return scale
+
+
 def require_time(scene: Scene, minimum: int) -> Array:
     """Return the times (S,) of the views; raise Untestable for fewer than `minimum` instants."""
     instants = np.unique(scene.times[np.isfinite(scene.times)])
