@@ -55,10 +55,10 @@ def cause_squares(evidence: Evidence, causes: Sequence[Placed]) -> dict[str, flo
     every = np.zeros(evidence.own)
     named = [np.zeros(0, dtype=np.int64), *(columns for _, columns, _ in causes)]
     rest = np.setdiff1d(np.arange(evidence.own), np.concatenate(named))
-    left = swept(f.information, rest)[: evidence.own, : evidence.own]
+    remaining = swept(f.information, rest)[: evidence.own, : evidence.own]
     for _, columns, values in causes:
         every[columns] = values * evidence.scale[columns]
-    parts = every * (left @ every) * _px2(evidence)
+    parts = every * (remaining @ every) * _px2(evidence)
     return {e.name: max(float(parts[columns].sum()), 0.0) for e, columns, _ in causes}
 
 

@@ -118,8 +118,8 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
         return []
     rest = np.setdiff1d(np.arange(evidence.own), columns)
     information = evidence.restored(evidence.information, rest)
-    left = swept(information, rest)
-    strength = evidence.score(left, columns).statistic
+    remaining = swept(information, rest)
+    strength = evidence.score(remaining, columns).statistic
     known = {one for effect, _ in evidence.linear.state.terms for one in effect.kinds}
     same: list[str] = []
     for other in candidates(evidence, rest):

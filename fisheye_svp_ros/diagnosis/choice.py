@@ -52,7 +52,7 @@ class HeldOutGain:
 
 
 @dataclass(frozen=True)
-class Step:
+class TraceStep:
     """One line of the trace: what was tried, its evidence, and what came of it."""
 
     effect: str
@@ -68,11 +68,11 @@ class Step:
 
 def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
     """Return all forms, best merit first."""
-    left = swept(evidence.restored(evidence.information, included), included)
+    remaining = swept(evidence.restored(evidence.information, included), included)
     found = []
     for form, effect in enumerate(evidence.forms.effects):
         columns = evidence.columns_of(form)
-        score = evidence.score(left, columns)
+        score = evidence.score(remaining, columns)
         if not score.rank or _impossible(effect, score):
             continue
         found.append(_candidate(evidence, form, score))
@@ -135,9 +135,9 @@ def held_out_gain(
 def _marginal(information: Array, included: Index, columns: Index, prior: Array) -> float:
     """Return what columns add to the log marginal likelihood, up to the prior's own constant."""
     chosen = np.concatenate([included, columns, [len(information) - 1]])
-    left = swept(information[np.ix_(chosen, chosen)], np.arange(len(included)))
-    block = left[len(included) : -1, len(included) : -1] + prior
-    gradient = left[len(included) : -1, -1]
+    remaining = swept(information[np.ix_(chosen, chosen)], np.arange(len(included)))
+    block = remaining[len(included) : -1, len(included) : -1] + prior
+    gradient = remaining[len(included) : -1, -1]
     inverse, _ = pseudo_inverse(block, 1e-14)
     return float(gradient @ inverse @ gradient - np.linalg.slogdet(block)[1]) / 2
 
@@ -147,7 +147,7 @@ class Choice:
     """The forms that were chosen, in order, and the trace."""
 
     forms: list[int]
-    trace: list[Step]
+    trace: list[TraceStep]
 
 
 def choose(
@@ -160,12 +160,12 @@ def choose(
     """
     choice, failed = Choice([], []), set()
     while len(choice.forms) < most:
-        left = (c for c in eligible(evidence, included)
-                if c.form not in failed and c.effect.name not in refused)
-        best = next(left, None)
+        remaining = (c for c in eligible(evidence, included)
+                     if c.form not in failed and c.effect.name not in refused)
+        best = next(remaining, None)
         if best is None:
             break
-        best = _likelier(best, left)
+        best = _likelier(best, remaining)
         columns = evidence.columns_of(best.form)
         gain = HeldOutGain(np.inf, 0.0)
         if not (best.effect.per_frame or quick):
@@ -189,10 +189,10 @@ def _likelier(best: Candidate, others: Iterator[Candidate]) -> Candidate:
                  and len(c.effect.parameters) == size), best)
 
 
-def _step(candidate: Candidate, gain: HeldOutGain) -> Step:
+def _step(candidate: Candidate, gain: HeldOutGain) -> TraceStep:
     score = candidate.score
     why = 'significant and predicts better' if gain.convincing else 'does not predict better'
-    return Step(
+    return TraceStep(
         candidate.effect.key, score.statistic, score.rank, score.p_value, candidate.corrected,
         gain.value, gain.stderr, gain.convincing, why,
     )

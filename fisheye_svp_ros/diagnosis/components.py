@@ -102,8 +102,8 @@ def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[st
             continue
         own, ge, gr, gx = products
         pull = gx.T @ change - np.einsum('ekc,ek->c', ge, solution.e) - gr.T @ solution.r
-        left = own - f.taken(ge, gr, gx[:-1])
-        mean, spread = float(np.trace(left)), 2 * float((left**2).sum())
+        remaining = own - f.taken(ge, gr, gx[:-1])
+        mean, spread = float(np.trace(remaining)), 2 * float((remaining**2).sum())
         size = float(pull @ pull) / solution.variance
         if mean > 1e-9 and spread > 0:
             found[name] = float(stats.gamma.sf(size, mean**2 / spread, scale=spread / mean))

@@ -11,9 +11,9 @@ import numpy as np
 from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.choice import Step
+from fisheye_svp_ros.diagnosis.choice import TraceStep
 from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses, thinned
-from fisheye_svp_ros.diagnosis.measured import Fit, Intrinsic, Measured
+from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import (
     Linearised,
@@ -60,17 +60,17 @@ class Diagnosis:
     noise_px: float
     frames: int
     observations: int
-    base: Fit
+    base: FitQuality
     components: list[Component]
     causes: list[Cause]
-    named: Fit
-    lens_only: Fit
-    extended: Fit
+    named: FitQuality
+    lens_only: FitQuality
+    extended: FitQuality
     gross: list[dict[str, Any]]
     advice: list[Advice]
     remaining: list[Structure]
     untestable: dict[str, str]
-    trace: list[Step]
+    trace: list[TraceStep]
     gain: Gain
     intrinsics: dict[str, Intrinsic]
     lenses: dict[str, Lens]
@@ -89,7 +89,7 @@ class Diagnosis:
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
 
-        def plain(fit: Fit) -> dict[str, Any]:
+        def plain(fit: FitQuality) -> dict[str, Any]:
             return {name: value for name, value in asdict(fit).items() if value is not None}
 
         external: dict[str, Any] = {}
@@ -185,15 +185,15 @@ def _judged(
     causes = measured.causes(components) + noise_causes
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
     stated = bool(np.isfinite(observations.sigma).all()) and not noise_causes
-    left = remaining_structure(
+    remaining = remaining_structure(
         evidence, found.fitted, found_components(components), stated
     )
-    left = with_outliers(left, found.gross, len(observations))
+    remaining = with_outliers(remaining, found.gross, len(observations))
     gross = gross_rows(observations, found.gross)
     if held_out is not None and measured.test_gross is not None:
         gross += gross_rows(held_out, measured.test_gross, 'held out: ')
     return Diagnosis(
-        verdict=_verdict(causes, left),
+        verdict=_verdict(causes, remaining),
         noise_px=measured.noise,
         frames=evidence.linear.data.frames,
         observations=len(observations),
@@ -205,7 +205,7 @@ def _judged(
         extended=measured.extended,
         gross=gross,
         advice=advise(found, causes, measured, found_components(components)),
-        remaining=left,
+        remaining=remaining,
         untestable=found.base.untestable,
         trace=found.trace,
         gain=measured.gain,
@@ -219,10 +219,10 @@ def _judged(
     )
 
 
-def _verdict(causes: Sequence[Cause], left: Sequence[Structure]) -> str:
+def _verdict(causes: Sequence[Cause], remaining: Sequence[Structure]) -> str:
     if causes:
-        return 'partly_explained' if left else 'explained'
-    return 'unexplained' if left else 'adequate'
+        return 'partly_explained' if remaining else 'explained'
+    return 'unexplained' if remaining else 'adequate'
 
 
 def extended_lenses(

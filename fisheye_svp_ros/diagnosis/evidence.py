@@ -97,10 +97,10 @@ class Evidence:
     @cached_property
     def untestable(self) -> dict[str, str]:
         """Effects that the data cannot test, and why."""
-        left = swept(self.information, np.arange(self.own))
+        remaining = swept(self.information, np.arange(self.own))
         ranks: dict[str, int] = {}
         for form, effect in enumerate(self.forms.effects):
-            rank = self.score(left, self.columns_of(form)).rank
+            rank = self.score(remaining, self.columns_of(form)).rank
             ranks[effect.name] = max(rank, ranks.get(effect.name, 0))
         taken = 'what it would do is taken up by what is free already'
         return self.forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
@@ -132,9 +132,9 @@ class Evidence:
         """Return the border's columns of a form."""
         return self.forms.at[form] + self.own
 
-    def score(self, left: Array, columns: Index) -> Score:
-        """Test columns by the information `left` once what is in the model is swept out."""
-        block, gradient = left[np.ix_(columns, columns)], left[columns, -1]
+    def score(self, remaining: Array, columns: Index) -> Score:
+        """Test columns by the information that remains once what is in the model is swept out."""
+        block, gradient = remaining[np.ix_(columns, columns)], remaining[columns, -1]
         # A normalised column alone has information 1 / sigma^2.
         inverse, rank = pseudo_inverse(
             block, least=IDENTIFIABLE / self.variances.sigma**2

@@ -37,7 +37,7 @@ from fisheye_svp_ros.scene.observations import Observations
 
 
 @dataclass(frozen=True)
-class Fit:
+class FitQuality:
     """How well a model describes the data it was fitted to and the data held out."""
 
     rms_px: float
@@ -146,35 +146,35 @@ class Measured:
         return 1.0 if stated else self.evidence.variances.sigma**2
 
     @property
-    def base(self) -> Fit:
+    def base(self) -> FitQuality:
         """The simulation as it was fitted."""
         linear = self.before
         freedom = self.evidence.full.rows - self.evidence.full.poses - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
-        return Fit(rms_px(linear, linear.residual), self._simulation.rms, chi2)
+        return FitQuality(rms_px(linear, linear.residual), self._simulation.rms, chi2)
 
     @property
-    def named(self) -> Fit:
+    def named(self) -> FitQuality:
         """All causes, without local offsets."""
         linear = self.evidence.linear
-        return Fit(rms_px(linear, linear.residual), self._prefixes[-1].rms)
+        return FitQuality(rms_px(linear, linear.residual), self._prefixes[-1].rms)
 
     @property
-    def lens_only(self) -> Fit:
+    def lens_only(self) -> FitQuality:
         """Only what moves with the lens, fitted without the rest."""
         linear = self.found.base.linear
         if set(self._elsewhere) < set(self.names):
             state = without_causes(self.evidence, self._elsewhere, self.free)
             data = self.evidence.linear.data
             linear = Linearised(data, fit(data, state, self.free), self.free)
-        return Fit(rms_px(linear, linear.residual), self._lens.rms)
+        return FitQuality(rms_px(linear, linear.residual), self._lens.rms)
 
     @property
-    def extended(self) -> Fit:
+    def extended(self) -> FitQuality:
         """Causes and predicted local offsets."""
-        left = conditional_residuals(self.found.fitted)
-        chi2 = float((left**2).sum()) / self._noise_square / self.evidence.full.rows
-        return Fit(rms_px(self.evidence.linear, left), self._best.rms, chi2)
+        remaining = conditional_residuals(self.found.fitted)
+        chi2 = float((remaining**2).sum()) / self._noise_square / self.evidence.full.rows
+        return FitQuality(rms_px(self.evidence.linear, remaining), self._best.rms, chi2)
 
     @property
     def gain(self) -> Gain:
@@ -203,10 +203,10 @@ class Measured:
         if self.medium is None:
             return causes
         gain = gain_between(self._simulation, self._base, self.noise)
-        left = 1 - self.medium.share
+        remaining = 1 - self.medium.share
         fitted = replace(self.medium, state=self.found.state)
         return [fitted.cause(self._free_errors(), self._base.rms, gain),
-                *(replace(cause, share=left * cause.share) for cause in causes)]
+                *(replace(cause, share=remaining * cause.share) for cause in causes)]
 
     def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""

@@ -104,8 +104,9 @@ class Medium:
         """Return the variance budget of the simulation in air from that behind the port."""
         square = float(np.mean(self.air.residual[self.air.used] ** 2)) * self.share
         square *= float(np.mean(1 / self.air.weight[self.air.weight > 0] ** 2))
-        left = 1 - self.share
-        parts = [p._replace(share=left * p.share, named_share=left * p.named_share) for p in parts]
+        remaining = 1 - self.share
+        parts = [p._replace(share=remaining * p.share, named_share=remaining * p.named_share)
+                 for p in parts]
         own = Component('named_lens', 'lens', float(np.sqrt(square)), self.share, self.share,
                         self.p_value)
         for i, part in enumerate(parts):

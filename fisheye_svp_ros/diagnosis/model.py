@@ -283,13 +283,13 @@ def fit(
 
     The frames are the blocks of one arrow.  held: effects whose values stay what they are.
     """
-    problem = _Fit(data, state, free, held, prior)
+    problem = _Adjustment(data, state, free, held, prior)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
 def fit_poses(data: Data, state: State) -> State:
     """Refit the poses of the frames alone."""
-    problem = _Fit(data, state, (), held=None)
+    problem = _Adjustment(data, state, (), held=None)
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
@@ -297,11 +297,11 @@ def moved(
     data: Data, state: State, free: Sequence[str], frame: Array, shared: Array
 ) -> State:
     """Return the state after a step of the poses (F, 6) and of what is shared (K,)."""
-    problem = _Fit(data, state, free)
+    problem = _Adjustment(data, state, free)
     return problem.unpack(problem.retract(problem.pack(state), (frame[None], shared[None])))
 
 
-class _Fit:
+class _Adjustment:
     """One arrow system: frames are the blocks; rig, intrinsics and effects are shared."""
 
     def __init__(

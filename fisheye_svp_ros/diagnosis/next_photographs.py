@@ -144,13 +144,13 @@ class Question:
     def merit(self, information: Array) -> Array:
         """Return how well each information (B, K, K) answers; more is better."""
         if self.value is None:
-            left = _reduced(information, self.interest, self.nuisance)
-            return np.asarray(np.linalg.slogdet(left)[1]) / len(self.interest)
+            remaining = _reduced(information, self.interest, self.nuisance)
+            return np.asarray(np.linalg.slogdet(remaining)[1]) / len(self.interest)
         merits = []
         for other in self.others or (self.nuisance[:0],):
             unknown = np.concatenate([self.nuisance, other])
-            left = _reduced(information, self.interest, unknown)
-            merits.append(np.einsum('i,bij,j->b', self.value, left, self.value))
+            remaining = _reduced(information, self.interest, unknown)
+            merits.append(np.einsum('i,bij,j->b', self.value, remaining, self.value))
         return np.asarray(np.min(merits, axis=0))
 
     def answer(self, information: Array) -> float:
@@ -235,9 +235,10 @@ class Design:
                 break
         ordered: list[int] = []
         for _ in range(count):
-            left = [i for i in chosen if i not in ordered]
+            remaining = [i for i in chosen if i not in ordered]
             known = self._with(ordered)
-            ordered.append(left[int(np.argmax(question.merit(known + self.added[left])))])
+            merit = question.merit(known + self.added[remaining])
+            ordered.append(remaining[int(np.argmax(merit))])
         return np.array(ordered), [
             question.answer(self._with(ordered[:i])) for i in range(count + 1)
         ]

@@ -31,7 +31,7 @@ _REACH = 3.0  # of a bump, in its standard deviations
 _WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
 
 
-class Points(NamedTuple):
+class GatheredPoints(NamedTuple):
     """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
 
     used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
@@ -51,7 +51,7 @@ class Points(NamedTuple):
     place: Array
 
     @classmethod
-    def of(cls, linear: Linearised) -> Points:
+    def of(cls, linear: Linearised) -> GatheredPoints:
         """Gather the points of a linearised state."""
         data, views = linear.data, linear.data.views
 
@@ -145,7 +145,7 @@ class Design(NamedTuple):
 
 def design(linear: Linearised, finest: bool = False) -> Design:
     """Build the columns of every component that the data can hold; finest: of the image, too."""
-    points = Points.of(linear)
+    points = GatheredPoints.of(linear)
     frame, label = _frame_columns(points)
     boards = linear.scene.boards
     of_landmark, local = _by_landmark(points)
@@ -167,7 +167,7 @@ def design(linear: Linearised, finest: bool = False) -> Design:
     )
 
 
-def _by_landmark(points: Points) -> tuple[Index, Array]:
+def _by_landmark(points: GatheredPoints) -> tuple[Index, Array]:
     """Return the board (L,) of each landmark and its place (L, 2) on it."""
     count = len(points.landmark)
     board, local = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
@@ -176,7 +176,7 @@ def _by_landmark(points: Points) -> tuple[Index, Array]:
     return board, local
 
 
-def _frame_columns(points: Points) -> tuple[Array, Index]:
+def _frame_columns(points: GatheredPoints) -> tuple[Array, Index]:
     """Return columns (F, M, B) and labels (B,) of what single frames have of their own."""
     blocks: list[tuple[str, Array]] = []
     for camera in range(int(points.camera.max()) + 1):
@@ -204,7 +204,7 @@ def _frame_columns(points: Points) -> tuple[Array, Index]:
     return columns.reshape(frames, 2 * count, -1), label
 
 
-def _bend_columns(points: Points) -> Array:
+def _bend_columns(points: GatheredPoints) -> Array:
     """Return columns (F, N, 2, 3 boards) of a bend of each board, anew in every frame."""
     x, y = np.moveaxis(points.local, -1, 0)
     powers = np.stack([x * x, x * y, y * y], axis=-1)
@@ -215,7 +215,7 @@ def _bend_columns(points: Points) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _grids(points: Points, finest: bool) -> list[Grid]:
+def _grids(points: GatheredPoints, finest: bool) -> list[Grid]:
     """Return bumps over the image that all frames share, camera by camera, coarse to fine."""
     grids = []
     for camera in range(int(points.camera.max()) + 1):
@@ -236,14 +236,14 @@ def _grids(points: Points, finest: bool) -> list[Grid]:
     return grids
 
 
-def _static_columns(points: Points, grid: Grid) -> sparse.csr_array:
+def _static_columns(points: GatheredPoints, grid: Grid) -> sparse.csr_array:
     mine = points.used & (points.camera == grid.camera)
     values = bump_values(points.uv, mine, grid.centres, grid.pitch)
     return _sparse(_both(values * points.weight[..., None]))
 
 
 def _board_fields(
-    points: Points, of_landmark: Index, local: Array, linear: Linearised
+    points: GatheredPoints, of_landmark: Index, local: Array, linear: Linearised
 ) -> list[BoardField]:
     """Return smooth displacements of boards, along and across them: neighbours err alike.
 
@@ -280,7 +280,7 @@ def _outside_powers(values: Array, at: Array, degree: int) -> Array:
     return np.asarray(values - powers @ np.linalg.lstsq(powers, values, rcond=1e-9)[0])
 
 
-def _field_columns(points: Points, field: BoardField) -> sparse.csr_array:
+def _field_columns(points: GatheredPoints, field: BoardField) -> sparse.csr_array:
     values = np.where(points.used[..., None], field.values[points.slot], 0.0)
     columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
     return _sparse(np.concatenate(columns, axis=-1))

@@ -17,10 +17,10 @@ _FEWEST_PAIRS = 100
 def conditional_residuals(fitted: Fitted) -> Array:
     """Return whitened residuals (F, M), every random part at its prediction."""
     solution = fitted.solution
-    left = fitted.linear.residual - _rows(
+    remaining = fitted.linear.residual - _rows(
         fitted, solution.e[..., None], solution.r[:, None], solution.values[:, None]
     )[..., 0]
-    return np.asarray(left * fitted.linear.used)
+    return np.asarray(remaining * fitted.linear.used)
 
 
 def leverages(fitted: Fitted) -> Array:
@@ -38,8 +38,8 @@ def leverages(fitted: Fitted) -> Array:
 
 def standardised_squares(fitted: Fitted) -> Array:
     """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
-    left = conditional_residuals(fitted)
-    return np.asarray(left**2 / (1 - leverages(fitted)) / fitted.solution.variance)
+    remaining = conditional_residuals(fitted)
+    return np.asarray(remaining**2 / (1 - leverages(fitted)) / fitted.solution.variance)
 
 
 def ripples(fitted: Fitted) -> float:
@@ -48,11 +48,11 @@ def ripples(fitted: Fitted) -> float:
     Residuals with everything predicted that are finer than the image fields have room for.
     """
     linear = fitted.linear
-    left = conditional_residuals(fitted).reshape(*linear.residual.shape[:1], -1, 2)
+    remaining = conditional_residuals(fitted).reshape(*linear.residual.shape[:1], -1, 2)
     uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
     used = linear.used[:, ::2]
     frame = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
-    places, errors = uv[used], left[used]
+    places, errors = uv[used], remaining[used]
     reach = float(np.ptp(places, axis=0).max()) / _FINEST
     pairs = cKDTree(places).query_pairs(reach, output_type='ndarray')
     pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]

@@ -12,7 +12,7 @@ from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     HeldOutGain,
-    Step,
+    TraceStep,
     choose,
     held_out_gain,
 )
@@ -60,7 +60,7 @@ class Found:
     state: State
     evidence: Evidence
     fitted: Fitted
-    trace: list[Step]
+    trace: list[TraceStep]
     base: Evidence
     gross: Gross
     growth: NoiseCause | None
@@ -77,7 +77,7 @@ def search(
     progress: Callable[[str, float], None],
 ) -> Found:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
-    trace: list[Step] = []
+    trace: list[TraceStep] = []
     before: Variances | None = None
     base: Evidence | None = None
     dropped: set[str] = set()
@@ -140,7 +140,7 @@ def search(
     return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth, given)
 
 
-def _names(steps: Sequence[Step]) -> list[str]:
+def _names(steps: Sequence[TraceStep]) -> list[str]:
     return [step.effect.partition('(')[0] for step in steps]
 
 
@@ -193,16 +193,16 @@ def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) 
 
 def _needed(
     evidence: Evidence, known: Sequence[str], quick: bool
-) -> tuple[Index, list[Step]]:
+) -> tuple[Index, list[TraceStep]]:
     """Return the columns of what is still needed, given the others, and why the rest is not.
 
     The weakest goes first: what is no longer significant, then what held-out frames no longer
     want.
     """
     included = np.arange(evidence.own)
-    gone: list[Step] = []
+    gone: list[TraceStep] = []
     while True:
-        weakest: tuple[float, Index, Step] | None = None
+        weakest: tuple[float, Index, TraceStep] | None = None
         for effect, columns, _ in evidence.terms:
             if effect.name in known or not np.isin(columns, included).all():
                 continue
@@ -217,7 +217,7 @@ def _needed(
 
 def _doubt(
     evidence: Evidence, included: Index, effect: Effect, columns: Index, quick: bool
-) -> Step | None:
+) -> TraceStep | None:
     """Return why an effect is not needed beside everything else that is included, if so."""
     score = drop_test(evidence, included, columns)
     corrected = min(1.0, score.p_value * evidence.forms.names())
@@ -229,7 +229,7 @@ def _doubt(
         if gain.convincing:
             return None
         why = 'removed: it does not predict better any more'
-    return Step(effect.key, score.statistic, score.rank, score.p_value, corrected,
+    return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
                 gain.value, gain.stderr, False, why)
 
 
@@ -258,7 +258,7 @@ def _estimated(
 
 def _landmarks(
     evidence: Evidence, state: State, wanted: Wanted
-) -> tuple[Effect, Array, Step] | None:
+) -> tuple[Effect, Array, TraceStep] | None:
     name = LandmarkSurveyEffect.name
     if name in wanted.left_out or any(effect.name == name for effect, _ in state.terms):
         return None

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import linalg, optimize, stats
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve, solve_lower
 from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
@@ -20,7 +20,7 @@ _OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
 _LANDMARK = np.array([name.startswith('landmark') for name in NAMES])
 
 
-def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, Step] | None:
+def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
     """Return landmarks that stand out against the variance of all, their offsets and the test.
 
     None where there is none, or where so many do that they are no single ones.
@@ -40,7 +40,7 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, S
     found = found[np.argsort(corrected[found], kind='stable')]
     ids = evidence.design.landmark[found]
     effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
-    step = Step(
+    step = TraceStep(
         effect.key, float(statistic[found].sum()), int(rank[found].sum()), float(p[found[0]]),
         float(corrected[found[0]]), np.nan, np.nan, True, 'further off than the bulk of landmarks',
     )

@@ -59,10 +59,10 @@ def remaining_structure(
 
 def _field_tests(evidence: Evidence) -> Iterator[tuple[str, float, float]]:
     own = np.arange(evidence.own)
-    left = swept(evidence.information, own)
+    remaining = swept(evidence.information, own)
     total = float((evidence.linear.residual**2).sum())
     for name, columns in evidence.probes.items():
-        score = evidence.confident(evidence.score(left, columns), own, columns)
+        score = evidence.confident(evidence.score(remaining, columns), own, columns)
         explained = (score.statistic - score.rank) * evidence.variances.sigma**2
         yield name, score.p_value, max(explained, 0.0) / total
 

@@ -18,7 +18,7 @@ from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
 from fisheye_svp_ros.diagnosis.reml import Variances
 
 
-class Parts(NamedTuple):
+class ErrorParts(NamedTuple):
     """Covariances, or variances, of the same shape: of noise, parameters, and what remains."""
 
     noise: Array
@@ -49,7 +49,7 @@ class ModelError:
         scale = evidence.scale[own]
         return cls(evidence.variances, inverse / np.outer(scale, scale))
 
-    def of_poses(self, linear: Linearised) -> Parts:
+    def of_poses(self, linear: Linearised) -> ErrorParts:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
 
         linear: frames that were posed with the lens of the diagnosis, those it was made of or
@@ -57,7 +57,7 @@ class ModelError:
         """
         return self.through(linear, pose_maps(linear.frame_columns))
 
-    def through(self, linear: Linearised, maps: Array) -> Parts:
+    def through(self, linear: Linearised, maps: Array) -> ErrorParts:
         """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
         turned = np.swapaxes(maps, -1, -2)
         shared = maps @ linear.shared_columns
@@ -74,9 +74,9 @@ class ModelError:
         for f in range(frames):
             field = (random.shared[f * rows:(f + 1) * rows].T @ turned[f]).T
             misfit[f] += (field * variance[random.shared_label]) @ field.T
-        return Parts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
+        return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
 
-    def of_points(self, linear: Linearised) -> Parts:
+    def of_points(self, linear: Linearised) -> ErrorParts:
         """Return variances (F, M), px^2, of u and v of the points of a fit.
 
         Of the lens alone: a turn of the camera as a whole is taken out, as poses take it up, and
@@ -95,7 +95,7 @@ class ModelError:
         misfit = misfit + np.asarray(fields).reshape(misfit.shape)
         px = np.where(weight > 0, weight, np.nan) ** -2.0
         parameters = np.einsum('fmk,kl,fml->fm', columns, self.covariance, columns)
-        return Parts(self.variances.sigma**2 * px, parameters * px, misfit * px)
+        return ErrorParts(self.variances.sigma**2 * px, parameters * px, misfit * px)
 
     def summary(self, linear: Linearised) -> dict[str, dict[str, float]]:
         """Return root mean squares of what each part adds, over the frames and points of a fit.

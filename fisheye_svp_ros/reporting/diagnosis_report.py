@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jinja2
 
 from fisheye_svp_ros.diagnosis.budget import stage_shares
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, Step
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.next_question import Next
@@ -177,7 +177,7 @@ def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _step(step: Step) -> dict[str, Any]:
+def _step(step: TraceStep) -> dict[str, Any]:
     tried = step.statistic > 0
     held_out = ''
     if math.isfinite(step.held_out):

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.diagnosis.known_truth import _compared
+from fisheye_svp_ros.diagnosis.known_truth import compared
 
 
 def test_the_interval_of_a_gain_holds_95_percent() -> None:
     rng = np.random.default_rng(5)
     count, before, after = 400, 10.0, 5.0
-    found = _compared(before + rng.standard_normal(count), after + rng.standard_normal(count))
+    found = compared(before + rng.standard_normal(count), after + rng.standard_normal(count))
     error = np.sqrt((1 + (after / before) ** 2) / count) / before  # of a ratio of means
     assert found.high - found.low == pytest.approx(2 * 1.96 * error, rel=0.1)
     assert found.low < found.gain < found.high
