@@ -119,7 +119,7 @@ def test_from_rendered_images_to_the_true_pose(
     listed = [float(value) for i in range(2) for value in (
         *where.take(i).position, *quaternion_from_rotation(where.take(i).rotation))]
     g = graph(f'board:={BOARD}', f'photograph:={BOARD}', f'lens:={lens}', f'poses:={listed}',
-               'rate:=2.0', 'sigma_px:=0.04', 'board_frame:=world')
+              'rate:=2.0', 'sigma_px:=0.04', 'board_frame:=world')
     images, estimated = g.hear(Image, 'image', SENSOR), g.hear(
         PoseWithCovarianceStamped, 'localizer/pose')
     results = g.hear(DiagnosticArray, 'localizer/result')
