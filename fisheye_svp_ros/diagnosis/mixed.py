@@ -125,7 +125,9 @@ def equations(design: Design, pose: Array, border: Array) -> Equations:
     products = multiplied(design, pose / scale[:, None], border)
     width = products.ff.shape[-1]
     l_label = np.where(design.landmark_label < 0, ABSENT, design.landmark_label)
-    by_frame = len(pose) * width >= l_label.size
+    # Bumps of single frames are many, and seldom there.
+    seldom = int((design.frame_label == NAMES.index('frame_bumps')).sum())
+    by_frame = len(pose) * (width - seldom) >= l_label.size
     f_label = np.concatenate([np.full(6, FIXED), design.frame_label])
     blocks = arranged(
         products, np.broadcast_to(f_label, (len(pose), width)), l_label, design.shared_label,
