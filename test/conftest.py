@@ -77,10 +77,28 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 
 
 @pytest.fixture
-def run_node(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
-    """Return a function that runs Python code or a script as a standalone node."""
+def start_process(
+    ros_domain: int
+) -> Iterator[Callable[[list[str], dict[str, str]], NodeProcess]]:
+    """Return a function that starts a command; what runs when the test ends is killed."""
     started: list[NodeProcess] = []
 
+    def start(command: list[str], env: dict[str, str]) -> NodeProcess:
+        started.append(NodeProcess(command, env))
+        return started[-1]
+
+    yield start
+    for node in started:
+        if node.process.poll() is None:
+            node.process.kill()
+            node.process.wait()
+
+
+@pytest.fixture
+def run_node(
+    ros_domain: int, start_process: Callable[..., NodeProcess]
+) -> Callable[..., NodeProcess]:
+    """Return a function that runs Python code or a script as a standalone node."""
     def run(source: str | Path, *args: str, genuine: bool = False) -> NodeProcess:
         env = os.environ | {'PYTHONUNBUFFERED': '1', 'ROS_DOMAIN_ID': str(ros_domain)}
         # Without the path of an installed ROS 2, the standalone client takes its place.
@@ -90,14 +108,9 @@ def run_node(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
         if isinstance(source, Path):
             code = f'import runpy; runpy.run_path({str(source)!r}, run_name="__main__")'
         text = code if genuine else _INSTALL + str(code)
-        started.append(NodeProcess([sys.executable, '-c', str(text), *args], env))
-        return started[-1]
+        return start_process([sys.executable, '-c', str(text), *args], env)
 
-    yield run
-    for node in started:
-        if node.process.poll() is None:
-            node.process.kill()
-            node.process.wait()
+    return run
 
 
 @pytest.fixture

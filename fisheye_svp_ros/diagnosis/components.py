@@ -20,6 +20,7 @@ from fisheye_svp_ros.diagnosis.reml import (
     GONE,
     Variances,
     estimate,
+    nothing_random,
     start_variances,
     without,
 )
@@ -41,7 +42,7 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
     """
     first = start_variances(eq, _SHARE)
     if before is None:
-        nothing = Variances(1.0, np.full(len(NAMES), GONE), first.weight)
+        nothing = nothing_random(len(first.weight))
         p = score_components(eq, nothing, [n for n in NAMES if n not in _LATE])
         lam = np.array([first.lam[i] if p.get(n, 1.0) < _CALLED else GONE
                         for i, n in enumerate(NAMES)])

@@ -28,6 +28,7 @@ from fisheye_svp_ros.diagnosis.noise import (
 )
 from fisheye_svp_ros.diagnosis.prediction import Gain
 from fisheye_svp_ros.diagnosis.refit import Local
+from fisheye_svp_ros.diagnosis.residuals import rms_px
 from fisheye_svp_ros.diagnosis.search import Found, search
 from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
 from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
@@ -148,7 +149,7 @@ def diagnose(
     data, gross = find_gross_errors(everything, start(everything, first, others))
     base = fit(data, start(data, first, others), free)
     step = quantisation_step(observations.uv)
-    rounded = step / np.sqrt(12) > _STEP_OVER_NOISE * _residual_px(Linearised(data, base, free))
+    rounded = step / np.sqrt(6) > _STEP_OVER_NOISE * rms_px(Linearised(data, base, free))
     if rounded:
         # Values on a lattice repeat with the pixel by themselves.
         wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
@@ -168,12 +169,6 @@ def diagnose(
         observations, lenses, found, Measured(found, free, held_out, wanted.quick, medium),
         noise_causes, cameras, held_out,
     )
-
-
-def _residual_px(linear: Linearised) -> float:
-    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
-    px = linear.residual[weight > 0] / weight[weight > 0]
-    return float(np.sqrt(np.mean(px**2)))
 
 
 def _judged(

@@ -198,7 +198,7 @@ def _prior(lens: Lens, free: Sequence[str]) -> Prior:
 
 def _noise(linear: Linearised) -> float:
     """Return the noise of u and of v, px, from what the fit leaves, no less than is stated."""
-    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+    weight = linear.row_weight
     px = linear.residual[weight > 0] / weight[weight > 0]
     unknown = linear.frame_columns.shape[-1] * len(linear.residual)
     stated = 1 / float(weight.max())

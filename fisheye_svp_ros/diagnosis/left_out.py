@@ -8,8 +8,6 @@ Source: Cook and Weisberg, Residuals and Influence in Regression (1982), for blo
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -38,12 +36,7 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
     random: the design of the components in the factored equations; pose (F, M, 6) and border
     (F, M, X): the columns that these were made of.
     """
-    def one(frame: int) -> LeftOut:
-        return _left_out(f, random, frame, pose[frame], border[frame])
-
-    # Linear algebra lets go of the interpreter: as many frames at once as there are cores.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(one, range(len(pose))))
+    found = [_left_out(f, random, i, pose[i], border[i]) for i in range(len(pose))]
     return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
 
 

@@ -31,7 +31,7 @@ from fisheye_svp_ros.diagnosis.prediction import (
     without_causes,
 )
 from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
-from fisheye_svp_ros.diagnosis.residuals import conditional_residuals
+from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, rms_px
 from fisheye_svp_ros.diagnosis.search import Found, drop_test
 from fisheye_svp_ros.scene.observations import Observations
 
@@ -151,13 +151,13 @@ class Measured:
         linear = self.before
         freedom = self.evidence.full.rows - self.evidence.full.poses - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
-        return FitQuality(rms_px(linear, linear.residual), self._simulation.rms, chi2)
+        return FitQuality(rms_px(linear), self._simulation.rms, chi2)
 
     @property
     def named(self) -> FitQuality:
         """All causes, without local offsets."""
         linear = self.evidence.linear
-        return FitQuality(rms_px(linear, linear.residual), self._prefixes[-1].rms)
+        return FitQuality(rms_px(linear), self._prefixes[-1].rms)
 
     @property
     def lens_only(self) -> FitQuality:
@@ -167,7 +167,7 @@ class Measured:
             state = without_causes(self.evidence, self._elsewhere, self.free)
             data = self.evidence.linear.data
             linear = Linearised(data, fit(data, state, self.free), self.free)
-        return FitQuality(rms_px(linear, linear.residual), self._lens.rms)
+        return FitQuality(rms_px(linear), self._lens.rms)
 
     @property
     def extended(self) -> FitQuality:
@@ -248,10 +248,3 @@ def _rig_columns(evidence: Evidence, free: Sequence[str]) -> int:
     return evidence.own - len(free) - sum(
         len(values) for effect, values in evidence.linear.state.terms if effect.stage != 'noise'
     )
-
-
-def rms_px(linear: Linearised, whitened: Array) -> float:
-    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M)."""
-    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
-    used = weight > 0
-    return float(np.sqrt(2 * np.mean((whitened[used] / weight[used]) ** 2)))

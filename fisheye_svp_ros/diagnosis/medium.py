@@ -28,6 +28,7 @@ from fisheye_svp_ros.diagnosis.model import (
 )
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
+from fisheye_svp_ros.diagnosis.residuals import rms_px
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
 from fisheye_svp_ros.errors import GeometryError
@@ -131,11 +132,11 @@ def find_medium(
     if lens.port is not None or data.cameras > 1:
         return None
     air = Linearised(data, base, free)
-    if not (_magnified(air, lens, base) if free else _rms_px(air) > _SUSPECT):
+    if not (_magnified(air, lens, base) if free else rms_px(air) > _SUSPECT):
         return None
     progress('asking whether the camera looks into another medium', 0.02)
     curve = _free_curve(data, base)
-    if not (_magnified(air, lens, curve) or _rms_px(Linearised(data, curve, ())) > _SUSPECT):
+    if not (_magnified(air, lens, curve) or rms_px(Linearised(data, curve, ())) > _SUSPECT):
         return None
     found = _behind_port(everything, data, lens)
     if found is None:
@@ -238,9 +239,3 @@ def _magnified(air: Linearised, lens: Lens, state: State) -> bool:
 
 def _cost(linear: Linearised) -> float:
     return float((linear.residual**2).sum())
-
-
-def _rms_px(linear: Linearised) -> float:
-    weight: Array = linear.data.blocks(linear.weight[..., None] * np.ones(2))
-    used = weight > 0
-    return float(np.sqrt(2 * np.mean((linear.residual[used] / weight[used]) ** 2)))

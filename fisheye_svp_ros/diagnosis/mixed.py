@@ -11,6 +11,7 @@ Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), ch
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -170,6 +171,18 @@ class Factored:
     border: Array
     information: Array
 
+    @cached_property
+    def root(self) -> Array:
+        """Lower root of the information of the fixed columns.
+
+        What random parts have all but taken up stays where it is.
+        """
+        info = self.information[:-1, :-1]
+        try:
+            return np.asarray(np.linalg.cholesky(info))
+        except np.linalg.LinAlgError:
+            return np.asarray(np.linalg.cholesky(info + _UNTOLD * np.diag(np.diag(info))))
+
     def coefficients(self, way: Array) -> tuple[Array, Array]:
         """Return the coefficients (E, k), (R,) that follow a combination (X,) of the border."""
         r = _back(self.factor, self.border @ way)
@@ -272,28 +285,19 @@ class Solution(NamedTuple):
 
 def solve(f: Factored, spread: bool = True) -> Solution:
     """Solve for all coefficients; the border must be of full rank."""
-    info, gradient = f.information[:-1, :-1], f.information[:-1, -1]
-    root = _root(info)
+    root, gradient = f.root, f.information[:-1, -1]
     half = solve_lower(root, gradient)
     values = solve_lower(root, half, trans=1)
     freedom = f.equations.rows - f.equations.poses - len(values)
     variance = float(f.information[-1, -1] - half @ half) / max(freedom, 1)
     e, r = f.coefficients(np.append(-values, 1.0))
-    deviance = _deviance(f, root, freedom, variance)
+    deviance = _deviance(f, freedom, variance)
     if not spread:
         return Solution(values, variance, e, r, np.zeros(0), np.zeros(0), deviance)
     known = posterior(f)
     spread_e = np.diagonal(known.block, axis1=-2, axis2=-1) + np.reshape(
         (known.e**2).sum(axis=1), e.shape)
     return Solution(values, variance, e, r, spread_e, (known.r**2).sum(axis=1), deviance)
-
-
-def _root(info: Array) -> Array:
-    """Return the lower root; what random parts have all but taken up stays where it is."""
-    try:
-        return np.asarray(np.linalg.cholesky(info))
-    except np.linalg.LinAlgError:
-        return np.asarray(np.linalg.cholesky(info + _UNTOLD * np.diag(np.diag(info))))
 
 
 def _back(factor: Array, right: Array) -> Array:
@@ -337,22 +341,20 @@ def posterior(f: Factored) -> Posterior:
         inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
         flat = (inverse_t @ f.coupled).reshape(len(e), len(inverse))
         e, r = linalg.blas.dtrmm(1.0, inverse, flat.T, lower=1).T, inverse.T
-    info = f.information[:-1, :-1]
-    if len(info):
-        root = linalg.cholesky(info, lower=True, check_finite=False)
-        fixed = linalg.lapack.dtrtri(root, lower=1)[0].T
+    if len(f.root):
+        fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
         e = np.concatenate([e, bent.reshape(len(e), len(fixed)) @ fixed], axis=1)
         r = np.concatenate([r, by_border @ fixed], axis=1)
     return Posterior(inverse_t @ f.inverse, e, r)
 
 
-def _deviance(f: Factored, root: Array, freedom: int, variance: float) -> float:
+def _deviance(f: Factored, freedom: int, variance: float) -> float:
     """Return -2 log restricted likelihood, the noise variance profiled out."""
     e, r = f.precision
     priors = np.concatenate([e.ravel(), r])
     priors = priors[priors > 0]
     logs = sum(
         2 * float(np.log(np.maximum(np.abs(np.diagonal(part, axis1=-2, axis2=-1)), 1e-300)).sum())
-        for part in (f.factor, root)
+        for part in (f.factor, f.root)
     ) - 2 * float(np.log(np.diagonal(f.inverse, axis1=-2, axis2=-1)).sum())
     return float(freedom * np.log(max(variance, 1e-300)) + logs - np.log(priors).sum())

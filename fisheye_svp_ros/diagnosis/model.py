@@ -233,9 +233,14 @@ class Linearised:
         return self.whitened(np.concatenate(shared, axis=-1))
 
     @cached_property
+    def row_weight(self) -> Array:
+        """Weights (F, M) of the rows, 1/px, zero for padding."""
+        return self.data.blocks(self.weight[..., None] * np.ones(2))
+
+    @property
     def used(self) -> Mask:
         """Which rows (F, M) are observations and not padding."""
-        return self.data.blocks((self.weight > 0)[..., None] * np.ones(2)) > 0
+        return self.row_weight > 0
 
     def whitened(self, columns: Array) -> Array:
         """Gather columns (S, N, 2, P) as (F, M, P), whitened, zero for padding."""
@@ -293,9 +298,7 @@ def fit_poses(data: Data, state: State) -> State:
     return problem.unpack(levenberg_marquardt(problem, problem.pack(state)).state)
 
 
-def moved(
-    data: Data, state: State, free: Sequence[str], frame: Array, shared: Array
-) -> State:
+def moved(data: Data, state: State, free: Sequence[str], frame: Array, shared: Array) -> State:
     """Return the state after a step of the poses (F, 6) and of what is shared (K,)."""
     problem = _Adjustment(data, state, free)
     return problem.unpack(problem.retract(problem.pack(state), (frame[None], shared[None])))
@@ -337,8 +340,7 @@ class _Adjustment:
             if is_shared(effect):
                 known, values = values[: len(known)], values[len(known) :]
             terms.append((effect, known))
-        rig = Pose(rig_rotation, rig_position)
-        pose = Pose(rotation, position)
+        pose, rig = Pose(rotation, position), Pose(rig_rotation, rig_position)
         return replace(self._template, pose=pose, rig=rig, lens=lenses[0],
                        others=tuple(lenses[1:]), terms=tuple(terms))
 

@@ -194,7 +194,7 @@ class Design:
         self.shots, self.board, self.known_views = shots, board, known
         self.known: Array = np.diag(1 / np.square(wide))
         if known:
-            used = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+            used = linear.row_weight
             mean = float(np.sqrt(np.mean(used[used > 0] ** 2)))
             self.known = self.known + information(linear, effects).sum(axis=0) / (mean * noise)**2
         views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)

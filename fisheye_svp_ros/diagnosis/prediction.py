@@ -154,12 +154,12 @@ def frames_in_turn(
 
 def _evenly(linear: Linearised) -> Array:
     """Return what takes the weights (F, M) of uneven noise out of whitened rows."""
-    weight, own = (linear.data.blocks(w[..., None] * np.ones(2))
-                   for w in (linear.data.views.weight, linear.weight))
+    weight = linear.data.blocks(linear.data.views.weight[..., None] * np.ones(2))
+    own = linear.row_weight
     return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
 
 
 def _figures(linear: Linearised, whitened: Array) -> HeldOut:
-    weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+    weight = linear.row_weight
     px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
     return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)

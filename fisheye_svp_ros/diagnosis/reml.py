@@ -52,9 +52,9 @@ class Variances:
         return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
 
 
-def nothing_random(landmarks: int, sigma: float = 1.0) -> Variances:
+def nothing_random(landmarks: int) -> Variances:
     """Return variances without any random component."""
-    return Variances(sigma, np.full(len(NAMES), GONE), np.ones(landmarks))
+    return Variances(1.0, np.full(len(NAMES), GONE), np.ones(landmarks))
 
 
 def start_variances(eq: Equations, share: float = 0.03) -> Variances:

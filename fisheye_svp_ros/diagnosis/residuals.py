@@ -6,12 +6,22 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.model import flat_rows
+from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows
 from fisheye_svp_ros.diagnosis.refit import Fitted
 
 _PROBES = 24
 _FINEST = 80  # of the image: how near to each other points have the same place
 _FEWEST_PAIRS = 100
+
+
+def rms_px(linear: Linearised, whitened: Array | None = None) -> float:
+    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
+
+    Without any: of those of the fit itself.
+    """
+    weight, used = linear.row_weight, linear.used
+    rows = linear.residual if whitened is None else whitened
+    return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))
 
 
 def conditional_residuals(fitted: Fitted) -> Array:

@@ -105,14 +105,16 @@ def search(
             effect, offset, step = found
             trace.append(step)
             state, changed = with_effect(state, effect, offset), True
-        asked = not (changed or wanted.quick)
-        if asked and not cleaned:
+        fitted: Fitted | None = None
+        if not (changed or wanted.quick or (cleaned and finest)):
+            fitted = fit_of(evidence)
+        if fitted is not None and not cleaned:
             # Once the causes are known: what is far off even beside random errors, and the noise.
-            data, gross, growth, changed = _cleaned(data, fit_of(evidence), gross, wanted)
+            data, gross, growth, changed = _cleaned(data, fitted, gross, wanted)
             cleaned = True
             if growth is not None:
                 state = with_noise_growth(state, growth.value)
-        if asked and not finest and ripples(fit_of(evidence)) > _RIPPLES:
+        if fitted is not None and not finest and ripples(fitted) > _RIPPLES:
             # Points of different frames err alike where they fall on the same place.
             finest = True
             if not changed:

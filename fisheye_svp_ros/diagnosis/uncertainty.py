@@ -83,7 +83,7 @@ class ModelError:
         what stays with the target is left out.
         """
         turn = _turns(linear)
-        weight = linear.data.blocks(linear.weight[..., None] * np.ones(2))
+        weight = linear.row_weight
         columns = linear.shared_columns * _of_the_lens(linear)
         flat, around = flat_rows(columns), flat_rows(turn)
         columns = (flat - around @ np.linalg.lstsq(around, flat, rcond=None)[0]).reshape(

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -27,22 +28,17 @@ except KeyboardInterrupt:  # before or after the command itself
 
 
 @pytest.fixture
-def start(ros_domain: int):  # type: ignore[no-untyped-def]
+def start(
+    ros_domain: int, start_process: Callable[..., NodeProcess]
+) -> Callable[..., NodeProcess]:
     """Return a function that starts a node as its executable does."""
-    started = []
-
     def run(node: str, *arguments: str) -> NodeProcess:
         path = os.pathsep.join([str(ROOT), os.environ.get('PYTHONPATH', '')])
         env = os.environ | {'ROS_DOMAIN_ID': str(ros_domain), 'PYTHONPATH': path,
                             'FISHEYE_SVP_ENGINE': 'numpy'}
-        started.append(NodeProcess([sys.executable, '-c', _CODE, node, *arguments], env))
-        return started[-1]
+        return start_process([sys.executable, '-c', _CODE, node, *arguments], env)
 
-    yield run
-    for one in started:
-        if one.process.poll() is None:
-            one.process.kill()
-            one.process.wait()
+    return run
 
 
 @pytest.mark.parametrize('arguments', [

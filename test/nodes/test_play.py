@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,19 +36,9 @@ OURS = sys.executable, '-m', 'fisheye_svp_ros.cli'
 
 
 @pytest.fixture
-def process(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
+def process(start_process: Callable[..., NodeProcess]) -> Callable[..., NodeProcess]:
     """Return a function that starts a command."""
-    started: list[NodeProcess] = []
-
-    def run(*words: str) -> NodeProcess:
-        started.append(NodeProcess(list(words), dict(os.environ)))
-        return started[-1]
-
-    yield run
-    for one in started:
-        if one.process.poll() is None:
-            one.process.kill()
-            one.process.wait()
+    return lambda *words: start_process(list(words), dict(os.environ))
 
 
 @pytest.fixture

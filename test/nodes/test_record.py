@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -307,22 +307,15 @@ def test_observations_of_two_worlds_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def command(ros_domain: int) -> Iterator[Callable[..., NodeProcess]]:
+def command(start_process: Callable[..., NodeProcess]) -> Callable[..., NodeProcess]:
     """Return a function that starts `fisheye-svp ARGUMENTS`."""
-    started: list[NodeProcess] = []
-
     def run(*arguments: str) -> NodeProcess:
         env = os.environ | {'PYTHONUNBUFFERED': '1'}
         env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
         words = [sys.executable, '-m', 'fisheye_svp_ros.cli', *arguments]
-        started.append(NodeProcess(words, env))
-        return started[-1]
+        return start_process(words, env)
 
-    yield run
-    for one in started:
-        if one.process.poll() is None:
-            one.process.kill()
-            one.process.wait()
+    return run
 
 
 def test_the_recorder_writes_every_message_until_it_is_interrupted(
