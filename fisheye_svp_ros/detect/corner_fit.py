@@ -9,12 +9,13 @@ leaves out (oblique blur, noise that grows with the light) does not move it to o
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
-from scipy.special import erf
+from scipy.special import digamma, erf, fdtrc, polygamma
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
@@ -23,11 +24,14 @@ _SMALLEST, _LARGEST = 2.5, 10.0  # radius of the window, px
 _WITHIN = 0.62  # of the distance to the next edge
 _UNKNOWNS = 12  # u, v; of two edges angle, bend, log blur; brightness, contrast, its gradient
 _ITERATIONS = 25
+_FEW = 8  # corners of one photograph, whose noise tells little of each other's
+_MUCH, _CHANCE = 4.0, 1e-6  # so much noisier a window is not by chance
 _CONTRAST = 6.0  # over the noise, below which a corner is not one
 _SMOOTHING = 0.8  # px; sharpened photographs have edges that would fall between pixels
 _PIXEL = 1 / 12 + _SMOOTHING**2  # px^2: what pixels and smoothing add to the blur
 _KEPT = 1 / (4 * np.pi * _SMOOTHING**2)  # of the variance of white noise, after smoothing
-_NEXT = float(np.exp(-1 / (4 * _SMOOTHING**2)))  # correlation of neighbours, after smoothing
+_PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
+_INDEPENDENT = 1 / (2 * np.pi * _SMOOTHING**2)  # of smoothed pixels: one over their rho^2 summed
 _ROOT = float(np.sqrt(2 / np.pi))
 
 
@@ -80,19 +84,29 @@ def _judged(
     radius: Array, square: bool, shape: tuple[int, Index],
 ) -> Corners:
     side, round_ = shape
-    windows = np.zeros((2, len(values), side * side))
-    windows[:, :, round_] = residual, weight
-    noise2 = _noise(windows[0], windows[1], values[:, :2], side, square)
     weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
     hessian, pull = weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
     scale = np.sqrt(np.maximum(np.einsum('nii->ni', hessian), 1e-30))
     unit = hessian / (scale[:, :, None] * scale[:, None, :]) + 1e-12 * np.eye(_UNKNOWNS)
     covariance = np.linalg.inv(unit) / (scale[:, :, None] * scale[:, None, :])
+    gain = covariance @ weighted
+    # What is left of the residuals over what is left of noise of unit size, fitted likewise.
+    probes = _unit_noise(side)
+    chosen = (np.arange(len(values))[:, None] * _EACH + np.arange(_EACH)) % len(probes)
+    noise = probes[chosen][..., round_]
+    noise -= (noise @ np.swapaxes(gain, -1, -2)) @ np.swapaxes(jacobian, -1, -2)
+    windows = np.zeros((len(values), 2 + _EACH, side * side))
+    windows[..., round_] = np.concatenate([weight[:, None], residual[:, None], noise], axis=1)
+    squares = _squares(windows, values[:, :2], side, square)
+    usual = squares[:, 1:].mean(axis=1)
+    noise2 = squares[:, 0] / np.maximum(usual, 1e-9)
+    freedom = np.maximum(usual / _KEPT * _INDEPENDENT, 1.0)
     # Smoothed noise is correlated: what each raw pixel moves the corner by, squared and summed.
-    gain = np.zeros((len(values), 2, side * side))
-    gain[:, :, round_] = covariance[:, :2] @ weighted
-    gain = gaussian_filter(gain.reshape(-1, 2, side, side), (0, 0, _SMOOTHING, _SMOOTHING))
-    sigma = np.sqrt(noise2 / _KEPT * (gain**2).sum(axis=(1, 2, 3)) / 2)
+    moved = np.zeros((len(values), 2, side * side))
+    moved[..., round_] = gain[:, :2]
+    moved = gaussian_filter(moved.reshape(-1, 2, side, side), (0, 0, _SMOOTHING, _SMOOTHING))
+    gain2 = (moved**2).sum(axis=(1, 2, 3)) / 2
+    sigma = np.sqrt(noise2 * gain2)
     # What the fit would still move the corner by; a blur may take longer to settle.
     left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
     uv, blur, contrast = values[:, :2] + place, np.exp(values[:, 6:8]).max(axis=1), values[:, 9]
@@ -102,40 +116,67 @@ def _judged(
         np.isfinite(uv).all(axis=1) & np.isfinite(sigma) & (sigma < 1)
         & (left < 0.1 * sigma + 1e-4)
         & (np.linalg.norm(uv - start, axis=1) < 0.7 * radius) & (blur < 0.7 * radius)
-        & (np.abs(contrast) > _CONTRAST * np.sqrt(noise2)) & (between > 0.17)
+        & (np.abs(contrast) > _CONTRAST * np.sqrt(_KEPT * noise2)) & (between > 0.17)
         & (weight.sum(axis=1) > 0.7 * np.pi * radius**2)
     )
+    if ok.sum() >= _FEW:
+        alike, foreign = _moderated(noise2[ok], freedom[ok])
+        sigma[ok] = np.sqrt(alike * gain2[ok])
+        ok[ok] = ~foreign
     return Corners(uv, sigma, blur, contrast, ok)
 
 
-def _noise(residual: Array, weight: Array, corner: Array, side: int, square: bool) -> Array:
-    """Return the variance (N,) of the noise in windows (N, P) of residuals.
+def _moderated(noise2: Array, freedom: Array) -> tuple[Array, Mask]:
+    """Return variances (N,), each from so few degrees of freedom, drawn towards their common one.
+
+    By as much as they scatter no more than variances of one noise do (empirical Bayes).  Also
+    which (N,) are beyond all others: something else is in their windows, the edge of the field.
+    Source: Smyth, Linear models and empirical Bayes methods, Statistical Applications in Genetics
+    and Molecular Biology 3 (2004), section 6.2.
+    """
+    half = freedom / 2
+    level = np.log(np.maximum(noise2, 1e-30)) - digamma(half) + np.log(half)
+    centre = float(np.median(level))
+    spread = (1.4826 * np.median(np.abs(level - centre))) ** 2 - polygamma(1, half).mean()
+    # 1 / (x - 0.5) is near the trigamma of x, from above one on.
+    prior = 2 * min(1 / max(float(spread), 1e-6) + 0.5, 1e6)
+    common = np.exp(centre + digamma(prior / 2) - np.log(prior / 2))
+    foreign = fdtrc(freedom, prior, noise2 / (_MUCH * common)) < _CHANCE
+    return (prior * common + freedom * noise2) / (prior + freedom), np.asarray(foreign)
+
+
+@lru_cache(maxsize=8)
+def _unit_noise(side: int) -> Array:
+    """Return windows (K, side * side) of white noise of unit variance, smoothed as images are."""
+    noise = np.random.default_rng(0).standard_normal((_PROBES, side + 8, side + 8))
+    smooth = gaussian_filter(noise, (0, _SMOOTHING, _SMOOTHING))[:, 4:-4, 4:-4]
+    return np.asarray(smooth.reshape(_PROBES, -1))
+
+
+def _squares(windows: Array, corner: Array, side: int, square: bool) -> Array:
+    """Return sums (N, K) of squares of residuals, windows[:, 1:] (N, 1 + K, P); first are weights.
 
     Of an X only what differs from one side of the corner to the other counts: the halo that
     sharpening leaves along edges is the same on both, and moves nothing.
     """
     if square:
-        return np.asarray((weight * residual**2).sum(1)
-                          / np.maximum(weight.sum(1) - _UNKNOWNS, 1.0))
+        return np.asarray((windows[:, :1] * windows[:, 1:] ** 2).sum(axis=-1))
     # The mirror image of each pixel lies between four others.
     opposite = 2 * corner[:, ::-1, None] + side - 1 - np.arange(side)
     first = np.floor(opposite).astype(np.int64)
     part = opposite[..., 0] - first[..., 0]
     inside = (first >= 0) & (first < side - 1)
     first = np.clip(first, 0, side - 2)
-    grid = np.stack([residual, weight]).reshape(2, -1, side, side)
+    grid = windows.reshape(*windows.shape[:2], side, side)
     system = np.arange(len(corner))[:, None, None]
     mirrored = np.zeros_like(grid)
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        share = (np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1]))[:, None, None]
-        mirrored += share * grid[:, system, first[:, 0, :, None] + down, first[:, 1, None] + right]
-    pairs = grid[1] * mirrored[1] * (inside[:, 0, :, None] & inside[:, 1, None])
-    odd2 = (pairs * (grid[0] - mirrored[0]) ** 2).sum(axis=(1, 2)) / 4
-    # What lies between pixels scatters less, though smoothed ones less so.
-    left = (1 - 2 * part * (1 - part) * (1 - _NEXT)).prod(axis=1)
-    # Half of the pixels are the others' mirror images, half of the unknowns are odd.
-    spare = np.maximum((pairs.sum(axis=(1, 2)) - _UNKNOWNS) / 2, 1.0)
-    return np.asarray(odd2 * 2 / (1 + left) / spare)
+        share = np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1])
+        mirrored += share[:, None, None, None] * np.moveaxis(
+            grid[system, :, first[:, 0, :, None] + down, first[:, 1, None] + right], -1, 1)
+    pairs = grid[:, 0] * mirrored[:, 0] * (inside[:, 0, :, None] & inside[:, 1, None])
+    odd2 = (grid[:, 1:] - mirrored[:, 1:]) ** 2 / 4
+    return np.asarray((pairs[:, None] * odd2).sum(axis=(-2, -1)))
 
 
 class _Problem:
@@ -198,12 +239,9 @@ class _Problem:
         edges = [
             _edge(du, dv, *(values[:, k + i:k + i + 1] for k in (2, 4, 6))) for i in (0, 1)
         ]
-        first, second = edges[0][0], edges[1][0]
-        if self._square:
-            shape = (1 + first) * (1 + second) / 2 - 1
-            by_edge = (1 + second) / 2, (1 + first) / 2
-        else:
-            shape, by_edge = first * second, (second, first)
+        corner = _inner if self._square else _cross
+        between = values[:, 2:3] - values[:, 3:4]
+        shape, *by_edge, by_cosine = corner(edges[0][0], edges[1][0], np.cos(between))
         light = 1 + values[:, 10:11] * du + values[:, 11:12] * dv
         level, contrast = values[:, 8:9], values[:, 9:10]
         face = level + contrast * shape
@@ -215,7 +253,8 @@ class _Problem:
                 - face * values[:, 10 + axis, None]
             )
         for i in (0, 1):
-            jacobian[..., 2 + i] = slope[i] * edges[i][3]
+            turned = contrast * light * by_cosine * (2 * i - 1) * np.sin(between)
+            jacobian[..., 2 + i] = slope[i] * edges[i][3] + turned
             jacobian[..., 4 + i] = slope[i] * edges[i][4]
             jacobian[..., 6 + i] = slope[i] * edges[i][5]
         jacobian[..., 8], jacobian[..., 9] = light, shape * light
@@ -223,20 +262,44 @@ class _Problem:
         return face * light, jacobian, self._weight[index]
 
 
-def _edge(du: Array, dv: Array, angle: Array, bend: Array, size: Array) -> tuple[Array, ...]:
-    """Return a blurred edge (A, P), -1 to 1, and its derivatives by u, v, angle, bend, size.
+def _cross(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array]:
+    """Return a blurred X (A, P), -1 to 1, and its derivatives by a, b and alike.
 
-    size: logarithm of the blur.
+    a, b: distances from the edges over their blurs; alike (A, 1): cosine between the edges.  What
+    a blur makes of a corner is the chance that two Gaussian numbers, correlated so, lie on one
+    side each, by the first terms of the tetrachoric series (Pearson, Phil. Trans. A 195, 1900).
+    """
+    first, second = erf(a / np.sqrt(2)), erf(b / np.sqrt(2))
+    by_a, by_b = _ROOT * np.exp(-0.5 * a * a), _ROOT * np.exp(-0.5 * b * b)
+    both, square, cube = by_a * by_b, alike**2 / 2, alike**3 / 6
+    across, other = a * a - 1, b * b - 1
+    more = alike + square * a * b + cube * across * other
+    return (
+        first * second + both * more,
+        by_a * second + both * (square * b + 2 * cube * a * other - a * more),
+        by_b * first + both * (square * a + 2 * cube * b * across - b * more),
+        both * (1 + alike * a * b + square * across * other),
+    )
+
+
+def _inner(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array]:
+    """Return a blurred L (A, P), -1 to 1, and its derivatives: the X and both edges, halved."""
+    shape, by_a, by_b, by_alike = _cross(a, b, alike)
+    edges = [(erf(d / np.sqrt(2)), _ROOT * np.exp(-0.5 * d * d)) for d in (a, b)]
+    return ((shape + edges[0][0] + edges[1][0] - 1) / 2,
+            (by_a + edges[0][1]) / 2, (by_b + edges[1][1]) / 2, by_alike / 2)
+
+
+def _edge(du: Array, dv: Array, angle: Array, bend: Array, size: Array) -> tuple[Array, ...]:
+    """Return the distance (A, P) from an edge over its blur, and its derivatives.
+
+    By u, v, angle, bend, size: the logarithm of the blur.
     """
     blur = np.exp(np.clip(size, -5, 5))
     cos, sin = np.cos(angle), np.sin(angle)
     across, along = cos * du + sin * dv, cos * dv - sin * du
-    distance = (across + 0.5 * bend * along * along) / blur
-    slope = (_ROOT / blur) * np.exp(-0.5 * distance * distance)
-    lean = bend * along
+    distance, lean = (across + 0.5 * bend * along * along) / blur, bend * along
     return (
-        erf(distance / np.sqrt(2)),
-        slope * (lean * sin - cos), -slope * (lean * cos + sin),
-        slope * along * (1 - bend * across), slope * (0.5 * along * along),
-        -slope * distance * blur,
+        distance, (lean * sin - cos) / blur, -(lean * cos + sin) / blur,
+        along * (1 - bend * across) / blur, 0.5 * along * along / blur, -distance,
     )

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
+import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 _START = 60.0  # s a process may take to start
+# No process of multiprocessing, which would run a caller's script anew from its first line.
+_PROGRAM = ('import sys; sys.path[:] = sys.argv[2:]; '
+            'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))')
 
 
 class Late(NamedTuple):
@@ -21,16 +26,18 @@ class Late(NamedTuple):
 
 class _Worker:
     def __init__(self, function: Callable[[Any], Any]) -> None:
-        context = multiprocessing.get_context('spawn')
-        self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_serve, args=(function, theirs), daemon=True)
+        ours, theirs = socket.socketpair()
+        self.pipe = Connection(ours.detach())
         # Ctrl-C is for whoever waits for the work.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
-            self.process.start()
+            with theirs:
+                self.process = subprocess.Popen(
+                    [sys.executable, '-c', _PROGRAM, str(theirs.fileno()), *sys.path],
+                    pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
-        theirs.close()
+        self.pipe.send(function)
         self.number, self.deadline = -1, 0.0
 
     def give(self, number: int, item: Any, seconds: float) -> None:
@@ -40,7 +47,7 @@ class _Worker:
     def stop(self) -> None:
         self.pipe.close()
         self.process.kill()
-        self.process.join()
+        self.process.wait()
 
 
 def bounded_map(
@@ -130,11 +137,14 @@ class BoundedCalls:
         self._busy = True
 
 
-def _serve(function: Callable[[Any], Any], pipe: Connection) -> None:
+def serve(number: int) -> None:
+    """Do in this process what comes by the connection with that file number, until it ends."""
     import cv2
 
     cv2.setNumThreads(1)  # the processes share the cores
+    pipe = Connection(number)
     try:
+        function = pipe.recv()
         while True:
             pipe.send(function(pipe.recv()))
     except (EOFError, OSError, KeyboardInterrupt):

@@ -66,19 +66,21 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     Every view is localized with weights that fade for points far from their prediction (Cauchy),
     on the scale of the median residual of that view or of all, whichever is larger: a view that
     a model error bends as a whole holds no gross error, nor does a landmark that is off in most
-    of its views.  A view out of all proportion belongs elsewhere as a whole.
+    of its views.  A view out of all proportion belongs elsewhere as a whole.  A point whose own
+    sigma is larger than most may lie so much further off.
     """
     model = state.cameras
     views, pose = data.views, state.view_poses(data)
     alone = model.localize(views) if data.cameras > 1 else pose
-    scale, offset = _scale(views, _offset(model, pose, views))
+    unsure = _unsure(views)
+    scale, offset = _scale(views, _offset(model, pose, views) / unsure)
     if np.nanmax(offset / scale) > _SUSPECT:
         for _ in range(_ROUNDS):
             before = offset
             fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
             weight = np.where(views.used, views.weight * fading, 0.0)
             alone = pose = model.localize(views._replace(weight=weight), pose)
-            scale, offset = _scale(views, _offset(model, pose, views))
+            scale, offset = _scale(views, _offset(model, pose, views) / unsure)
             if np.nanmax(np.abs(offset - before) / scale) < _SETTLED:
                 break
     of_landmark = _scale_of_landmark(views, offset)
@@ -91,6 +93,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     torn, apart = _torn_frames(data, state, alone, typical)
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
+    offset = offset * unsure
     for mask, px, why in ((swapped, offset, SWAPPED), (far & ~swapped, offset, FAR),
                           (views.used & whole[:, None], offset, VIEW),
                           (views.used & torn[:, None], apart, FRAME)):
@@ -163,6 +166,12 @@ def _offset(model: Cameras, pose: Pose, views: Views) -> Array:
     """Distances (S, N) of the points from their predictions, px; NaN for padding."""
     distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
     return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
+
+
+def _unsure(views: Views) -> Array:
+    """Return the sigma of each point (S, N) over the median one, 1 at least."""
+    sigma = 1 / np.where(views.used, views.weight, np.nan)
+    return np.nan_to_num(np.maximum(sigma / np.nanmedian(sigma), 1.0), nan=1.0)
 
 
 def _scale(views: Views, offset: Array) -> tuple[Array, Array]:

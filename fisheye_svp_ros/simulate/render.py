@@ -23,6 +23,7 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 _BETWEEN = 3  # samples along each side of a pixel
 _ROUNDS = 6  # to meet a bowed board
 _DARK, _BRIGHT, _ROOM = 0.08, 0.85, 0.30  # reflectance of ink, paper, what is behind
+_WIDE = 0.75  # pixels around an edge that may see it: a half, and what bends
 _AROUND = 12.0  # px around the sheet that may see it once it is moved
 _CHUNK = 200_000  # pixels whose rays are computed at once
 
@@ -191,22 +192,37 @@ def _light(printed: Print, places: Array) -> NDArray[np.float32]:
     part = places / printed.size
     by_v, by_u = np.gradient(part, axis=(0, 1))
     (vv, uv_), uu = np.gradient(by_v, axis=(0, 1)), np.gradient(by_u, axis=1)
-    light = np.empty((_BETWEEN * part.shape[0], _BETWEEN * part.shape[1]), np.float32)
+    wide = _WIDE * (np.abs(by_u) + np.abs(by_v))
+    # Few pixels see an edge; the others see one brightness all over.
+    edge = ~(_line_distance(printed, part) > wide).all(axis=-1)
+    light = np.empty((*edge.shape, _BETWEEN, _BETWEEN), np.float32)
+    light[:] = np.expand_dims(_reflectance(printed, part, np.full(2, 1e-12)), (2, 3))
+    part, by_u, by_v, uu, uv_, vv = (
+        np.asarray(array)[edge] for array in (part, by_u, by_v, uu, uv_, vv))
     steps = (np.arange(_BETWEEN) + 0.5) / _BETWEEN - 0.5
     for row, b in enumerate(steps):
         for column, a in enumerate(steps):
             sample = (part + a * by_u + b * by_v
                       + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv)
-            slope = (by_u + a * uu + b * uv_, by_v + a * uv_ + b * vv)
-            light[row::_BETWEEN, column::_BETWEEN] = _reflectance(printed, sample, slope)
+            # How far, in squares, a sample reaches across lines of x and of y.
+            reach = np.abs(by_u + a * uu + b * uv_) + np.abs(by_v + a * uv_ + b * vv)
+            light[edge, row, column] = _reflectance(printed, sample, reach / _BETWEEN + 1e-12)
     light[~np.isfinite(light)] = _ROOM
-    return light
+    height, width = edge.shape
+    return light.swapaxes(1, 2).reshape(_BETWEEN * height, _BETWEEN * width)
 
 
-def _reflectance(printed: Print, places: Array, slope: tuple[Array, Array]) -> Array:
-    """Return the reflectance at places (H, W, 2), squares, averaged over a sample's width."""
-    # How far, in squares, a sample reaches across lines of x and of y.
-    width = (np.abs(slope[0]) + np.abs(slope[1])) / _BETWEEN + 1e-12
+def _line_distance(printed: Print, places: Array) -> Array:
+    """Return how far places (..., 2), squares, are from the nearest lines of x and of y."""
+    count = np.array([printed.columns, printed.rows])
+    squares = np.abs(places - np.clip(np.round(places), -1, count))
+    sheet = np.minimum(np.abs(places + 1 + printed.margin),
+                       np.abs(places - count - printed.margin))
+    return np.asarray(np.minimum(squares, sheet))
+
+
+def _reflectance(printed: Print, places: Array, width: Array) -> Array:
+    """Return the reflectance at places (..., 2), squares, averaged over a sample's width."""
     count = np.array([printed.columns, printed.rows])
     # Brightness changes across the lines through inner corners alone.
     line = np.clip(np.round(places), 0, count - 1)

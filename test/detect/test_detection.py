@@ -460,6 +460,19 @@ class TestOrder:
         assert found(tmp_path, 'chessboard:6x4:30mm').certainty.mean() < 0.95
 
 
+def test_a_script_without_a_main_guard_searches_as_well(tmp_path: Path) -> None:
+    write(tmp_path, [photograph(poses(4, 2).take(0))])
+    script = tmp_path / 'mine.py'
+    script.write_text(f"""
+from fisheye_svp_ros.detect.detection import detect
+from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.photographs import find_photographs
+print(len(detect(find_photographs([{str(tmp_path)!r}]), parse_pattern({BOARD!r})).observations))
+""")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ('30\n', '')
+
+
 def test_work_is_bounded_in_time() -> None:
     results = dict(bounded_map(sleep, [0.0, 0.0, 0.0, 120.0, 0.0, 0.0], 1.0))
     assert results[3] == Late(True)

@@ -10,7 +10,7 @@ from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import thinned
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
-from fisheye_svp_ros.diagnosis.noise import Gross, quantisation_step
+from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors, quantisation_step
 from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -132,6 +132,23 @@ def test_landmarks_far_from_their_place_are_no_gross_errors():
     for parameter, true in zip(values.values(), moves, strict=True):
         assert abs(parameter['value'] - true) < 5 * parameter['stderr']
     assert [s.variable for s in found.remaining] == ['outliers']
+
+
+def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
+    rng = np.random.default_rng(22)
+    pose, views = scene(rng)
+    clean = observe(lens(), (), pose, views, 0.0, rng)
+    sigma = np.full(len(clean), SIGMA)
+    sigma[::40] = 6 * SIGMA
+    uv = clean.uv + sigma[:, None] * rng.normal(size=clean.uv.shape)
+    uv[40] = clean.uv[40] + 10 * SIGMA
+    table = replace(clean, uv=uv, sigma=sigma)
+    data = prepare(table)
+    assert not len(find_gross_errors(data, start(data, lens()))[1].rows)
+    data = prepare(replace(table, sigma=np.full(len(clean), SIGMA)))
+    gross = find_gross_errors(data, start(data, lens()))[1]
+    assert 40 in gross.rows.tolist()
+    assert gross.px[gross.rows == 40] == pytest.approx(10 * SIGMA * np.sqrt(2), rel=0.3)
 
 
 def test_quantisation_is_read_off_the_numbers():

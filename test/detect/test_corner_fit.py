@@ -1,0 +1,56 @@
+"""Single corners: how far they scatter is what is stated, also oblique ones and small ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from cv2 import GaussianBlur
+
+from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
+
+SIDE, COUNT, BLUR, NOISE = 41, 150, 0.6, 1.5
+
+
+def corners(angle: float, clearance: float, square: bool, band: int = 0) -> tuple[Corners, float]:
+    """Fit a corner seen COUNT times in noise; return it, and how far it scatters, px.
+
+    band: columns of the first image's right edge that something else covers.
+    """
+    rng = np.random.default_rng(0)
+    axes = np.array([[1.0, 0.0], [np.cos(np.radians(angle)), np.sin(np.radians(angle))]])
+    place = 20 + np.array([0.21, -0.37])
+    fine = (np.arange(5 * SIDE) + 0.5) / 5 - 0.5
+    x, y = np.meshgrid(fine - place[0], fine - place[1])
+    # A blurred corner is a blurred picture of a sharp one: on a grid of fifths of a pixel.
+    sides = [np.sign(x * np.sin(np.radians(angle)) - y * np.cos(np.radians(angle))), np.sign(y)]
+    sharp = (1 + sides[0]) * (1 + sides[1]) / 2 - 1 if square else sides[0] * sides[1]
+    soft = GaussianBlur(sharp, (0, 0), 5 * BLUR).reshape(SIDE, 5, SIDE, 5).mean(axis=(1, 3))
+    image = 120 + 95 * np.tile(soft, (1, COUNT))
+    image += NOISE * rng.standard_normal(image.shape)
+    image[:, SIDE - band:SIDE] = 0.0
+    start = np.stack([place[0] + SIDE * np.arange(COUNT), np.full(COUNT, place[1])], axis=-1)
+    found = fit_corners(image, start + rng.uniform(-0.3, 0.3, start.shape),
+                        np.tile(axes, (COUNT, 1, 1)), np.full(COUNT, clearance), square)
+    error = (found.uv - start)[found.ok]
+    return found, float(np.sqrt(((error - error.mean(axis=0)) ** 2).mean()))
+
+
+@pytest.mark.parametrize(('angle', 'clearance', 'square'), [
+    (90, 40, False), (90, 13, False), (70, 20, False), (50, 20, False), (40, 20, False),
+    (70, 9, False), (90, 12, True), (60, 20, True),
+])
+def test_scatter_is_the_stated_sigma(angle: float, clearance: float, square: bool) -> None:
+    found, scatter = corners(angle, clearance, square)
+    assert found.ok.mean() > 0.97
+    assert scatter / np.sqrt((found.sigma[found.ok] ** 2).mean()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_sigma_is_that_of_the_photograph_where_a_window_tells_little() -> None:
+    found, _ = corners(90, 13, False)
+    assert found.sigma.std() < 0.06 * found.sigma.mean()
+
+
+def test_a_corner_by_the_edge_of_the_field_is_none() -> None:
+    found, _ = corners(90, 40, False, band=12)
+    assert not found.ok[0]
+    assert found.ok[1:].all()
