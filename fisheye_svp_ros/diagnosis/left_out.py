@@ -8,13 +8,14 @@ Source: Cook and Weisberg, Residuals and Influence in Regression (1982), for blo
 
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.mixed import Factored, solve_lower
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, random_roots
 from fisheye_svp_ros.diagnosis.random_effects import Design
 
 
@@ -36,65 +37,77 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
     random: the design of the components in the factored equations; pose (F, M, 6) and border
     (F, M, X): the columns that these were made of.
     """
-    found = [_left_out(f, random, i, pose[i], border[i]) for i in range(len(pose))]
+    eq, (e, r) = f.equations, random_roots(f)
+    # Roots of the covariance of the coefficients and, given the border, their predictions.
+    split = eq.sorted(
+        np.concatenate([e, e @ f.border], axis=1).reshape(*f.coupled.shape[:2], -1),
+        np.concatenate([r, r @ f.border], axis=1),
+    )
+
+    def one(frame: int) -> LeftOut:
+        return _left_out(f, split, random, frame, pose[frame], border[frame])
+
+    # NumPy's linear algebra, unlike SciPy's, lets go of the interpreter.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        found = list(pool.map(one, range(len(pose))))
     return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
 
 
-def _left_out(f: Factored, random: Design, frame: int, pose: Array, border: Array) -> LeftOut:
+def _left_out(
+    f: Factored, split: tuple[Array, Array, Array], random: Design, frame: int, pose: Array,
+    border: Array,
+) -> LeftOut:
+    """Return what a frame brings.
+
+    split: roots of the covariance and what the border says, by frame, by landmark, shared.
+    """
     used = np.flatnonzero(np.abs(pose).sum(axis=1) + np.abs(border).sum(axis=1))
     height, rows = len(pose), np.zeros_like(border)
     own = np.concatenate(
         [pose[used] / f.equations.pose_scale[frame], random.frame[frame][used]], axis=1
     )
+    at, place = _places(f.equations, random, frame)
     shared = random.shared[frame * height + used].toarray()
-    slot = np.repeat(random.slot[frame], 2)[used]
-    place = random.place[frame].reshape(height, 3)[used]
-    inside, rest, at_border = _eliminated(f, frame, own, shared, slot, place, random)
-    half = solve_lower(f.factor, rest)
+    touched = np.flatnonzero(shared.any(axis=0))
+    by_frame, by_landmark, by_all = split
+    both = own @ by_frame[frame] + shared[:, touched] @ by_all[touched]
+    if len(by_landmark):
+        both += (place @ by_landmark[at]).reshape(height, -1)[used]
+    root, told = np.split(both, [len(f.factor)], axis=1)
+    inside, at_border = _eliminated(f, frame, own, np.repeat(at, 2)[used],
+                                    place.reshape(height, 3)[used])
     # P of this frame's rows, and P border
-    p = np.eye(len(used)) - inside - half.T @ half
-    left = border[used] - at_border - half.T @ f.border
+    p = np.eye(len(used)) - inside - root @ root.T
+    remaining = border[used] - at_border - told
     basis = _span(pose[used])
-    left -= basis @ (basis.T @ left)
-    root = linalg.cholesky(p + basis @ basis.T, lower=True, check_finite=False)
-    first = solve_lower(root, left)
-    rows[used] = solve_lower(root, first, trans=1)
-    return LeftOut(first.T @ first, rows)
+    remaining -= basis @ (basis.T @ remaining)
+    rows[used] = np.linalg.solve(p + basis @ basis.T, remaining)
+    return LeftOut(remaining.T @ rows[used], rows)
+
+
+def _places(eq: Equations, random: Design, frame: int) -> tuple[Index, Array]:
+    """Return a frame's landmarks (N,) in the equations and their places (N, 2, 3) or zero."""
+    order = np.full(len(random.landmark) + 1, -1)
+    order[eq.landmarks] = np.arange(len(eq.landmarks))
+    slot = random.slot[frame]
+    at = order[slot]
+    there = (random.landmark_label[slot] >= 0) & (at >= 0)[:, None]
+    return at, np.where(there[:, None], random.place[frame], 0.0)
 
 
 def _eliminated(
-    f: Factored, frame: int, own: Array, shared: Array, slot: Array, place: Array, random: Design
-) -> tuple[Array, Array, Array]:
-    """Return what the eliminated blocks take from a frame's m rows.
-
-    From their products (m, m), what is left of their columns of the rest (R, m), and from their
-    border (m, X).
-    """
-    eq = f.equations
-    order = np.full(len(random.landmark) + 1, -1)
-    order[eq.landmarks] = np.arange(len(eq.landmarks))
-    at = order[slot]
-    place = np.where((random.landmark_label[slot] >= 0) & (at >= 0)[:, None], place, 0.0)
-    count = len(eq.landmarks)
-    if eq.by_frame:
+    f: Factored, frame: int, own: Array, at: Index, place: Array
+) -> tuple[Array, Array]:
+    """Return what the eliminated blocks take from a frame's rows (m, m) and border (m, X)."""
+    if f.equations.by_frame:
         first = f.inverse[frame] @ own.T
-        landmark = np.zeros((count, 3, len(own)))
-        if count:
-            landmark[at, :, np.arange(len(own))] = place
-        rest = np.concatenate([shared.T, landmark.reshape(3 * count, len(own))])
-        return (first.T @ first, rest - f.coupled[frame].T @ first,
-                first.T @ f.block_border[frame])
-    rest = np.zeros((len(f.factor), len(own)))
-    width = own.shape[1]
-    rest[frame * width : (frame + 1) * width] = own.T
-    rest[len(rest) - shared.shape[1] :] = shared.T
-    if not count:
-        return np.zeros((len(own), len(own))), rest, np.zeros((len(own), f.border.shape[1]))
+        return first.T @ first, first.T @ f.block_border[frame]
+    if not len(f.equations.landmarks):
+        return np.zeros((len(own), len(own))), np.zeros((len(own), f.border.shape[1]))
     step = (f.inverse[at] @ place[..., None])[..., 0]
     same = at[:, None] == at
-    rest -= np.einsum('mi,mir->rm', step, f.coupled[at])
-    return np.where(same, step @ step.T, 0.0), rest, np.einsum('mi,mix->mx', step,
-                                                              f.block_border[at])
+    return (np.where(same, step @ step.T, 0.0),
+            np.einsum('mi,mix->mx', step, f.block_border[at]))
 
 
 def _span(columns: Array) -> Array:

@@ -330,17 +330,25 @@ class Posterior(NamedTuple):
         return np.asarray(root @ root.T + np.where(block[:, None] == block, own, 0.0))
 
 
+def random_roots(f: Factored) -> tuple[Array, Array]:
+    """Return roots e (E k, R), r (R, R) of the covariance given the fixed columns.
+
+    That of the rest is r r'; of the blocks it is e e' and, within each, inverse' inverse.
+    """
+    count, width, rest = f.coupled.shape
+    flat = (np.swapaxes(f.inverse, -1, -2) @ f.coupled).reshape(count * width, rest)
+    if not rest:
+        return flat, np.zeros((0, 0))
+    inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
+    return linalg.blas.dtrmm(-1.0, inverse, flat.T, lower=1).T, inverse.T
+
+
 def posterior(f: Factored) -> Posterior:
     """Return the covariance of all coefficients; the border must be of full rank."""
     inverse_t = np.swapaxes(f.inverse, -1, -2)
     by_border = _back(f.factor, f.border[:, :-1])
     bent = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
-    e = np.zeros((bent.shape[0] * bent.shape[1], 0))
-    r = np.zeros((len(f.factor), 0))
-    if len(f.factor):
-        inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
-        flat = (inverse_t @ f.coupled).reshape(len(e), len(inverse))
-        e, r = linalg.blas.dtrmm(1.0, inverse, flat.T, lower=1).T, inverse.T
+    e, r = random_roots(f)
     if len(f.root):
         fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
         e = np.concatenate([e, bent.reshape(len(e), len(fixed)) @ fixed], axis=1)
