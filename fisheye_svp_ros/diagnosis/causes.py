@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import (
@@ -59,7 +59,7 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
         estimates = np.array([_step(part, own) for part in evidence.in_turn]) / scale
         count = len(estimates)
         squares = (count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(axis=0)
-        limit = stats.chi2.ppf(_GUARD, count - 1) / (count - 1)
+        limit = special.chdtri(count - 1, 1 - _GUARD) / (count - 1)
         errors = np.where(squares > limit * errors**2, np.sqrt(squares), errors)
     return np.where(open_, np.nan, errors)
 

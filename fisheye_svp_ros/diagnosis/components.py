@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.mixed import (
@@ -107,7 +107,7 @@ def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[st
         mean, spread = float(np.trace(remaining)), 2 * float((remaining**2).sum())
         size = float(pull @ pull) / solution.variance
         if mean > 1e-9 and spread > 0:
-            found[name] = float(stats.gamma.sf(size, mean**2 / spread, scale=spread / mean))
+            found[name] = float(special.gammaincc(mean**2 / spread, size * mean / spread))
     return found
 
 
@@ -163,7 +163,7 @@ def significance(
 
 
 def _chance(ratio: float) -> float:
-    return float(stats.chi2.sf(max(ratio, 0.0), 1)) / 2
+    return float(special.chdtrc(1, max(ratio, 0.0))) / 2
 
 
 def likelihood_ratios(

@@ -12,7 +12,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
@@ -141,7 +141,7 @@ class Evidence:
         )
         estimate = inverse @ gradient
         statistic = float(estimate @ gradient)
-        p = float(stats.chi2.sf(statistic, rank)) if rank else 1.0
+        p = float(special.chdtrc(rank, max(statistic, 0.0))) if rank else 1.0
         return Score(statistic, rank, p, estimate / self.scale[columns], np.inf)
 
     def confident(self, score: Score, included: Index, columns: Index) -> Score:
@@ -153,7 +153,7 @@ class Evidence:
         if covariance is None or not score.rank:
             return score
         freedom = self._freedom(score.estimate * self.scale[columns], included, columns)
-        p = float(stats.f.sf(score.statistic / score.rank, score.rank, freedom))
+        p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
         return score._replace(p_value=p, freedom=freedom)
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.budget import Component
@@ -156,7 +156,7 @@ def find_medium(
     if not (merits[0] < merits[1] or near):
         return None
     mine = _cost(air)
-    p_value = float(stats.chi2.sf((before - after) / square, len(names)))
+    p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(state, names, gross, air, tuple(free), p_value, max(0.0, 1 - after / mine),
                   bool(merits[1] < merits[0]))
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
@@ -162,7 +162,7 @@ class Question:
         if self.value is None:
             return float(np.exp(-merit / 2))
         rank = len(self.interest)
-        return float(stats.ncx2.sf(stats.chi2.isf(CLASS_SIGNIFICANCE, rank), rank, merit))
+        return float(1 - special.chndtr(special.chdtri(rank, CLASS_SIGNIFICANCE), rank, merit))
 
 
 class Design:

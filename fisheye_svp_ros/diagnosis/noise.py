@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.cameras import Cameras
@@ -221,7 +221,7 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     tails = max(float(e2.var()) / 2, 1.0)
     gain = (deviance(0.0) - float(best.fun)) / tails
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    p = float(stats.chi2.sf(max(gain, 0.0), 1))
+    p = float(special.chdtrc(1, max(gain, 0.0)))
     level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
     return NoiseCause(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
 

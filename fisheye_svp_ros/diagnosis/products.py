@@ -48,17 +48,19 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
     landmarks, shared, edge = len(design.landmark), design.shared, border.shape[-1]
     own = np.concatenate([pose, design.frame], axis=-1)
     across, flat = np.swapaxes(own, -1, -2), border.reshape(frames * height, edge)
-    offsets = design.offsets
+    offsets, count = design.offsets, shared.shape[1]
     lf = np.zeros((3 * landmarks, frames, own.shape[-1]))
-    sf = np.zeros((shared.shape[1], frames, own.shape[-1]))
-    ss = np.zeros((shared.shape[1], shared.shape[1]))
+    sf = np.zeros((count, frames, own.shape[-1]))
+    ss, sx = np.zeros((count, count)), np.zeros((count, edge))
     for f in range(frames):
         rows = slice(f * height, (f + 1) * height)
-        lf[:, f], sf[:, f] = offsets[rows].T @ own[f], shared[rows].T @ own[f]
+        lf[:, f] = offsets[rows].T @ own[f]
         part = shared[rows]
         seen = np.unique(part.indices)  # a frame fills a part of the image
-        dense = part[:, seen].toarray()
-        ss[np.ix_(seen, seen)] += dense.T @ dense
+        dense = part[:, seen].toarray().T
+        sf[seen, f] = dense @ own[f]
+        sx[seen] += dense @ border[f]
+        ss[np.ix_(seen, seen)] += dense @ dense.T
     place = design.place * (design.slot >= 0)[..., None, None]
     ll = np.zeros((landmarks, 3, 3))
     np.add.at(ll, design.slot, np.swapaxes(place, -1, -2) @ place)
@@ -67,7 +69,7 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
     return Products(
         across @ own, ll, lf.reshape(landmarks, 3, frames, -1), ss, sf,
         (offsets.T @ shared).toarray().reshape(landmarks, 3, -1), across @ border,
-        (offsets.T @ flat).reshape(landmarks, 3, -1), shared.T @ flat, flat.T @ flat,
+        (offsets.T @ flat).reshape(landmarks, 3, -1), sx, flat.T @ flat,
     )
 
 

@@ -6,6 +6,7 @@ offsets of landmarks from a t distribution); the variances come from the data (`
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -149,8 +150,9 @@ def design(linear: Linearised, finest: bool = False) -> Design:
     frame, label = _frame_columns(points)
     boards = linear.scene.boards
     of_landmark, local = _by_landmark(points)
-    grids, fields = _grids(points, finest), _board_fields(points, of_landmark, local, linear)
-    parts = [_static_columns(points, grid) for grid in grids]
+    static = list(_grids(points, finest))
+    grids, fields = [grid for grid, _ in static], _board_fields(points, of_landmark, local, linear)
+    parts = [_moving_both(points.weight[..., None] * bumps) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
     names = [grid.name for grid in grids] + [field.name for field in fields]
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
@@ -215,9 +217,11 @@ def _bend_columns(points: GatheredPoints) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _grids(points: GatheredPoints, finest: bool) -> list[Grid]:
-    """Return bumps over the image that all frames share, camera by camera, coarse to fine."""
-    grids = []
+def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, Array]]:
+    """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
+
+    Each grid with its values (F, N, K) at the points.
+    """
     for camera in range(int(points.camera.max()) + 1):
         mine = points.used & (points.camera == camera)
         if not mine.any():
@@ -229,17 +233,11 @@ def _grids(points: GatheredPoints, finest: bool) -> list[Grid]:
             cells = min(most, fits) if name == 'image_finest' else most
             pitch = max(float((high - low).max()) / cells, 1e-9)
             centres = hexagons(low, high, pitch)
-            seen = bump_values(points.uv, mine, centres, pitch).sum(axis=(0, 1)) > 4.0
+            bumps = bump_values(points.uv, mine, centres, pitch)
+            seen = bumps.sum(axis=(0, 1)) > 4.0
             # A grid finer than the points is noise by another name.
             if seen.any() and mine.sum() >= fewest * seen.sum():
-                grids.append(Grid(name, camera, centres[seen], pitch))
-    return grids
-
-
-def _static_columns(points: GatheredPoints, grid: Grid) -> sparse.csr_array:
-    mine = points.used & (points.camera == grid.camera)
-    values = bump_values(points.uv, mine, grid.centres, grid.pitch)
-    return _sparse(_both(values * points.weight[..., None]))
+                yield Grid(name, camera, centres[seen], pitch), bumps[..., seen]
 
 
 def _board_fields(
@@ -283,7 +281,7 @@ def _outside_powers(values: Array, at: Array, degree: int) -> Array:
 def _field_columns(points: GatheredPoints, field: BoardField) -> sparse.csr_array:
     values = np.where(points.used[..., None], field.values[points.slot], 0.0)
     columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
-    return _sparse(np.concatenate(columns, axis=-1))
+    return sparse.csr_array(np.concatenate(columns, axis=-1).reshape(points.used.size * 2, -1))
 
 
 def hexagons(low: Array, high: Array, pitch: float) -> Array:
@@ -323,5 +321,8 @@ def _both(values: Array) -> Array:
     return columns.reshape(*values.shape[:2], 2, -1)
 
 
-def _sparse(columns: Array) -> sparse.csr_array:
-    return sparse.csr_array(columns.reshape(-1, columns.shape[-1]))
+def _moving_both(values: Array) -> sparse.csr_array:
+    """Return columns (2 F N, 2 K), sparse, that move u and v apart by values (F, N, K)."""
+    return sparse.csr_array(
+        sparse.kron(sparse.csr_array(values.reshape(-1, values.shape[-1])), np.eye(2), 'csr')
+    )

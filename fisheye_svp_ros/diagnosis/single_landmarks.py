@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import linalg, optimize, stats
+from scipy import linalg, optimize, special
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
@@ -27,7 +27,7 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, T
     """
     statistic, rank, offset = landmark_tests(evidence)
     count = len(statistic)
-    p = np.asarray(stats.chi2.sf(statistic, np.maximum(rank, 1)))
+    p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
     corrected = np.where(rank > 0, p * 2 * count * evidence.forms.names(), 1.0)
     found = np.flatnonzero(corrected < SIGNIFICANCE)
     bulk = evidence.variances.alive[_LANDMARK].any()
@@ -106,7 +106,7 @@ def _against(
     if not bulk.any() or not (rank > 0).any():
         return statistic(0.0), rank, offset
     mine = rank > 0
-    typical = stats.chi2.ppf(0.5, rank[mine])
+    typical = special.chdtri(rank[mine], 0.5)
 
     def off(log_scale: float) -> float:
         return float(np.median(statistic(np.exp(log_scale))[mine] / typical) - 1)

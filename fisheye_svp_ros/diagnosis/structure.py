@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.budget import Component
@@ -49,7 +49,7 @@ def remaining_structure(
     if full.rows - full.poses - evidence.own < _FEWEST:
         return list(found.values())
     tests = [*_field_tests(evidence), *_scatter_tests(fitted, known_noise)]
-    tests.append(('image', float(stats.norm.sf(ripples(fitted))), 0.0))
+    tests.append(('image', float(special.ndtr(-ripples(fitted))), 0.0))
     for name, p, share in tests:
         corrected = min(1.0, p * len(tests))
         if corrected < SIGNIFICANCE and name not in found:
@@ -74,18 +74,19 @@ def _scatter_tests(fitted: Fitted, known_noise: bool) -> Iterator[tuple[str, flo
     used = linear.used
     # A normal quantile of the heaviest numbers: points in pairs, leverages estimated.
     largest = float(e2[used].max())
-    p = min(1.0, used.sum() * float(stats.chi2.sf(largest, 1)))
+    p = min(1.0, used.sum() * float(special.chdtrc(1, largest)))
     yield 'outliers', p, largest / float(e2.sum())
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
     yield 'scatter_vs_theta', _trend(e2[used], theta[used] ** 2), 0.0
     labels = np.broadcast_to(np.arange(used.shape[0])[:, None], used.shape)[used]
-    yield 'scatter_vs_frame', _groups(e2[used], labels), 0.0
+    if labels.any():
+        yield 'scatter_vs_frame', _groups(e2[used], labels), 0.0
     if known_noise:
         eq = fitted.factored.equations
         freedom = eq.rows - eq.poses - len(fitted.solution.values)
         squares = fitted.solution.variance * freedom
-        larger = stats.chi2.sf(squares / _TOLERATED**2, freedom)
-        smaller = stats.chi2.cdf(squares * _TOLERATED**2, freedom)
+        larger = special.chdtrc(freedom, squares / _TOLERATED**2)
+        smaller = special.chdtr(freedom, squares * _TOLERATED**2)
         yield 'size', 2 * float(min(larger, smaller)), 0.0
 
 
@@ -94,7 +95,7 @@ def _trend(e2: Array, z: Array) -> float:
     centred = e2 - e2.mean(), z - z.mean()
     spread = float((centred[0] ** 2).sum() * (centred[1] ** 2).sum())
     r2 = float((centred[0] * centred[1]).sum()) ** 2 / max(spread, 1e-300)
-    return float(stats.chi2.sf(len(e2) * r2, 1))
+    return float(special.chdtrc(1, len(e2) * r2))
 
 
 def _groups(e2: Array, labels: Index) -> float:
@@ -103,4 +104,4 @@ def _groups(e2: Array, labels: Index) -> float:
     sums = np.bincount(labels, weights=e2 - e2.mean())
     explained = float((sums**2 / np.maximum(counts, 1)).sum())
     statistic = explained / max(float(e2.var()), 1e-300)
-    return float(stats.chi2.sf(statistic, int((counts > 0).sum()) - 1))
+    return float(special.chdtrc(int((counts > 0).sum()) - 1, statistic))

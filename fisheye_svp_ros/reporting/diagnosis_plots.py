@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from scipy import stats
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -112,7 +112,7 @@ def draw_histogram(path: Path, shown: Shown) -> None:
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
         for axis, (side, colour) in zip(axes, _SIDES, strict=True):
             z = getattr(shown.points, side).ravel() / shown.noise
-            expected = z.size * np.diff(bins)[0] * stats.norm.pdf(middle)
+            expected = z.size * np.diff(bins)[0] * np.exp(-middle**2 / 2) / np.sqrt(2 * np.pi)
             axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='u and v')
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
             axis.set(yscale='log', ylim=(0.5, None), xlabel='residual over the noise')
@@ -177,7 +177,7 @@ def _by_group(path: Path, shown: Shown, group: Index, x: Array | None, label: st
     place = names if x is None else np.bincount(label_of, weights=x) / count
     order = np.argsort(place, kind='stable')
     low, high = (
-        np.sqrt(stats.chi2.ppf(p, 2 * count) / count) * shown.noise for p in (0.025, 0.975)
+        np.sqrt(special.chdtri(2 * count, 1 - p) / count) * shown.noise for p in (0.025, 0.975)
     )
     with picture(path, _WIDTH, 2.8) as figure:
         axis = figure.subplots()
