@@ -36,11 +36,16 @@ _LEGEND_COLUMNS = 4
 def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
     """Yield a figure of a size in inches; write it whole when the block succeeds."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout='constrained')
+        figure = Figure(figsize=(width, height), dpi=150, layout='constrained')
         FigureCanvasAgg(figure)
         yield figure
+        # Laid out once: savefig would draw everything once more for that.
+        engine = figure.get_layout_engine()
+        assert engine is not None
+        engine.execute(figure)
+        figure.set_layout_engine(None)
         drawn = BytesIO()
-        figure.savefig(drawn, dpi=150, format=path.suffix[1:])
+        figure.savefig(drawn, format=path.suffix[1:])
         write_bytes(path, drawn.getvalue())
 
 
