@@ -39,10 +39,8 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
     """
     eq, (e, r) = f.equations, random_roots(f)
     # Roots of the covariance of the coefficients and, given the border, their predictions.
-    split = eq.sorted(
-        np.concatenate([e, e @ f.border], axis=1).reshape(*f.coupled.shape[:2], -1),
-        np.concatenate([r, r @ f.border], axis=1),
-    )
+    e, r = (np.concatenate([root, root @ f.border], axis=1) for root in (e, r))
+    split = eq.sorted(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
 
     def one(frame: int) -> LeftOut:
         return _left_out(f, split, random, frame, pose[frame], border[frame])

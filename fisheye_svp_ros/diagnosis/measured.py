@@ -20,7 +20,15 @@ from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit, prepare, start_poses
+from fisheye_svp_ros.diagnosis.model import (
+    Data,
+    Linearised,
+    State,
+    fit,
+    fit_poses,
+    prepare,
+    start_poses,
+)
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
     Gain,
@@ -77,7 +85,7 @@ class Measured:
             test = prepare(held_out)
             solved = start_poses(test, self._there(test, found.state))
             self.test, self.test_gross = find_gross_errors(test, solved)
-            self.test_pose = start_poses(self.test, self._there(test, found.state)).pose
+            self.test_pose = fit_poses(self.test, solved).pose
 
     @cached_property
     def errors(self) -> Array:
