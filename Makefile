@@ -34,7 +34,7 @@ blind: $(VENV)/ready
 
 # The same through rendered photographs: only the pictures are handed over; takes long, too.
 blind-images: $(VENV)/ready
-	$(BIN)/python -m benchmark.blind_images --trials 20
+	$(BIN)/python -m benchmark.blind_images --trials 100
 
 # How accurate detected corners are, into docs/detectors.md.
 detectors: $(VENV)/ready
