@@ -287,14 +287,13 @@ def report(trials: Sequence[Trial], size: float) -> str:
     lines = [
         '# Blind tests through images', '',
         'Beside [blind.md](blind.md), where points are handed over, here nothing but photographs',
-        f'is: {PHOTOGRAPHS} of a chessboard ({BOARD}), {LENS.width} x {LENS.height} px, rendered '
-        'through a lens of 94°, of which',
+        f'is: {PHOTOGRAPHS} of a board ({BOARD}), {LENS.width} x {LENS.height} px, rendered '
+        'through a lens of 94°. Of them',
         '`detect`, `calibrate` and `diagnose` say what is wrong. An effect is as large as what a',
-        f'lens fitted without it leaves {size:g} times the noise of (corners scatter by {NOISE} px '
-        'here). Of',
-        '`principal_point` the lens was calibrated before it was bumped. Defocus and uneven light '
-        'are', 'no error of the lens and count as clean; of over-exposed photographs, which '
-        '`detect` names', 'itself, only the row tells. Intervals are 95 %.', '', '```bash',
+        f'lens fitted without it leaves {size:g} times the noise of (corners scatter by {NOISE}',
+        'px here). Of `principal_point` the lens was calibrated before it was bumped. Defocus and',
+        'uneven light are no error of the lens and count as clean; of over-exposed photographs,',
+        'which `detect` names itself, only the row tells. Intervals are 95 %.', '', '```bash',
         f'python -m benchmark.blind_images --trials {len(hidden)}', '```', '',
         f'- effect named: {_rate([t.hit for t in hidden])}',
         '- and nothing else: '

@@ -19,6 +19,7 @@ _HOMES = {
     'write_observations': 'io.readers',
     'read_poses': 'io.readers',
     'load_lens': 'library',
+    'load_rig': 'io.rig_files',
     'save_lens': 'library',
     'project': 'library',
     'back_project': 'library',

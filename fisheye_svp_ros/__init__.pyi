@@ -3,6 +3,7 @@ from fisheye_svp_ros.io.readers import read_observations as read_observations
 from fisheye_svp_ros.io.readers import read_poses as read_poses
 from fisheye_svp_ros.io.readers import write_observations as write_observations
 from fisheye_svp_ros.io.result_files import Columns as Columns
+from fisheye_svp_ros.io.rig_files import load_rig as load_rig
 from fisheye_svp_ros.library import back_project as back_project
 from fisheye_svp_ros.library import budget as budget
 from fisheye_svp_ros.library import calibrate as calibrate

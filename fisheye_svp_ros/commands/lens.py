@@ -1,4 +1,4 @@
-"""`fisheye-svp lens`: a lens shown, checked, converted."""
+"""`fisheye-svp lens`: a lens shown, checked, converted; a rig as well."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.io.lens_formats import Foreign
     from fisheye_svp_ros.optics.lens import Lens
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
@@ -31,22 +32,26 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.files import write_text
     from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
     from fisheye_svp_ros.io.lens_formats import read_foreign, write_foreign
+    from fisheye_svp_ros.io.rig_files import save_rig
     from fisheye_svp_ros.io.share import lens_path
 
     path = lens_path(args.lens)
+    foreign = read_lens_file(path)
+    if foreign is not None and not foreign.lenses and not args.format:
+        _rigs(foreign)
+        if args.output:
+            save_rig(foreign.rigs[0], args.output)
+        return
     lens = load_lens(path)
     print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
           ' deg')
     for name, value in lens.parameters.items():
         print(f'  {name:<18}{value:.10g}')
-    foreign = read_lens_file(path)
     if foreign is not None:
         for camera, worst in foreign.worst_px.items():
             if worst > 0:
                 print(f'  {camera}: a fit of kannala_brandt, {worst:.2g} px off at worst')
-        for number, rig in enumerate(foreign.rigs):
-            print(f'  camera {number} in camera {number + 1} at '
-                  + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
+        _rigs(foreign)
     if args.output and args.format:
         text = write_foreign(lens, args.format)
         write_text(args.output, text)
@@ -55,6 +60,12 @@ def run(args: argparse.Namespace) -> None:
             _lost(lens, next(iter(written.lenses.values())))
     elif args.output:
         save_lens(lens, args.output)
+
+
+def _rigs(foreign: Foreign) -> None:
+    for number, rig in enumerate(foreign.rigs):
+        print(f'  camera {number} in camera {number + 1} at '
+              + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
 
 
 def _lost(lens: Lens, written: Lens) -> None:

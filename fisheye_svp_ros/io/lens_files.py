@@ -42,6 +42,8 @@ def load_lens(path: str | Path) -> Lens:
     if foreign is None and not camera:
         return lens_from_dict(parse_yaml(text, path, LensError), str(path))
     lenses = foreign.lenses if foreign else {}
+    if foreign and not lenses:
+        raise LensError(f'{path}: it holds a rig and no lens')
     camera = camera or next(iter(lenses), '')
     if camera not in lenses:
         raise LensError(f'{path}: no camera {camera!r} in it; it has '

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -15,9 +17,11 @@ from fisheye_svp_ros import cli
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
+from fisheye_svp_ros.io.rig_files import load_rig, save_rig
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery, KannalaBrandt, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_vector
 
 LENS = Lens('front', 848, 800, 285.2, 284.9, 424.3, 398.7,
             KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0))
@@ -225,3 +229,102 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert '0.1 m' in said
     assert cli.main(['lens', str(tmp_path / 'ros.yaml'), '-o', str(tmp_path / 'back.yaml')]) == 0
     assert load_lens(tmp_path / 'back.yaml').viewpoint_shift is None
+
+
+RIG = Pose(rotation_from_vector(np.array([0.02, -0.3, 0.1])), np.array([-0.15, 0.01, 0.002]))
+# How the optical frames of RIG hang on a robot: urdf says xyz and roll, pitch, yaw
+URDF = """<?xml version="1.0"?>
+<robot name="head"><link name="base"/>
+<joint name="mount" type="fixed"><parent link="base"/><child link="left_camera"/>
+  <origin xyz="0.1 0.2 0.3" rpy="0.1 -0.2 0.7"/></joint>
+<joint name="optics" type="fixed"><parent link="left_camera"/><child link="left_optical_frame"/>
+  <origin rpy="-1.5707963267948966 0 -1.5707963267948966"/></joint>
+<joint name="other" type="fixed"><parent link="left_optical_frame"/>
+  <child link="right_optical_frame"/><origin xyz="{}" rpy="{}"/></joint>
+</robot>
+"""
+
+
+def of_opencv(folder: Path, suffix: str) -> Path:
+    path = folder / f'stereo{suffix}'
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write('image_width', 848)
+    storage.write('image_height', 800)
+    for number, lens in ((1, LENS), (2, SHORT)):
+        storage.write(f'K{number}', np.array(
+            [[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]))
+        storage.write(f'D{number}', np.array([lens.image_height.coefficients[:4]]).T)
+    storage.write('R', RIG.rotation)
+    storage.write('T', RIG.position[:, None])
+    storage.release()
+    return path
+
+
+def of_urdf(folder: Path, suffix: str) -> Path:
+    right = RIG.inverse()
+    m = right.rotation
+    angles = (np.arctan2(m[2, 1], m[2, 2]), -np.arcsin(m[2, 0]), np.arctan2(m[1, 0], m[0, 0]))
+    path = folder / f'robot{suffix}'
+    path.write_text(URDF.format(*(' '.join(f'{value:.15g}' for value in values)
+                                  for values in (right.position, angles))))
+    return path
+
+
+def of_tf(folder: Path, suffix: str) -> Path:
+    q = quaternion_from_rotation(RIG.rotation).tolist()
+    entry = {
+        'header': {'frame_id': 'right_camera_optical_frame'},
+        'child_frame_id': 'left_camera_optical_frame',
+        'transform': {'translation': dict(zip('xyz', RIG.position.tolist(), strict=True)),
+                      'rotation': dict(zip('xyzw', q, strict=True))},
+    }
+    path = folder / f'tf_static{suffix}'
+    path.write_text(yaml.safe_dump({'transforms': [entry]}) + '---\n')
+    return path
+
+
+def of_ours(folder: Path, suffix: str) -> Path:
+    save_rig(RIG, folder / f'rig{suffix}')
+    return folder / f'rig{suffix}'
+
+
+@pytest.mark.parametrize(('write', 'suffix'), [
+    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_urdf, '.urdf'), (of_tf, '.yaml'),
+    (of_ours, '.yaml'),
+])
+def test_rigs(tmp_path: Path, write: Callable[[Path, str], Path], suffix: str) -> None:
+    rig = load_rig(write(tmp_path, suffix))
+    assert np.abs(rig.position - RIG.position).max() < 1e-12
+    assert np.abs(rig.rotation - RIG.rotation).max() < 1e-12
+
+
+def test_both_lenses_of_a_rig_of_opencv(tmp_path: Path) -> None:
+    path = of_opencv(tmp_path, '.yml')
+    assert load_lens(path).image_height == LENS.image_height
+    assert load_lens(f'{path}#right').image_height.coefficients[:2] == (-0.011, 0.0041)
+
+
+def test_a_robot_is_shown_and_is_no_lens(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = of_urdf(tmp_path, '.urdf')
+    cli.main(['lens', str(path), '-o', str(tmp_path / 'rig.yaml')])
+    assert 'camera 0 in camera 1 at -150.000, 10.000, 2.000 mm' in capsys.readouterr().out
+    assert np.abs(load_rig(tmp_path / 'rig.yaml').position - RIG.position).max() < 1e-12
+    with pytest.raises(LensError, match='holds a rig and no lens'):
+        load_lens(path)
+
+
+@pytest.mark.parametrize(('text', 'said'), [
+    ('<robot name="a"></robot>', 'no fixed transforms'),
+    ('<robot', 'not a whole URDF'),
+    (URDF.format('0 0', '0 0 0'), 'finite numbers'),
+    (URDF.format('0 0 0', '0 0 0').replace('right_optical', 'rear_optical'), 'called right'),
+    ('child_frame_id: a\ntranslation: 1\n', 'not a whole transform'),
+    ('left_in_right: {position: [0, 0], quaternion: [0, 0, 0, 1]}', 'position must be'),
+    ('left_in_right: {position: [0, 0, 0], quaternion: [0, 0, 0, 0]}', 'unit length'),
+    ('name: lens', 'left_in_right'),
+])
+def test_what_is_no_rig_is_refused(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / 'rig').write_text(text)
+    with pytest.raises(LensError, match=said) as error:
+        load_rig(tmp_path / 'rig')
+    assert '\n' not in str(error.value)

@@ -1,4 +1,8 @@
-"""OpenCV FileStorage (YAML or XML) of cv2.fisheye: a matrix and four coefficients."""
+"""OpenCV FileStorage (YAML or XML) of cv2.fisheye: a matrix and four coefficients, or two cameras.
+
+Of two (K1, D1, K2, D2) R and T bring points of the first camera into the second, as
+cv2.fisheye.stereoCalibrate returns them.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +16,12 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, nearest_rotation
 
-_MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1')
-_COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D', 'D1')
+_MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1', 'cameraMatrix1')
+_COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D', 'D1',
+                 'distCoeffs1')
+_SECOND = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
 _WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
 _SIZE = ('image_size', 'imageSize', 'size')
 
@@ -42,17 +49,28 @@ def read(text: str, where: str) -> Foreign:
         size = radial.numbers({'size': value(_SIZE)}, 'size', 2, where)
     else:
         size = radial.numbers({'size': [value(_WIDTH), value(_HEIGHT)]}, 'size', 2, where)
-    k = _matrix(value(_MATRIX), ((3, 3),), where)
-    d = _matrix(value(_COEFFICIENTS), ((1, 4), (4, 1)), where)
-    lens = radial.kannala_brandt('camera', size, (k[0], k[4], k[2], k[5]), d, where)
-    return Foreign('opencv', {'camera': lens}, (), {})
+
+    def lens(name: str, matrix: tuple[str, ...], coefficients: tuple[str, ...]) -> Lens:
+        k = _matrix(value(matrix), ((3, 3),), where)
+        d = _matrix(value(coefficients), ((1, 4), (4, 1)), where)
+        return radial.kannala_brandt(name, size, (k[0], k[4], k[2], k[5]), d, where)
+
+    if not any(name in document for name in _SECOND[0]):
+        return Foreign('opencv', {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}, (), {})
+    pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_SECOND)}
+    rigs: tuple[Pose, ...] = ()
+    if 'R' in document or 'T' in document:
+        turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
+        place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
+        rigs = (Pose(nearest_rotation(turn), np.array(place)),)
+    return Foreign('opencv', pair, rigs, {})
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
     """Return the numbers of a matrix of one of some shapes, row by row."""
     if not isinstance(value, dict) or (value.get('rows'), value.get('cols')) not in shapes:
         raise LensError(f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
-                        'needed')
+                        'needed (of a rig R, 3 x 3, and T, 3 x 1)')
     return radial.numbers(value, 'data', int(np.prod(shapes[0])), where)
 
 

@@ -1,0 +1,111 @@
+"""Static transforms of a robot, which hold a rig and no lens: URDF, and what /tf_static says.
+
+The cameras are the two frames that are called left and right and, where several are, optical.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
+from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_quaternion, rotation_from_vector
+
+_Joint = tuple[str, str, Pose]  # parent, child, child in parent
+_OPTICAL = 'optical'
+
+
+def recognises(text: str) -> bool:
+    """Say whether a text is such a file."""
+    return '<robot' in text or ('child_frame_id:' in text and 'translation:' in text)
+
+
+def read(text: str, where: str) -> Foreign:
+    """Read the rig: the left camera in the right one; raises LensError, naming what is missing."""
+    joints = list(_urdf(text, where) if '<robot' in text else _messages(text, where))
+    left, right = (_camera(side, joints, where) for side in ('left', 'right'))
+    (root, mine), (other, theirs) = _rooted(left, joints), _rooted(right, joints)
+    if root != other:
+        raise LensError(f'{where}: no fixed transforms lead from {left} to {right}')
+    return Foreign('transforms', {}, (theirs.inverse().compose(mine),), {})
+
+
+def _camera(side: str, joints: list[_Joint], where: str) -> str:
+    frames = list(dict.fromkeys(itertools.chain.from_iterable(j[:2] for j in joints)))
+    found = [frame for frame in frames if side in frame]
+    found = [frame for frame in found if _OPTICAL in frame] or found
+    if len(found) != 1:
+        raise LensError(f'{where}: one frame called {side} and {_OPTICAL} is needed; there are '
+                        + (', '.join(found or frames) or 'no fixed transforms'))
+    return found[0]
+
+
+def _rooted(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:
+    """Return the root of a frame's tree, and the frame in it."""
+    above = {child: (parent, pose) for parent, child, pose in joints}
+    pose = identity()
+    for _ in joints:
+        if frame not in above:
+            break
+        frame, step = above[frame]
+        pose = step.compose(pose)
+    return frame, pose
+
+
+def _urdf(text: str, where: str) -> Iterator[_Joint]:
+    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
+        raise LensError(f'{where}: not a whole URDF (document types are not read, nor more than '
+                        f'{LARGEST_YAML >> 20} MB)')
+    try:
+        root = ElementTree.fromstring(text.lstrip().encode())
+    except (ElementTree.ParseError, ValueError, LookupError) as cause:
+        raise LensError(f'{where}: not a whole URDF ({cause})') from cause
+    for joint in root.iter('joint'):
+        ends = joint.find('parent'), joint.find('child')
+        if joint.get('type') == 'fixed' and ends[0] is not None and ends[1] is not None:
+            origin = joint.find('origin')
+            given = {} if origin is None else origin.attrib
+            place, turn = (_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
+                           for name in ('xyz', 'rpy'))
+            yield (str(ends[0].get('link')), str(ends[1].get('link')),
+                   Pose(_turned(turn), place))
+
+
+def _numbers(text: str, where: str) -> Array:
+    words: list[Any] = text.split()
+    with suppress(ValueError):
+        words = [float(word) for word in words]
+    return np.array(radial.numbers({'origin': words}, 'origin', 3, where))
+
+
+def _turned(angles: Array) -> Array:
+    """Roll, pitch and yaw about fixed axes, as URDF has them."""
+    roll, pitch, yaw = rotation_from_vector(np.diag(angles))
+    return np.asarray(yaw @ pitch @ roll)
+
+
+def _messages(text: str, where: str) -> Iterator[_Joint]:
+    # `ros2 topic echo` ends each message with a line of its own.
+    for part in text.split('\n---'):
+        document = parse_yaml(part, where, LensError) if part.strip() else {}
+        entries = document.get('transforms', [document] if document else [])
+        for entry in entries if isinstance(entries, list) else []:
+            try:
+                place, turn = (
+                    [float(entry['transform'][name][axis]) for axis in axes]
+                    for name, axes in (('translation', 'xyz'), ('rotation', 'xyzw')))
+                ends = str(entry['header']['frame_id']), str(entry['child_frame_id'])
+            except (KeyError, TypeError, ValueError) as cause:
+                raise LensError(f'{where}: not a whole transform ({cause!r})') from cause
+            if not np.isfinite([*place, *turn]).all() or not np.linalg.norm(turn) > 0.5:
+                raise LensError(f'{where}: {ends[1]}: a translation and a unit quaternion are '
+                                'needed')
+            yield (*ends, Pose(rotation_from_quaternion(turn), np.array(place)))
