@@ -8,9 +8,11 @@ from helpers.guide import LENS, POINTS, SHEET, present, seen_from, session
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import guide as module
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.guide import Guide, Seen, Stand, consider, observations_of
 from fisheye_svp_ros.diagnosis.model import Prior, fit, intrinsic_names, prepare, start
 from fisheye_svp_ros.diagnosis.next_photographs import Board
+from fisheye_svp_ros.diagnosis.next_question import next_photographs
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose
@@ -152,6 +154,27 @@ def test_from_a_data_sheet_to_a_settled_shift(first):
     assert guide.stand.stderr <= 3e-4
     true = LENS.viewpoint_shift.e0
     assert abs(guide.stand.value - true) < 4 * guide.stand.stderr
+
+
+def test_hope_to_tell_a_look_alike_ends(first, monkeypatch):
+    rng, found = np.random.default_rng(5), []
+
+    def alike(table, lens, **settings):
+        found.append(diagnose(table, lens, **settings))
+        if 'wanted' not in settings:
+            found[-1].causes[0].indistinguishable_from.append('flat_port')
+        return found[-1]
+
+    def hopeful(*args, **settings):
+        return next_photographs(*args, **settings)._replace(answers=(0.9,) * 5)
+
+    monkeypatch.setattr(module, 'diagnose', alike)
+    monkeypatch.setattr(module, 'next_photographs', hopeful)
+    taken = tuple(present(LENS, first, rng) for _ in range(10))
+    few = consider(replace(session(), taken=taken[:9], goal=1.0))
+    many = consider(replace(session(), taken=taken, goal=1.0))
+    assert not few.settled and few.alike == many.alike == ('flat_port',)
+    assert many.settled and len(found) == 3
 
 
 def test_what_fails_is_left_out(first, monkeypatch):
