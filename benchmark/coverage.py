@@ -3,8 +3,10 @@
 A lens is calibrated and diagnosed on half of the frames.  In each frame of the other half the
 camera is posed twice, from the left and from the right half of the points: the difference should
 lie within its interval in 95 of 100 cases, by noise alone, with the lens's parameters, and with
-the misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with a bent
-board, displaced landmarks and an image field that no catalogue holds.  Writes docs/coverage.json.
+the misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with
+displaced landmarks and an image field that no catalogue holds, of which the truth is known: poses
+of the other half, and points that two of the cameras see as a rig, by what the lens files carry
+(`diagnosis.lens_errors`).  Writes docs/coverage.json.
 """
 
 from __future__ import annotations
@@ -12,15 +14,20 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.lens_errors import (
+    LensErrors,
+    depth_errors,
+    localize_with_errors,
+)
 from fisheye_svp_ros.diagnosis.model import (
     Data,
     Linearised,
@@ -29,12 +36,13 @@ from fisheye_svp_ros.diagnosis.model import (
     prepare,
     start_poses,
 )
-from fisheye_svp_ros.diagnosis.uncertainty import pose_maps
+from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
@@ -42,9 +50,22 @@ from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 
 WITHIN = 1.959964  # standard deviations, 95 %
 LEVELS = ('noise', 'noise and parameters', 'with the misfit')
+RIG = Pose(rotation_from_vector(np.array([0.02, 0.1, -0.01])), np.array([-0.15, 0.0, 0.01]))
+POINTS = 40  # that a rig sees
+NOISE = 0.1  # px
+
+
+class Simulated(NamedTuple):
+    """A simulated camera: its photographs, poses (F,) and what it sees of points before it."""
+
+    table: Observations
+    size: tuple[int, int]
+    poses: Pose | None
+    see: Callable[[Array], Array] | None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -56,34 +77,83 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/coverage.json'))
     asked = parser.parse_args(arguments)
     width, height = map(int, asked.image_size.split('x'))
-    sets = [(joined([read_observations(path) for path in asked.tables]), (width, height))
+    sets = [Simulated(joined([read_observations(path) for path in asked.tables]), (width, height),
+                      None, None)
             ] if asked.tables else [simulated(number) for number in range(asked.cameras)]
-    pulls: list[Array] = []
+    halves: list[Array] = []
+    poses: list[Array] = []
+    lenses: list[Lens] = []
     with progress('halves', 2 * len(sets)) as advance:
-        for table, size in sets:
-            frames = table.frames
+        for one in sets:
+            frames = one.table.frames
             for half in (0, 1):
-                mine = np.isin(table.frame, frames[half::2])
-                pulls.append(pulls_of(table.take(mine), table.take(~mine), size))
+                mine = np.isin(one.table.frame, frames[half::2])
+                test = one.table.take(~mine)
+                found = diagnosed(one.table.take(mine), one.size)
+                halves.append(pulls_of(found, test))
+                if one.poses is not None:
+                    poses.append(against_truth(found.lens, test, one.poses))
+                if not half:
+                    lenses.append(found.lens)
                 advance()
-    every = np.concatenate(pulls)
-    found: dict[str, Any] = {
+    told = coverage(halves)
+    if not asked.tables:
+        told |= {'poses': coverage(poses), 'stereo points': coverage(
+            of_a_rig(sets[i:i + 2], lenses[i:i + 2]) for i in range(0, len(sets) - 1, 2))}
+    name = asked.tables[0].parent.name if asked.tables else 'simulated'
+    saved = json.loads(asked.output.read_text()) if asked.output.is_file() else {}
+    write_text(asked.output, json.dumps(saved | {name: told}, indent=1) + '\n')
+    sys.stdout.write(json.dumps(told, indent=1) + '\n')
+
+
+def coverage(pulls: Iterable[Array]) -> dict[str, Any]:
+    """Return how many of pulls (N, levels, P) are within 95 %, and how large they are."""
+    every = np.concatenate(list(pulls))
+    return {
         'differences': int(every.shape[0] * every.shape[2]),
         'coverage': {level: float((np.abs(every[:, i]) < WITHIN).mean())
                      for i, level in enumerate(LEVELS)},
         'pull_rms': {level: float(np.sqrt((every[:, i] ** 2).mean()))
                      for i, level in enumerate(LEVELS)},
     }
-    name = asked.tables[0].parent.name if asked.tables else 'simulated'
-    saved = json.loads(asked.output.read_text()) if asked.output.is_file() else {}
-    write_text(asked.output, json.dumps(saved | {name: found}, indent=1) + '\n')
-    sys.stdout.write(json.dumps(found, indent=1) + '\n')
 
 
-def pulls_of(train: Observations, test: Observations, size: tuple[int, int]) -> Array:
-    """Return differences over their standard deviations (F, levels, 6)."""
-    lens = calibrate(train, 'kannala_brandt', size).adjusted.lens
-    found = diagnose(train, lens)
+def diagnosed(train: Observations, size: tuple[int, int]) -> Diagnosis:
+    """Calibrate and diagnose."""
+    return diagnose(train, calibrate(train, 'kannala_brandt', size).adjusted.lens)
+
+
+def against_truth(lens: Lens, test: Observations, poses: Pose) -> Array:
+    """Return errors of poses over their standard deviations (F, levels, 6), by a lens file."""
+    found, parts = localize_with_errors(LensErrors.of(lens), test)
+    return _pulls(found.result.pose.difference(poses.take(found.views.frame)), parts)
+
+
+def of_a_rig(cameras: Sequence[Simulated], lenses: Sequence[Lens]) -> Array:
+    """Return errors of stereo points over their standard deviations (N, levels, 3)."""
+    rng = np.random.default_rng(cameras[0].table.uv[0].astype(int))
+    points = rng.uniform([-0.6, -0.4, 0.3], [0.6, 0.4, 1.0], (POINTS, 3))
+    uv = []
+    for camera, pose in zip(cameras, (RIG, identity()), strict=True):
+        assert camera.see is not None
+        uv.append(camera.see(pose.into_body(points)) + NOISE * rng.normal(size=(POINTS, 2)))
+    models = [ForwardModel(lens) for lens in lenses]
+    found = triangulate_optimally(models[0], models[1], RIG, uv[0], uv[1]).points
+    errors = [LensErrors.of(lens) for lens in lenses]
+    parts = depth_errors(errors[0], errors[1], RIG, found)
+    known = np.isfinite(found).all(axis=1)
+    return _pulls((found - points)[known], ErrorParts(*(part[known] for part in parts)))
+
+
+def _pulls(difference: Array, parts: ErrorParts) -> Array:
+    """Return differences (N, P) over their standard deviations at all levels."""
+    levels = (parts.noise, parts.noise + parts.parameters, parts.total)
+    return np.stack([difference / np.sqrt(np.diagonal(part, axis1=1, axis2=2))
+                     for part in levels], axis=1)
+
+
+def pulls_of(found: Diagnosis, test: Observations) -> Array:
+    """Return differences of poses over their standard deviations (F, levels, 6)."""
     data = prepare(test)
     state = start_poses(data, found.after.state)
     middle = np.array([np.median(v[w > 0]) for v, w in zip(
@@ -91,7 +161,8 @@ def pulls_of(train: Observations, test: Observations, size: tuple[int, int]) -> 
     left = data.views.uv[..., 0] < middle[:, None]
     sides = [side(data, state, mask) for mask in (left, ~left)]
     difference = sides[0][0].pose.difference(sides[1][0].pose)
-    return np.moveaxis(_over(found, data, state, sides[0][1] - sides[1][1], difference), 0, 1)
+    linear = Linearised(data, state, found.after.free)
+    return _pulls(difference, found.errors.through(linear, sides[0][1] - sides[1][1]))
 
 
 def side(data: Data, state: State, mask: Mask) -> tuple[State, Array]:
@@ -100,16 +171,6 @@ def side(data: Data, state: State, mask: Mask) -> tuple[State, Array]:
         weight=np.where(mask, data.views.weight, 0.0)))
     posed = fit_poses(kept, state)
     return posed, pose_maps(Linearised(kept, posed, ()).frame_columns)
-
-
-def _over(
-    found: Diagnosis, data: Data, state: State, maps: Array, difference: Array
-) -> Array:
-    linear = Linearised(data, state, found.after.free)
-    parts = found.errors.through(linear, maps)
-    levels = (parts.noise, parts.noise + parts.parameters, parts.total)
-    return np.stack([
-        difference / np.sqrt(np.diagonal(part, axis1=1, axis2=2)) for part in levels])
 
 
 def joined(tables: Sequence[Observations]) -> Observations:
@@ -121,19 +182,25 @@ def joined(tables: Sequence[Observations]) -> Observations:
         board=np.concatenate([t.board for t in tables]))
 
 
-def simulated(number: int) -> tuple[Observations, tuple[int, int]]:
-    """Return photographs of a board with errors of its own, through a lens with a field."""
+def simulated(number: int) -> Simulated:
+    """Return a camera with an image field, and its photographs of a board that errs itself."""
     rng = np.random.default_rng([5, number])
     lens = Lens('lens', 1280, 960, 420.0, 420.0, 640.0, 480.0, KannalaBrandt(-0.01, 0.002), 1.5)
     printed = Print(11, 8, 0.03)
     poses = board_views(lens, printed, 30, (0.2, 0.7), rng)
     points = printed.corners + rng.normal(size=printed.corners.shape) * [4e-5, 4e-5, 2e-4]
-    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, 0.1, rng)
+    seen = simulate(ForwardModel(lens), Landmarks(np.arange(len(points)), points), poses, NOISE,
+                    rng)
     waves = rng.uniform(-1, 1, (6, 2)) / 60.0
     phase, size = rng.uniform(0, 2 * np.pi, 6), 0.06 * rng.normal(size=(6, 2))
-    field = np.cos(seen.uv @ waves.T + phase) @ size
-    return replace(seen, uv=seen.uv + field, xyz=printed.corners[seen.landmark],
-                   sigma=np.full(len(seen), np.nan)), (1280, 960)
+
+    def moved(uv: Array) -> Array:
+        return np.asarray(uv + np.cos(uv @ waves.T + phase) @ size)
+
+    table = replace(seen, uv=moved(seen.uv), xyz=printed.corners[seen.landmark],
+                    sigma=np.full(len(seen), np.nan))
+    return Simulated(table, (1280, 960), poses,
+                     lambda points: moved(ForwardModel(lens).project(points).uv))
 
 
 if __name__ == '__main__':

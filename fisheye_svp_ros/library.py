@@ -114,7 +114,8 @@ class StereoDepth(Result):
     """Points (N, 3), m, in the right camera, of what both cameras see; frame, landmark (N,).
 
     gap (N,), m: distance of the two rays; epipolar_px (N,): of the left point from the epipolar
-    curve of the right one (Error2 is its mean).  NaN where the rays do not meet.
+    curve of the right one (Error2 is its mean); covariance (N, 3, 3), m^2, where the lenses' own
+    errors were asked for.  NaN where the rays do not meet.
     """
 
     frame: Index
@@ -122,6 +123,7 @@ class StereoDepth(Result):
     points: Array
     gap: Array
     epipolar_px: Array
+    covariance: Array | None = None
 
     def table(self) -> Columns:
         """Return one row a point."""
@@ -183,13 +185,15 @@ class Diagnosed(Result):
 class Budgeted(Result):
     """SVP errors and what noise causes, by quantity: arrays (A, R), SI and px.
 
-    spreads (A,), rad; ranges (R,), m; see `study.budget.Budget`.
+    spreads (A,), rad; ranges (R,), m; own: by part what is wrong with a lens that knows its own
+    errors; see `study.budget.Budget`.
     """
 
     spreads: Array
     ranges: Array
     error: dict[str, Array]
     noise: dict[str, Array]
+    own: dict[str, dict[str, Array]]
 
     def table(self) -> Columns:
         """Return one row a spread and range."""
@@ -198,6 +202,8 @@ class Budgeted(Result):
             'spread': spread.ravel(), 'range': distance.ravel(),
             **{name: np.ravel(values) for name, values in self.error.items()},
             **{f'{name}_noise': np.ravel(values) for name, values in self.noise.items()},
+            **{f'{name}_{part}': np.ravel(values) for part, by in self.own.items()
+               for name, values in by.items()},
         })
 
 
@@ -224,13 +230,22 @@ def back_project(lens: AnyLens, uv: Array) -> Rays:
     return forward.back_project(load_lens(lens), np.asarray(uv, dtype=float))
 
 
-def localize(observations: AnyObservations, lens: AnyLens) -> Localized:
+def localize(
+    observations: AnyObservations, lens: AnyLens, *, model_error: bool = False
+) -> Localized:
     """Pose every frame of one camera that can be posed; no start values are needed.
 
-    Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed.
+    model_error: covariances with what the lens says of its own errors (`uncertainty`).
+    Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
+    LensError for a lens that does not know its errors.
     """
-    table = _table(observations)
-    measured = localize_measured(ForwardModel(load_lens(lens)), table)
+    table, known = _table(observations), load_lens(lens)
+    if model_error:
+        from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
+
+        measured, _ = localize_with_errors(LensErrors.of(known), table)
+    else:
+        measured = localize_measured(ForwardModel(known), table)
     views, result, fitted = measured.views, measured.result, measured.fitted
     residual = np.full((len(table), 2), np.nan)
     residual[views.row[views.used]] = fitted[views.used]
@@ -268,19 +283,29 @@ def calibrate_stereo(
 
 
 def stereo_depth(
-    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose
+    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose, *,
+    model_error: bool = False,
 ) -> StereoDepth:
     """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
 
-    Raises ObservationError for a missing camera.
+    model_error: covariances, too: of the noise, and of what the lenses say of their own errors
+    (`uncertainty`); the rig is taken as it is.
+    Raises ObservationError for a missing camera, LensError for a lens that does not know its
+    errors.
     """
     one, other = stereo_views(_table(observations))
     both = one.used & other.used
     known = (*_models(left, right), rig, one.uv[both], other.uv[both])
     solved = triangulate(*known)
     frame = np.broadcast_to(one.frame[:, None], both.shape)
+    covariance = None
+    if model_error:
+        from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, depth_errors
+
+        errors = [LensErrors.of(load_lens(lens)) for lens in (left, right)]
+        covariance = depth_errors(errors[0], errors[1], rig, solved.points).total
     return StereoDepth(frame[both], one.landmark[both], solved.points, solved.gap,
-                       epipolar_offset(*known).distance)
+                       epipolar_offset(*known).distance, covariance)
 
 
 def simulate_scenario(**scenario: Any) -> Simulated:

@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
     points = at_point(budget, spread, args.working_range, limits)
     given = frozenset(name for name, value in limits.items() if value is not None)
     asked = Asked(lens.name, spread, args.working_range, given,
-                  lens.port is not None)
+                  lens.port is not None, bool(budget.own))
     print_table(
         f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '
         f'{args.working_range:g} m, {args.noise:g} px of noise', asked.header, rows(points, asked),

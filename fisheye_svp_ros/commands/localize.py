@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.solve.measured import MeasuredPoses
 
@@ -26,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'with --board')
     add_board_arguments(parser)
     add_lens_argument(parser)
+    parser.add_argument('--model-error', action='store_true',
+                        help='covariances with what the lens file says of its own errors: its '
+                        'parameters, and the misfit that remains (an extended_lens.yaml)')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for localize.json, poses.csv, residuals.csv, covariance.csv; '
                         'of a rig, a folder in it for each camera')
@@ -36,6 +40,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
     from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
     from fisheye_svp_ros.commands.photographs import measured as read
+    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.measured import localize_measured
@@ -43,19 +48,22 @@ def run(args: argparse.Namespace) -> None:
     given = load_lenses(args.lens)
     observations, _ = read(args.observations, args)
     for camera, (name, lens) in enumerate(lenses_of(observations.cameras, given).items()):
-        model = ForwardModel(lens)
+        model, parts = ForwardModel(lens), None
+        table = observations.take(observations.camera == camera)
         with progress('localizing'):
-            measured = localize_measured(
-                model, observations.take(observations.camera == camera))
-        _print(measured, ' '.join(filter(None, (args.observations, name))))
+            if args.model_error:
+                measured, parts = localize_with_errors(LensErrors.of(lens), table)
+            else:
+                measured = localize_measured(model, table)
+        _print(measured, parts, ' '.join(filter(None, (args.observations, name))))
         note_left_out(measured.left_out)
         note_doubtful(measured.views.frame.tolist(), measured.reasons)
         if args.output:
             with together():
-                _write(args.output / name, model, measured)
+                _write(args.output / name, model, measured, parts)
 
 
-def _print(measured: MeasuredPoses, source: str) -> None:
+def _print(measured: MeasuredPoses, parts: ErrorParts | None, source: str) -> None:
     import numpy as np
 
     from fisheye_svp_ros.reporting.tables import noise_text, print_table
@@ -81,12 +89,26 @@ def _print(measured: MeasuredPoses, source: str) -> None:
     )
     if len(views.frame) > _SHOWN:
         print(f'  and {len(views.frame) - _SHOWN} more frames')
-    print(f'  {noise_text(measured.sigma)}, in the worst direction')
+    said = noise_text(measured.sigma) if parts is None else _parts_text(parts)
+    print(f'  {said}, in the worst direction')
 
 
-def _write(folder: Path, model: ForwardModel, measured: MeasuredPoses) -> None:
+def _parts_text(parts: ErrorParts) -> str:
+    from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
+
+    by = pose_summary(parts)['position_m']
+    shares = ', '.join(f'{words} {1000 * by[name]:.3g} mm' for name, words in (
+        ('noise', 'noise'), ('parameters', 'parameters of the lens'),
+        ('misfit', 'what remains without a name')))
+    return f'standard errors with those of the lens (rms of positions: {shares})'
+
+
+def _write(
+    folder: Path, model: ForwardModel, measured: MeasuredPoses, parts: ErrorParts | None
+) -> None:
     import numpy as np
 
+    from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
     from fisheye_svp_ros.io.csv_table import write_table
     from fisheye_svp_ros.io.readers import write_poses
     from fisheye_svp_ros.io.results import write_json
@@ -125,4 +147,5 @@ def _write(folder: Path, model: ForwardModel, measured: MeasuredPoses) -> None:
             {'frame': int(frame), 'reason': reason}
             for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
         ],
+        **({} if parts is None else {'uncertainty': pose_summary(parts)}),
     })

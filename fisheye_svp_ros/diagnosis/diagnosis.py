@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
 from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses, thinned
+from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import (
@@ -175,7 +176,7 @@ def _judged(
     observations: Observations, lenses: Mapping[str, Lens], found: Found, measured: Measured,
     noise_causes: list[Cause], cameras: list[TwoCameras], held_out: Observations | None,
 ) -> Diagnosis:
-    evidence = found.evidence
+    evidence, errors = found.evidence, ModelError.of(found.evidence)
     components = measured.components({c.effect: c.p_value for c in noise_causes})
     causes = measured.causes(components) + noise_causes
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
@@ -205,9 +206,11 @@ def _judged(
         trace=found.trace,
         gain=measured.gain,
         intrinsics=measured.intrinsics,
-        lenses=extended_lenses(lenses, found.state, observations),
+        lenses=with_uncertainty(
+            errors, evidence.linear, measured.noise,
+            lambda state: extended_lenses(lenses, state, observations)),
         local=measured.local,
-        errors=ModelError.of(evidence),
+        errors=errors,
         cameras=cameras,
         before=measured.before,
         after=evidence.linear,

@@ -13,9 +13,9 @@ import numpy as np
 from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.gathered import GatheredPoints, Setting
 from fisheye_svp_ros.diagnosis.model import Linearised
 
-MILLIMETRE = 1e-3  # unit of offsets on the target
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
     'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
@@ -30,54 +30,6 @@ _FRAME_CELLS, _BOARD_CELLS = 4, 4
 _FEWEST_ON_BOARD = 12
 _REACH = 3.0  # of a bump, in its standard deviations
 _WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
-
-
-class GatheredPoints(NamedTuple):
-    """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
-
-    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
-    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on
-    the board over its size; place (F, N, 2, 3): whitened derivatives by an offset along the
-    board's axes, per mm.
-    """
-
-    used: Mask
-    uv: Array
-    weight: Array
-    camera: Index
-    slot: Index
-    landmark: Index
-    board: Index
-    local: Array
-    place: Array
-
-    @classmethod
-    def of(cls, linear: Linearised) -> GatheredPoints:
-        """Gather the points of a linearised state."""
-        data, views = linear.data, linear.data.views
-
-        def rows(values: Array | Index) -> Array:
-            return data.blocks(np.asarray(values, dtype=float)[..., None, :])
-
-        weight = rows(linear.weight[..., None])[..., 0]
-        used = weight > 0
-        landmark = rows(views.landmark[..., None])[..., 0].astype(np.int64)
-        known = np.unique(landmark[used])
-        slot = np.where(used, np.searchsorted(known, landmark), -1)
-        number = rows(views.board[..., None])[..., 0].astype(np.int64)
-        boards = linear.scene.boards
-        camera = np.broadcast_to(data.camera_of[:, None, None], (*views.landmark.shape, 1))
-        points, uv = rows(views.points), rows(np.nan_to_num(linear.linear.uv))
-        place = linear.whitened(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
-        board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
-        for i, one in enumerate(boards):
-            mine = used & (number == one.id)
-            board[mine], local[mine] = i, one.local(points[mine])[:, :2]
-            place[mine] = place[mine] @ one.axes.T
-        return cls(
-            used, uv, weight, rows(camera)[..., 0].astype(np.int64), slot, known, board, local,
-            place,
-        )
 
 
 class Grid(NamedTuple):
@@ -144,14 +96,17 @@ class Design(NamedTuple):
         )
 
 
-def design(linear: Linearised, finest: bool = False) -> Design:
-    """Build the columns of every component that the data can hold; finest: of the image, too."""
-    points = GatheredPoints.of(linear)
-    frame, label = _frame_columns(points)
-    boards = linear.scene.boards
-    of_landmark, local = _by_landmark(points)
-    static = list(_grids(points, finest))
-    grids, fields = [grid for grid, _ in static], _board_fields(points, of_landmark, local, linear)
+def design(linear: Linearised, finest: bool = False, setting: Setting | None = None) -> Design:
+    """Build the columns of every component that the data can hold; finest: of the image, too.
+
+    setting: of the data that the variances are of, None for these; with it every component has
+    its columns, and what stays with a target those views alone that show it.
+    """
+    points = GatheredPoints.of(linear, setting)
+    frame, label = _frame_columns(points, setting is None)
+    static = list(_grids(points, finest) if setting is None else
+                  _all_grids(points, setting.finest))
+    grids, fields = [grid for grid, _ in static], _board_fields(points)
     parts = [_moving_both(points.weight[..., None] * bumps) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
     names = [grid.name for grid in grids] + [field.name for field in fields]
@@ -160,32 +115,23 @@ def design(linear: Linearised, finest: bool = False) -> Design:
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
     )
-    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3 for one in boards]
+    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3 for one in points.boards]
     return Design(
-        frame, label, points.place, points.slot, points.landmark, np.array(kinds)[of_landmark],
+        frame, label, points.place, points.slot, points.landmark,
+        np.array(kinds)[points.of_landmark],
         sparse.hstack([sparse.csr_array((rows, 0)), *parts], format='csr'),
         np.concatenate([np.zeros(0, dtype=np.int64), *of]), tuple(grids), tuple(fields),
-        np.stack([one.axes for one in boards])[of_landmark],
+        np.stack([one.axes for one in points.boards])[points.of_landmark],
     )
 
 
-def _by_landmark(points: GatheredPoints) -> tuple[Index, Array]:
-    """Return the board (L,) of each landmark and its place (L, 2) on it."""
-    count = len(points.landmark)
-    board, local = np.zeros(count, dtype=np.int64), np.zeros((count, 2))
-    board[points.slot[points.used]] = points.board[points.used]
-    local[points.slot[points.used]] = points.local[points.used]
-    return board, local
-
-
-def _frame_columns(points: GatheredPoints) -> tuple[Array, Index]:
+def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]:
     """Return columns (F, M, B) and labels (B,) of what single frames have of their own."""
     blocks: list[tuple[str, Array]] = []
-    for camera in range(int(points.camera.max()) + 1):
+    for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
         if not mine.any():
             continue
-        low, high = points.uv[mine].min(axis=0), points.uv[mine].max(axis=0)
         half = float((high - low).max()) / 2
         x, y = np.moveaxis((points.uv - (low + high) / 2) / half, -1, 0)
         weight = points.weight * mine
@@ -195,8 +141,9 @@ def _frame_columns(points: GatheredPoints) -> tuple[Array, Index]:
             powers = np.stack([x ** (degree - j) * y**j for j in range(degree + 1)], axis=-1)
             blocks.append((name, _both(powers * weight[..., None])))
         pitch = 2 * half / _FRAME_CELLS
-        bumps = bump_values(points.uv, mine, hexagons(low, high, pitch), pitch)
-        blocks.append(('frame_bumps', _both(_compact(bumps * weight[..., None]))))
+        bumps = bump_values(points.uv, mine, _over(points, mine, pitch), pitch)
+        bumps = bumps * weight[..., None]
+        blocks.append(('frame_bumps', _both(_compact(bumps) if compact else bumps)))
     blocks.append(('frame_bend', _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
     label = np.concatenate([
@@ -206,13 +153,20 @@ def _frame_columns(points: GatheredPoints) -> tuple[Array, Index]:
     return columns.reshape(frames, 2 * count, -1), label
 
 
+def _over(points: GatheredPoints, mine: Mask, pitch: float) -> Array:
+    """Return centres of bumps over the extent of a camera and over all its points."""
+    low, high = points.extents[int(points.camera[mine][0])]
+    uv = points.uv[mine]
+    return hexagons(np.minimum(low, uv.min(axis=0)), np.maximum(high, uv.max(axis=0)), pitch)
+
+
 def _bend_columns(points: GatheredPoints) -> Array:
     """Return columns (F, N, 2, 3 boards) of a bend of each board, anew in every frame."""
     x, y = np.moveaxis(points.local, -1, 0)
     powers = np.stack([x * x, x * y, y * y], axis=-1)
     bend = points.place[..., 2:] * powers[..., None, :]
-    boards = int(points.board.max()) + 1
-    mine = points.used[..., None] & (points.board[..., None] == np.arange(boards))
+    boards = len(points.boards)
+    mine = (points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
@@ -222,14 +176,12 @@ def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, Array]]
 
     Each grid with its values (F, N, K) at the points.
     """
-    for camera in range(int(points.camera.max()) + 1):
+    for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
         if not mine.any():
             continue
-        uv = points.uv[mine]
-        low, high = uv.min(axis=0), uv.max(axis=0)
         for name, most, fewest in _STATIC[: 4 if finest else 3]:
-            fits = max(int(np.sqrt(len(uv) / fewest)), 16)
+            fits = max(int(np.sqrt(mine.sum() / fewest)), 16)
             cells = min(most, fits) if name == 'image_finest' else most
             pitch = max(float((high - low).max()) / cells, 1e-9)
             centres = hexagons(low, high, pitch)
@@ -240,28 +192,38 @@ def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, Array]]
                 yield Grid(name, camera, centres[seen], pitch), bumps[..., seen]
 
 
-def _board_fields(
-    points: GatheredPoints, of_landmark: Index, local: Array, linear: Linearised
-) -> list[BoardField]:
+def _all_grids(points: GatheredPoints, finest: float) -> Iterator[tuple[Grid, Array]]:
+    """Yield the bumps wherever there are points; finest: pitch of the finest grid, px, or NaN."""
+    for camera, (low, high) in enumerate(points.extents):
+        mine = points.used & (points.camera == camera)
+        for name, most, _ in _STATIC if mine.any() else ():
+            pitch = finest if name == 'image_finest' else float((high - low).max()) / most
+            if np.isfinite(pitch):
+                centres = _over(points, mine, pitch)
+                yield (Grid(name, camera, centres, pitch),
+                       bump_values(points.uv, mine, centres, pitch))
+
+
+def _board_fields(points: GatheredPoints) -> list[BoardField]:
     """Return smooth displacements of boards, along and across them: neighbours err alike.
 
     Along it, what is linear has its own variance: paper stretches as a whole.  Across it, the
     smooth shapes that the catalogue has are taken out.
     """
     fields = []
-    for i, board in enumerate(linear.scene.boards):
-        mine = of_landmark == i
+    for i, board in enumerate(points.boards):
+        mine = points.of_landmark == i
         if not board.flat or mine.sum() < _FEWEST_ON_BOARD:
             continue
-        at = local[mine]
+        at = points.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
         centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
         bumps = bump_values(at[None], np.ones((1, len(at)), dtype=bool), centres, pitch)[0]
-        stretch = np.zeros((len(local), 2))
+        stretch = np.zeros((len(points.at), 2))
         stretch[mine] = at - at.mean(axis=0)
         fields.append(BoardField('board_stretch', (0, 1), stretch))
         for name, axes, degree in (('board_in_plane', (0, 1), 1), ('board_normal', (2,), 4)):
-            values = np.zeros((len(local), len(centres)))
+            values = np.zeros((len(points.at), len(centres)))
             values[mine] = _outside_powers(bumps, at, degree)
             kept = np.sqrt((values**2).sum(axis=0)) > 0.05
             if kept.any():
@@ -279,7 +241,7 @@ def _outside_powers(values: Array, at: Array, degree: int) -> Array:
 
 
 def _field_columns(points: GatheredPoints, field: BoardField) -> sparse.csr_array:
-    values = np.where(points.used[..., None], field.values[points.slot], 0.0)
+    values = np.where(points.slot[..., None] >= 0, field.values[points.slot], 0.0)
     columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
     return sparse.csr_array(np.concatenate(columns, axis=-1).reshape(points.used.size * 2, -1))
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.evidence import Evidence
+from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
 from fisheye_svp_ros.diagnosis.mixed import (
     Equations,
     Factored,
@@ -21,7 +22,6 @@ from fisheye_svp_ros.diagnosis.mixed import (
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
 from fisheye_svp_ros.diagnosis.products import multiplied_by
 from fisheye_svp_ros.diagnosis.random_effects import (
-    MILLIMETRE,
     NAMES,
     Design,
     Grid,

@@ -51,6 +51,11 @@ class Variances:
         """Standard deviation of each component's coefficients, 0 for what has vanished."""
         return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
 
+    @property
+    def spread(self) -> float:
+        """Mean factor on the variance of landmarks' offsets: a few are far off."""
+        return float(np.mean(1 / self.weight)) if len(self.weight) else 1.0
+
 
 def nothing_random(landmarks: int) -> Variances:
     """Return variances without any random component."""

@@ -8,8 +8,9 @@ from scipy import linalg, optimize, special
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
+from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
 from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve, solve_lower
-from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import GONE, landmark_labels, start_variances
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
 

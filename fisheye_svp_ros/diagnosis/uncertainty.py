@@ -6,16 +6,17 @@ out over the points of a view.  Carried through the solver, it stands beside noi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
+from fisheye_svp_ros.diagnosis.gathered import Setting
 from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows, is_shared
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
-from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.reml import GONE, Variances
 
 
 class ErrorParts(NamedTuple):
@@ -35,19 +36,30 @@ class ErrorParts(NamedTuple):
 class ModelError:
     """What a diagnosis knows of its own errors.
 
-    variances: of the null model; covariance (K, K): of all that is shared, beside it.
+    variances: of the null model; covariance (K, K): of all that is shared, beside it; setting:
+    what the variances are of.
     """
 
     variances: Variances
     covariance: Array
+    setting: Setting
 
     @classmethod
     def of(cls, evidence: Evidence) -> ModelError:
-        """Return the errors of what was fitted under a null model."""
+        """Return the errors of what was fitted under a null model.
+
+        Parameters take up part of an image field that has no name: what it does to them is not
+        counted beside the field.
+        """
+        lam = np.where(np.isin(np.arange(len(NAMES)), _of_the_image()), GONE,
+                       evidence.variances.lam)
+        bare = replace(evidence, variances=replace(evidence.variances, lam=lam))
         own = np.arange(evidence.own)
-        inverse, _ = pseudo_inverse(evidence.information[np.ix_(own, own)], 1e-13)
+        inverse, _ = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
         scale = evidence.scale[own]
-        return cls(evidence.variances, inverse / np.outer(scale, scale))
+        finest = [grid.pitch for grid in evidence.design.grids if grid.name == 'image_finest']
+        return cls(evidence.variances, inverse / np.outer(scale, scale),
+                   Setting.of(evidence.linear, max(finest, default=np.nan)))
 
     def of_poses(self, linear: Linearised) -> ErrorParts:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
@@ -108,18 +120,11 @@ class ModelError:
         }}
         if linear.data.poses is not None:
             return found
-        poses = self.of_poses(linear)._asdict()
-        for what, mine in (('position_m', slice(0, 3)), ('rotation_rad', slice(3, 6))):
-            found[what] = {
-                name: float(np.sqrt(np.trace(part[:, mine, mine], axis1=1, axis2=2).mean()))
-                for name, part in poses.items()
-            }
-        return found
+        return found | pose_summary(self.of_poses(linear))
 
     def _design(self, linear: Linearised) -> tuple[Design, Array]:
         """Return the random columns of the frames, and the variance of each component, last 0."""
-        alive = self.variances.alive
-        random = design(linear, bool(alive[NAMES.index('image_finest')])).kept(alive)
+        random = design(linear, setting=self.setting).kept(self.variances.alive)
         return random, np.append(self.variances.tau**2, 0.0)
 
     def _of_landmarks(self, random: Design, variance: Array) -> Array:
@@ -127,9 +132,17 @@ class ModelError:
 
         A few landmarks are further off than the bulk: theirs is the mean.
         """
-        mean = float(np.mean(1 / self.variances.weight)) if len(self.variances.weight) else 1.0
         label = np.where(random.slot[..., None] >= 0, random.landmark_label[random.slot], -1)
-        return np.asarray(mean * variance[label])
+        return np.asarray(self.variances.spread * variance[label])
+
+
+def pose_summary(parts: ErrorParts) -> dict[str, dict[str, float]]:
+    """Return root mean squares of position_m and rotation_rad from covariances (F, 6, 6)."""
+    return {
+        what: {name: float(np.sqrt(np.trace(part[:, mine, mine], axis1=1, axis2=2).mean()))
+               for name, part in parts._asdict().items()}
+        for what, mine in (('position_m', slice(0, 3)), ('rotation_rad', slice(3, 6)))
+    }
 
 
 def pose_maps(columns: Array) -> Array:

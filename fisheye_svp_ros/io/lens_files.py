@@ -26,7 +26,7 @@ from fisheye_svp_ros.registry import Registry
 C = TypeVar('C', bound=Curve)
 
 _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
-           'target', 'calibration', 'provenance'}
+           'target', 'calibration', 'uncertainty', 'provenance'}
 _LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
@@ -84,7 +84,8 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
         port=_port(own.get(PORT), where),
         target=target,
-        calibration=_calibration(document.get('calibration'), where),
+        calibration=_mapping(document, 'calibration', where),
+        uncertainty=_mapping(document, 'uncertainty', where),
     )
     wrong = lens.check()
     if wrong:
@@ -113,8 +114,10 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
         document['viewpoint_shift'] = _shift_to_dict(lens.viewpoint_shift)
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
     document |= {'corrections': own | dict(lens.corrections), 'target': dict(lens.target)}
-    if lens.calibration is not None:
-        document['calibration'] = dict(lens.calibration)
+    for name in ('calibration', 'uncertainty'):
+        section = getattr(lens, name)
+        if section is not None:
+            document[name] = dict(section)
     return document
 
 
@@ -197,9 +200,10 @@ def _effects(document: Mapping[str, Any], name: str, where: str) -> dict[str, An
     return section
 
 
-def _calibration(section: Any, where: str) -> dict[str, Any] | None:
+def _mapping(document: Mapping[str, Any], name: str, where: str) -> dict[str, Any] | None:
+    section = document.get(name)
     if section is not None and not isinstance(section, dict):
-        raise LensError(f'{where}: calibration must be a mapping, is {section!r}')
+        raise LensError(f'{where}: {name} must be a mapping, is {section!r}')
     return section
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
 from sensor_msgs.msg import PointCloud2
@@ -12,16 +14,21 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.markers import camera_shape
-from fisheye_svp_ros.nodes.solver import Items, SolverNode
+from fisheye_svp_ros.nodes.solver import Items, SolverNode, lens_of
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.camera import incidence
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import Solved, localized
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
 _NEAR = 0.1  # rad, and of the distance of the nearest landmark
@@ -45,19 +52,33 @@ class Localizer(SolverNode):
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._transforms = Transforms(self, self.settings.publish_tf)
         self._before: tuple[Pose | None, float] = None, 0.0
+        self._errors: LensErrors | None = None  # of the latest lens
         self.start()
+
+    def prepare(self, settings: Any) -> Any:
+        """Refuse a lens that cannot be loaded, or does not know its errors where they count."""
+        if settings.model_error and settings.lens not in ('', CAMERA_INFO):
+            _errors_of(lens_of(settings.lens, 1.0, settings))
+        return super().prepare(settings)
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Localize the camera of one set; raise GeometryError where its points fix no pose."""
         seen: decoding.ImagePoints = items['image_points']
         views, model = self.views(stamp, landmarks, seen), self.model(stamp, items)
+        errors = self._lens_errors(stamp, items) if self.settings.model_error else None
+        if errors is not None:
+            sigma = errors.allowing(self.settings.sigma_px)
+            views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
         found = self._localized(model, views, true).checked()
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         camera = self.settings.camera_frame or seen.frame
+        covariance = solution.covariance
+        if errors is not None:
+            covariance = errors.of_solved(views, solution, None).total
         self._pose.publish(
-            messages.pose_with_covariance_message(pose, solution.covariance[0], stamp, world)
+            messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
         self._residuals.publish(
             messages.cloud_message(residuals(model, views, solution), stamp, camera)
@@ -72,6 +93,12 @@ class Localizer(SolverNode):
             shape = camera_shape(pose, 'estimated', alpha=0.6)
             self._markers.publish(messages.markers_message([shape], stamp, world))
 
+    def _lens_errors(self, stamp: int, items: Items) -> LensErrors:
+        lens = self.lens(stamp, items)
+        if self._errors is None or self._errors.lens is not lens:
+            self._errors = _errors_of(lens)
+        return self._errors
+
     def _localized(
         self, model: ForwardModel, views: Views, true: Pose | None
     ) -> Solved[Localization]:
@@ -85,6 +112,13 @@ class Localizer(SolverNode):
         rms, pose = _rms_px(found), found.solution.pose
         self._before = (pose, max(rms, _EXACT)) if np.isfinite(rms) else (None, 0.0)
         return found
+
+
+def _errors_of(lens: Lens) -> LensErrors:
+    # Nothing else here needs what that imports, and a node is to start at once.
+    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+
+    return LensErrors.of(lens)
 
 
 def _rms_px(found: Solved[Localization]) -> float:

@@ -149,13 +149,13 @@ class SolverNode(ManagedNode):
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
         if settings.lens not in ('', CAMERA_INFO):
-            _lens_of(settings.lens, 1.0, settings)
+            lens_of(settings.lens, 1.0, settings)
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
         """Load the lens and say which; do not wait for a scenario that nobody needs."""
         told = settings.lens in ('', CAMERA_INFO)
-        self._lens = None if told else _lens_of(settings.lens, 1.0, settings)
+        self._lens = None if told else lens_of(settings.lens, 1.0, settings)
         if settings.lens == CAMERA_INFO:
             self._listen_to_camera_info()
         if settings.lens and not self.BY_SCENARIO:
@@ -195,7 +195,7 @@ class SolverNode(ManagedNode):
             raise ParameterError('no scenario names a lens; set the parameter lens')
         name = allowed(scenario['lens'], self.settings.folder, 'scenario: lens')
         scale = shift_scale(scenario.get('shift_scale', '1.0'))
-        return _lens_of(name, scale, self.settings)
+        return lens_of(name, scale, self.settings)
 
     def views(self, stamp: int, landmarks: LandmarkSet, seen: ImagePoints) -> Views:
         """Return image points as one view; raise ObservationError for an unknown landmark."""
@@ -359,7 +359,8 @@ class SolverNode(ManagedNode):
         self._counts.incomplete += bool(present)
 
 
-def _lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
+def lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
+    """Return a lens as it is to be solved with; raise FisheyeSvpError where it cannot be."""
     lens = true_lens(name, scale)
     return lens.svp() if settings.solves_svp else lens
 

@@ -26,7 +26,7 @@ class Lens:
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
     them; target: those of the target that they were found on, and its landmarks, see
     `effects.target`; both are changed by `effects.extension.extend_lens`.  calibration: where a
-    fit came from.
+    fit came from; uncertainty: of what a diagnosis found, see `diagnosis.lens_errors`.
     """
 
     name: str
@@ -43,6 +43,7 @@ class Lens:
     corrections: Mapping[str, Any] = field(default_factory=dict)
     target: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, Any] | None = None
+    uncertainty: Mapping[str, Any] | None = None
 
     @property
     def parameters(self) -> dict[str, float]:

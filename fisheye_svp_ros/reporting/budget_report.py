@@ -25,7 +25,8 @@ _WORDS = {
 class Asked(NamedTuple):
     """What the user asked for: lens; spread, rad; working range, m; quantities with a limit.
 
-    port: whether the lens is behind one, so that the question is that of its calibration in air.
+    port: whether the lens is behind one, so that the question is that of its calibration in air;
+    own: whether it knows its own errors.
     Where the user states no limit at all, what noise causes is the limit of every quantity.
     """
 
@@ -34,6 +35,7 @@ class Asked(NamedTuple):
     working_range: float
     given: frozenset[str]
     port: bool = False
+    own: bool = False
 
     @property
     def model(self) -> str:
@@ -43,7 +45,8 @@ class Asked(NamedTuple):
     @property
     def header(self) -> tuple[str, ...]:
         """The heads of the table's columns."""
-        return ('error', f'{self.model} causes', 'noise causes', 'limit', 'unit', 'kept',
+        own = ('its parameters', 'what remains') if self.own else ()
+        return ('error', f'{self.model} causes', 'noise causes', *own, 'limit', 'unit', 'kept',
                 'nearest range', 'largest spread')
 
     def judged(self, points: Sequence[Point]) -> list[Point]:
@@ -56,9 +59,11 @@ def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
     found = []
     for point in asked.judged(points):
         unit, factor = _PEOPLE[UNITS[point.quantity]]
+        own = (point.parameters, point.misfit) if asked.own else ()
         found.append((
             _WORDS[point.quantity],
-            *(f'{factor * value:.3g}' for value in (point.error, point.noise, point.limit)),
+            *(f'{factor * value:.3g}' if np.isfinite(value) else '-'
+              for value in (point.error, point.noise, *own, point.limit)),
             unit, 'yes' if point.kept else 'no',
             f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
             f'{np.degrees(point.largest_spread):.0f} deg'
@@ -106,6 +111,8 @@ def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str,
         'ranges_m': budget.ranges.tolist(),
         'error': {name: budget.error[name].tolist() for name in QUANTITIES},
         'noise': {name: budget.noise[name].tolist() for name in QUANTITIES},
+        **{part: {name: values.tolist() for name, values in by.items()}
+           for part, by in budget.own.items()},
     }
 
 

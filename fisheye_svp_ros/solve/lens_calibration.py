@@ -145,7 +145,7 @@ def _finished(
         'frames': len(views.frame),
         'source': observations.source,
     }
-    lens = check_lens(replace(lens, calibration=block), observations.source)
+    lens = check_lens(replace(lens, calibration=block, uncertainty=None), observations.source)
     return Calibration(adjusted._replace(lens=lens), sigma, views, left_out, beyond)
 
 

@@ -2,7 +2,9 @@
 
 A lens looks at landmarks that are spread evenly over a cap of directions about its axis, all at
 one range, alone (localization) and as a stereo rig (epipolar lines and depth).  Beside every SVP
-error stands what image noise alone causes.  For a lens behind a port SVP is the lens in air.
+error stands what image noise alone causes, and what a lens that knows its own errors
+(`uncertainty`) leaves even where it is used as it is.  For a lens behind a port SVP is the lens
+in air.
 """
 
 from __future__ import annotations
@@ -27,7 +29,10 @@ from fisheye_svp_ros.solve.stereo_depth import (
 
 QUANTITIES = ('position', 'axis', 'residual', 'epipolar', 'depth')
 UNITS = {'position': 'm', 'axis': 'rad', 'residual': 'px', 'epipolar': 'px', 'depth': 'm'}
+_OWN = ('parameters', 'misfit')
 _LANDMARKS = 48
+_AT_ONCE = 24  # caps
+_FEWER = 4  # of them one for what the lens's own errors do to stereo points
 _SMALLEST_SPREAD = np.radians(15.0)
 _EDGE = np.radians(1.0)  # how far inside the field of view the widest spread ends
 _NEAREST, _FARTHEST = 0.05, 20.0  # m
@@ -49,19 +54,23 @@ class Budget(NamedTuple):
     spreads (A,): largest incidence angle of the landmarks, rad; ranges (R,), m.  position: of the
     camera; axis: of its viewing axis; residual: mean, px; epipolar: mean distance to the epipolar
     curve; depth: mean 3-D distance of stereo points.  NaN where nothing can be solved.
+    own: by part (parameters, misfit) and quantity what is wrong with the lens as it stands, of
+    position, axis and depth; empty for a lens that does not say.
     """
 
     spreads: Array
     ranges: Array
     error: dict[str, Array]
     noise: dict[str, Array]
+    own: dict[str, dict[str, Array]]
 
 
 class Point(NamedTuple):
     """One quantity where the user works: error and noise there; limit; whether SVP keeps it.
 
     nearest_range: from which on SVP keeps the limit at this spread, m; largest_spread: the largest
-    at which it keeps it at this range, rad; NaN where it does so nowhere.
+    at which it keeps it at this range, rad; NaN where it does so nowhere.  parameters, misfit:
+    what is wrong with the lens as it stands, see `Budget.own`; NaN where unknown.
     """
 
     quantity: str
@@ -71,6 +80,8 @@ class Point(NamedTuple):
     kept: bool
     nearest_range: float
     largest_spread: float
+    parameters: float
+    misfit: float
 
 
 def widest_spread(lens: Lens) -> float:
@@ -118,7 +129,9 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
         {name: row[i].reshape(shape) for name, row in zip(QUANTITIES, rows, strict=True)}
         for i in range(2)
     )
-    return Budget(angle, distance, error, noise)
+    own = {part: {name: values.reshape(shape) for name, values in by.items()}
+           for part, by in _own_errors(setup, flat).items()}
+    return Budget(angle, distance, error, noise, own)
 
 
 def at_point(
@@ -154,6 +167,8 @@ def at_point(
             bool(here <= 0),
             float(np.exp(_kept_from(np.log(budget.ranges), by_range))),
             _largest_kept(budget.spreads, by_spread),
+            *(_value(budget, budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan)),
+                     spread, working_range) for part in _OWN),
         ))
     return found
 
@@ -193,6 +208,31 @@ def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     # Noise of the left point across the curve and of the right point that moves the curve.
     epipolar_noise = np.full(len(points), 2 / np.sqrt(np.pi) * setup.noise)
     return [(epipolar, epipolar_noise), (depth, depth_noise)]
+
+
+def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
+    """Return what the lens's own errors do to caps (S, N, 3): (S,) by part and quantity."""
+    if setup.lens.uncertainty is None:
+        return {}
+    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, depth_errors
+
+    errors, lens = LensErrors.of(setup.lens), ForwardModel(setup.lens)
+    some = points[:, ::_FEWER]
+    left = lens.predict(setup.rig.broadcast_to(len(some)), _blank(some)).uv
+    both: Mask = np.asarray(np.isfinite(left).all(axis=-1))
+    depth = depth_errors(errors, errors, setup.rig, some[both])
+    poses = [errors.of_poses(_blank(caps), identity(len(caps)))
+             for caps in np.array_split(points, -(-len(points) // _AT_ONCE))]
+    found = {}
+    for part in _OWN:
+        variance = np.concatenate([
+            np.diagonal(getattr(one, part), axis1=-2, axis2=-1) for one in poses])
+        far = np.sqrt(np.trace(getattr(depth, part), axis1=-2, axis2=-1))
+        found[part] = {
+            'position': np.sqrt(variance[:, :3].sum(axis=-1)),
+            'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)), 'depth': _mean_by_cap(both, far),
+        }
+    return found
 
 
 def _caps(angles: Array) -> Array:

@@ -96,6 +96,10 @@ class LocalizerSettings(SolverSettings):
     camera_frame: str = parameter(
         '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True
     )
+    model_error: bool = parameter(
+        False, 'Covariance of the pose with what the lens file says of the lens\'s own errors, '
+        'beside `sigma_px`: `uncertainty`, as `diagnose` writes it'
+    )
 
 
 @dataclass(frozen=True)

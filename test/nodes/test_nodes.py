@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph, set_parameter
+from helpers.uncertain import NOISE, uncertain
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
@@ -18,13 +20,14 @@ from sensor_msgs.msg import CameraInfo, PointCloud2  # isort: skip
 from std_msgs.msg import Float64  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
+from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, unpack
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
-from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import camera, messages
 from fisheye_svp_ros.nodes.base import Finished
@@ -366,6 +369,29 @@ def test_a_pose_that_is_not_to_be_relied_on_is_a_warning(graph: Callable[..., Gr
     assert all(f' {landmark} (' in status[1].message for landmark in named)
     assert 'times what sigma allows' in status[2].message
     sets.graph.until(lambda: len(sets.poses) == 3)
+
+
+def test_the_covariance_of_a_pose_with_the_lens_s_own_errors(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    lens, path = uncertain(), tmp_path / 'lens.yaml'
+    save_lens(lens, path)
+    sets = Sets(graph(f'lens:={path}', 'patience:=0.2', f'sigma_px:={NOISE}'))
+    sets.tell_landmarks(0, 0.5)
+    seen = simulate_scenario(Scenario(lens=str(path), radius=0.5, noise_px=NOISE)).observations
+    found = []
+    for stamp, asked in enumerate((False, True), start=1):
+        assert set_parameter(sets.node, 'model_error', asked).successful
+        sets.points.publish(messages.image_points_message(seen.landmark, seen.uv, stamp, 'camera'))
+        sets.graph.until(lambda: len(sets.poses) == stamp)  # noqa: B023
+        found.append(np.reshape(sets.poses[-1].pose.covariance, (6, 6)))
+    sigma = replace(seen, sigma=np.full(len(seen), NOISE))
+    _, parts = localize_with_errors(LensErrors.of(lens), sigma)
+    np.testing.assert_allclose(found[0], parts.noise[0], rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(found[1], parts.total[0], rtol=1e-3, atol=1e-12)
+    assert np.trace(found[1]) > 4 * np.trace(found[0])
+    refused = set_parameter(sets.node, 'lens', 'fish214')
+    assert not refused.successful and 'no uncertainty' in refused.reason
 
 
 def test_points_without_landmarks_are_dropped(graph: Callable[..., Graph]) -> None:

@@ -1,0 +1,243 @@
+"""How far off poses and stereo points by a diagnosed lens may be: what its file carries.
+
+`diagnose` writes it into the lens as `uncertainty`; whoever solves with that lens may ask for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.gathered import Setting
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.reml import GONE, Variances
+from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, ModelError, pose_maps
+from fisheye_svp_ros.effects.base import Term
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.target import Target
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import Observations, Views, make_observations, views_of
+from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured
+
+_OFFSETS = ('landmark_in_plane', 'landmark_normal', 'landmark')
+_STEP = 1e-3  # of a standard error
+_AT_ONCE = 500  # stereo points
+
+
+def with_uncertainty(
+    errors: ModelError, linear: Linearised, noise: float,
+    lenses_of: Callable[[State], Mapping[str, Lens]],
+) -> dict[str, Lens]:
+    """Return the lenses of a diagnosis, each with what is known of its errors.
+
+    linear: the fit; noise, px; lenses_of: makes lenses of its state.
+    """
+    misfit = errors.summary(linear)['image_px']['misfit']
+    lenses, by = lenses_of(linear.state), {}
+    for name in lenses:
+        by[name] = np.zeros((len(_numbers(lenses[name])), len(errors.covariance)))
+    frames = np.zeros((linear.data.frames, 6))
+    for k, stderr in enumerate(np.sqrt(np.diag(errors.covariance))):
+        if k < 6 * (linear.data.cameras - 1) or not stderr:
+            continue  # of the rig
+        step = np.zeros(len(errors.covariance))
+        step[k] = _STEP * stderr
+        one, other = (lenses_of(moved(linear.data, linear.state, linear.free, frames, way))
+                      for way in (step, -step))
+        for name, columns in by.items():
+            values = [np.array([*_numbers(lens[name]).values()]) for lens in (one, other)]
+            columns[:, k] = (values[0] - values[1]) / (2 * step[k])
+    return {
+        name: replace(lens, uncertainty=_entry(
+            errors, camera, noise, misfit, by[name] @ errors.covariance @ by[name].T,
+            list(_numbers(lens))))
+        for camera, (name, lens) in enumerate(lenses.items())
+    }
+
+
+def _numbers(lens: Lens) -> dict[str, float]:
+    """Return all numbers of a lens: of its curves, its corrections and those of its target."""
+    target = Target.of(lens.target, lens.name)
+    terms = (*ForwardModel(lens).terms, *(target.terms if target else ()))
+    return {**lens.parameters, **{
+        name: float(value) for term in terms for name, value in
+        zip(_names(term), term[1], strict=True)}}
+
+
+def _names(term: Term) -> list[str]:
+    return [f'{term[0].name}.{parameter.name}' for parameter in term[0].parameters]
+
+
+def _entry(
+    errors: ModelError, camera: int, noise: float, misfit: float, covariance: Array,
+    names: list[str],
+) -> dict[str, Any]:
+    setting, variances = errors.setting, errors.variances
+    sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True) if size}
+    sizes |= {name: sizes[name] * float(np.sqrt(variances.spread)) for name in _OFFSETS
+              if name in sizes}
+    known = np.diag(covariance) > 0
+    return {
+        'noise_px': noise, 'misfit_px': misfit,
+        'parameters': [name for name, there in zip(names, known, strict=True) if there],
+        'covariance': covariance[np.ix_(known, known)].tolist(),
+        'components': sizes,
+        'extent_px': setting.extents[camera].tolist(),
+        'finest_px': float(setting.finest) if np.isfinite(setting.finest) else None,
+        'landmarks': [[*pair, *place] for *pair, place in zip(
+            setting.landmark.tolist(), setting.board.tolist(), setting.points.tolist(),
+            strict=True)],
+    }
+
+
+@dataclass(frozen=True)
+class LensErrors:
+    """A lens and what its file says of its errors.
+
+    noise, misfit: of a coordinate of an image point, px; covariance (K, K) of the numbers `names`;
+    variances, setting: of what remains without a name.
+    """
+
+    lens: Lens
+    noise: float
+    misfit: float
+    names: tuple[str, ...]
+    covariance: Array
+    variances: Variances
+    setting: Setting
+
+    @classmethod
+    def of(cls, lens: Lens) -> LensErrors:
+        """Return what a lens carries; raise LensError for one that carries nothing, or half."""
+        entry = lens.uncertainty
+        if entry is None:
+            raise LensError(f'lens {lens.name!r} has no uncertainty; the extended_lens.yaml that '
+                            '`diagnose -o` writes has')
+        try:
+            size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
+            lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, GONE)
+            finest = entry['finest_px']
+            rows = np.array(entry['landmarks'], dtype=float).reshape(-1, 5)
+            setting = Setting(
+                np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
+                np.nan if finest is None else float(finest), rows[:, 0].astype(np.int64),
+                rows[:, 1].astype(np.int64), rows[:, 2:])
+            names = tuple(map(str, entry['parameters']))
+            covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
+            found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']), names,
+                        covariance, Variances(1.0, lam, np.zeros(0)), setting)
+        except (AttributeError, KeyError, TypeError, ValueError) as cause:
+            raise LensError(f'lens {lens.name!r}: uncertainty is incomplete ({cause})') from cause
+        numbers = (found.noise, found.misfit, *covariance.ravel(), *setting.extents.ravel(),
+                   *setting.points.ravel(), *size)
+        if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows)):
+            raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
+        return found
+
+    def allowing(self, sigma: Array | float) -> Array | float:
+        """Return sigma (...), px, of image points by this lens: noise and what remains."""
+        return np.hypot(sigma, self.misfit)
+
+    def of_poses(self, views: Views, pose: Pose) -> ErrorParts:
+        """Return covariances (S, 6, 6), m and rad, of poses, for noise of 1 / weight."""
+        linear = self.linearised(views, pose)
+        return self.through(linear, pose_maps(linear.frame_columns))
+
+    def of_solved(self, views: Views, solved: Localization, sigma: float | None) -> ErrorParts:
+        """Return covariances (S, 6, 6), m and rad, of the change in `Pose.retract` of poses.
+
+        sigma: noise that was estimated with weights of 1, px, in whose place that of the lens is
+        taken; None where weights are 1 / `allowing(sigma)`.  A pose whose misfit the solver found
+        to be more than it may be is so much more uncertain.
+        """
+        linear = self.linearised(views, solved.pose)
+        maps = pose_maps(linear.frame_columns)
+        parts = self.through(linear, maps)
+        excess = np.trace(solved.covariance, axis1=1, axis2=2)
+        excess = excess / np.trace(parts.noise, axis1=1, axis2=2) / (sigma or 1.0) ** 2
+        if sigma is None:
+            weight = linear.data.blocks(views.weight[..., None] * np.ones(2))
+            of_noise = 1 - (self.misfit * weight) ** 2
+        else:
+            of_noise = np.full(maps.shape[::2], self.noise**2)
+        parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
+        return ErrorParts(*(part * excess[:, None, None] for part in parts))
+
+    def linearised(self, views: Views, pose: Pose) -> Linearised:
+        """Linearise views of this lens, with the numbers that are uncertain free."""
+        terms = ForwardModel(self.lens).terms_for(views)
+        bare = replace(self.lens, corrections={}, target={})
+        own = [name for name in self.names if name in bare.parameters]
+        count = len(views.frame)
+        data = Data(_table(views), views, np.arange(count), np.zeros(count, dtype=np.int64))
+        return Linearised(data, State(pose, identity(1), bare, terms), own)
+
+    def through(self, linear: Linearised, maps: Array) -> ErrorParts:
+        """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
+        names = [*linear.free, *(name for term in linear.state.terms for name in _names(term))]
+        at = {name: i for i, name in enumerate(self.names)}
+        place = np.array([at.get(name, len(at)) for name in names], dtype=np.int64)
+        whole = np.pad(self.covariance, (0, 1))
+        return ModelError(self.variances, whole[np.ix_(place, place)], self.setting).through(
+            linear, maps)
+
+
+def localize_with_errors(
+    errors: LensErrors, observations: Observations
+) -> tuple[MeasuredPoses, ErrorParts]:
+    """Pose every frame of one camera's table that can be posed, and say how far off each may be.
+
+    Raises ObservationError and GeometryError as `localize_measured` does.
+    """
+    allowed = replace(observations, sigma=np.asarray(errors.allowing(observations.sigma)))
+    found = localize_measured(ForwardModel(errors.lens), allowed)
+    kept = found.views._replace(weight=np.where(found.gross, 0.0, found.views.weight))
+    parts = errors.of_solved(kept, found.result, found.sigma)
+    return found._replace(result=found.result._replace(covariance=parts.total)), parts
+
+
+def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) -> ErrorParts:
+    """Return covariances (N, 3, 3), m^2, of stereo points (N, 3), m, in the right camera.
+
+    Of points of least reprojection error; rig: left camera in the right one, taken as it is.  NaN
+    where a point is NaN or a camera does not see it.
+    """
+    found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
+    for rows in _chunks(np.flatnonzero(np.isfinite(points).all(axis=1))):
+        views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
+        pairs = [(errors, errors.linearised(views, pose)) for errors, pose in (
+            (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
+        by = [linear.whitened(linear.linear.d_target) / errors.noise for errors, linear in pairs]
+        seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
+        by = [np.where(seen[:, None, None], one, np.eye(2, 3)) for one in by]
+        rows_of_both = np.concatenate(by, axis=1)
+        information = np.swapaxes(rows_of_both, -1, -2) @ rows_of_both
+        information[~seen] = np.eye(3)
+        for (errors, linear), one in zip(pairs, by, strict=True):
+            maps = np.linalg.solve(information * errors.noise, np.swapaxes(one, -1, -2))
+            parts = errors.through(linear, np.asarray(maps))
+            parts = parts._replace(noise=parts.noise * errors.noise**2)
+            for whole, part in zip(found, parts, strict=True):
+                whole[rows] = np.nan_to_num(whole[rows]) + part
+        for whole in found:
+            whole[rows[~seen]] = np.nan
+    return ErrorParts(*found)
+
+
+def _chunks(rows: Index) -> Iterator[Index]:
+    for first in range(0, len(rows), _AT_ONCE):
+        yield rows[first:first + _AT_ONCE]
+
+
+def _table(views: Views) -> Observations:
+    used = views.used
+    frame = np.broadcast_to(views.frame[:, None], used.shape)[used]
+    return make_observations(frame, views.landmark[used], views.uv[used], views.points[used])

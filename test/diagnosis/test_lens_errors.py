@@ -1,0 +1,185 @@
+"""What a lens file says of its own errors: against samples, and the same for whoever asks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.uncertain import (
+    BOARD,
+    BUMPS,
+    COARSE,
+    HIGH,
+    LINEAR,
+    LOW,
+    NAMES,
+    NOISE,
+    OFFSET,
+    uncertain,
+)
+
+import fisheye_svp_ros as fsvp
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.lens_errors import (
+    LensErrors,
+    depth_errors,
+    localize_with_errors,
+)
+from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.scene.observations import make_observations, views_of
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
+from fisheye_svp_ros.study.budget import Setup, make_budget
+
+SAMPLES = 300
+
+
+def drawn(lens, rng):
+    """Return the lens as it may really be."""
+    half = np.linalg.cholesky(np.array(lens.uncertainty['covariance']))
+    off = half @ rng.normal(size=len(NAMES))
+    moved = [lens.parameters[n] + d for n, d in zip(NAMES, off, strict=True)]
+    return lens.with_parameters(NAMES, moved)
+
+
+def smooth(uv, size, pitch, rng):
+    """Draw fields (..., 2) of Gaussian bumps on a hexagonal grid, by their covariance."""
+    width = 0.65 * pitch
+    squares = ((uv[:, None] - uv) ** 2).sum(axis=-1)
+    variance = size**2 * 2 / np.sqrt(3) / pitch**2 * np.pi * width**2
+    covariance = variance * np.exp(-squares / (4 * width**2))
+    half = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(uv)))
+    return half @ rng.normal(size=(len(uv), 2))
+
+
+def misfit(uv, rng):
+    pitch = (HIGH - LOW).max()
+    x = (uv - (LOW + HIGH) / 2) / (pitch / 2)
+    return (smooth(uv, COARSE, pitch / 6, rng) + smooth(uv, BUMPS, pitch / 4, rng)
+            + LINEAR * x @ rng.normal(size=(2, 2)))
+
+
+def seen_by(lens, pose, points, rng):
+    """Return image points (N, 2) as the lens, its misfit and noise make them."""
+    uv = ForwardModel(drawn(lens, rng)).project(pose.into_body(points)).uv
+    return uv + misfit(uv, rng) + NOISE * rng.normal(size=uv.shape)
+
+
+@pytest.mark.parametrize('board', [True, False])
+def test_poses_scatter_as_the_lens_file_says(board):
+    """A board that errs itself, and landmarks in all directions that do not."""
+    lens, rng = uncertain(), np.random.default_rng(1)
+    pose = Pose(rotation_from_vector(np.array([0.3, -0.4, 0.2])), np.array([0.2, 0.0, -0.25]))
+    points = BOARD if board else pose.transform(
+        rng.uniform([-1, -0.7, 0.3], [1, 0.7, 1.0], (25, 3)))
+    uv = []
+    for _ in range(SAMPLES):
+        true = points + (1e-3 * OFFSET * rng.normal(size=points.shape) if board else 0.0)
+        uv.append(seen_by(lens, pose, true, rng))
+    errors = LensErrors.of(lens)
+    weight = np.full((SAMPLES, len(points)), 1 / errors.allowing(NOISE))
+    views = views_of(points, np.array(uv), weight)
+    start = Pose(*(np.repeat(part[None], SAMPLES, axis=0) for part in pose))
+    solved = localize(ForwardModel(lens), views, start)
+    parts = errors.of_solved(views.take([0]), solved.take([0]), None)
+    off = solved.pose.difference(start)
+    pull = np.einsum('si,ij,sj->s', off, np.linalg.inv(parts.total[0]), off) / 6
+    assert np.mean(pull) == pytest.approx(1, abs=0.15)
+    for part in (parts.noise, parts.parameters, parts.misfit):
+        assert (np.diagonal(part[0]) < 0.95 * np.diagonal(parts.total[0])).all()
+
+
+def test_stereo_points_scatter_as_the_lens_files_say():
+    lens, rng = uncertain(), np.random.default_rng(2)
+    rig = Pose(rotation_from_vector(np.array([0.0, 0.1, 0.0])), np.array([-0.15, 0.0, 0.0]))
+    points = np.array([[0.1, 0.05, 0.6], [-0.5, 0.2, 0.5], [0.3, -0.3, 0.9]])
+    pairs = np.array([[seen_by(lens, pose, points, rng) for pose in (rig, identity())]
+                      for _ in range(SAMPLES)])
+    found = triangulate_optimally(
+        ForwardModel(lens), ForwardModel(lens), rig, pairs[:, 0], pairs[:, 1], NOISE)
+    parts = depth_errors(LensErrors.of(lens), LensErrors.of(lens), rig, points)
+    off = found.points - points
+    pull = np.einsum('sni,nij,snj->sn', off, np.linalg.inv(parts.total), off) / 3
+    assert pull.mean(axis=0) == pytest.approx(np.ones(3), abs=0.25)
+    nowhere = np.array([[np.nan] * 3, [0.0, 0.0, -5.0], points[0]])
+    holes = depth_errors(LensErrors.of(lens), LensErrors.of(lens), rig, nowhere)
+    assert np.isnan(holes.total[:2]).all()
+    np.testing.assert_allclose(holes.total[2], parts.total[0], rtol=0.01)
+
+
+def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
+    lens = replace(uncertain(), uncertainty=None, viewpoint_shift=None)
+    table = board_table(lens, np.random.default_rng(3), 8)
+    found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(quick=True))
+    save_lens(found.lens, tmp_path / 'lens.yaml')
+    errors = LensErrors.of(load_lens(tmp_path / 'lens.yaml'))
+    views, pose = found.after.data.views, found.after.state.pose
+    said, carried = found.errors.of_poses(found.after), errors.of_poses(views, pose)
+    np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-6, atol=1e-15)
+    assert errors.noise == pytest.approx(found.noise_px) and said.misfit.any()
+    assert {'fx', 'k4', 'target_shape.board0.z20'} < set(errors.names)
+
+
+def board_table(lens, rng, frames):
+    """Return photographs of a bent board through a lens with a shift."""
+    bent = BOARD + np.stack([0 * BOARD[:, 0]] * 2 + [0.06 * (BOARD[:, 0] - 0.12) ** 2], -1)
+    bent = bent + 3e-4 * rng.normal(size=BOARD.shape)
+    seeing, tables = ForwardModel(replace(lens, viewpoint_shift=Gennery(e0=0.003))), []
+    for _ in range(frames):
+        turn = rotation_from_vector(0.5 * rng.normal(size=3))
+        pose = Pose(turn, np.array([0.12, 0.08, 0.0]) - turn @ rng.uniform(
+            [-0.1, -0.1, 0.2], [0.1, 0.1, 0.4]))
+        uv = seeing.project(pose.into_body(bent)).uv
+        tables.append(uv + 0.05 * rng.normal(size=uv.shape))
+    return make_observations(np.repeat(np.arange(frames), len(BOARD)),
+                             np.tile(np.arange(len(BOARD)), frames), np.concatenate(tables),
+                             np.tile(BOARD, (frames, 1)))
+
+
+def test_library_and_core_say_the_same_and_misfit_is_no_doubt():
+    lens, rng = uncertain(), np.random.default_rng(4)
+    pose = Pose(rotation_from_vector(np.array([0.2, -0.2, 0.1])), np.array([0.1, 0.1, -0.3]))
+    uv = seen_by(lens, pose, BOARD, rng)
+    table = make_observations(np.zeros(len(BOARD), int), np.arange(len(BOARD)), uv, BOARD,
+                              sigma=np.full(len(BOARD), NOISE))
+    plain, known = fsvp.localize(table, lens), fsvp.localize(table, lens, model_error=True)
+    poses, parts = localize_with_errors(LensErrors.of(lens), table)
+    np.testing.assert_array_equal(known.covariance, parts.total)
+    assert plain.reasons[0] and not known.reasons[0] and not poses.reasons[0]
+    bare = localize(ForwardModel(lens), poses.views._replace(
+        weight=np.full_like(poses.views.weight, 1 / NOISE)))
+    np.testing.assert_allclose(parts.noise, bare.covariance, rtol=1e-3)
+    # Without a sigma the noise is the lens's, not what residuals look like.
+    guessed = fsvp.localize(replace(table, sigma=np.full(len(BOARD), np.nan)), lens,
+                            model_error=True)
+    np.testing.assert_allclose(guessed.covariance, known.covariance, rtol=1e-3)
+
+
+def test_a_budget_of_a_lens_that_knows_its_errors():
+    lens = uncertain()
+    setup = Setup(lens, Pose(np.eye(3), np.array([0.15, 0.0, 0.0])), 0.1)
+    budget = make_budget(setup, 3, 3)
+    assert set(budget.own) == {'parameters', 'misfit'}
+    for by in budget.own.values():
+        assert set(by) == {'position', 'axis', 'depth'}
+        assert all((values > 0).all() and values.shape == (3, 3) for values in by.values())
+    # Nothing but a wrong focal length: depth errs in proportion.
+    only = replace(lens, uncertainty={**lens.uncertainty, 'components': {}, 'parameters': ['fx'],
+                                      'covariance': [[9.0]]})
+    wide = make_budget(Setup(only, setup.rig, 0.1), 2, 2).own
+    assert not wide['misfit']['depth'].any() and (wide['parameters']['depth'] > 0).all()
+
+
+def test_a_lens_without_errors_or_with_half_of_them_is_refused():
+    lens = uncertain()
+    with pytest.raises(LensError, match='no uncertainty'):
+        LensErrors.of(replace(lens, uncertainty=None))
+    for name, value in (('noise_px', -1.0), ('covariance', [[1.0]]), ('extent_px', None),
+                        ('landmarks', []), ('components', {'image_coarse': float('nan')})):
+        with pytest.raises(LensError, match='uncertainty'):
+            LensErrors.of(replace(lens, uncertainty={**lens.uncertainty, name: value}))
