@@ -82,6 +82,9 @@ class Detector(BaseNode):
     NAME = 'detector'
     SETTINGS = DetectorSettings
     settings: DetectorSettings
+    # Looked at by destroy_node, also where a signal came while this was being built
+    _searches: BoundedCalls | None = None
+    _guiding: Guiding | None = None
 
     def __init__(self) -> None:
         super().__init__()
@@ -91,9 +94,7 @@ class Detector(BaseNode):
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
         self._waiting: tuple[int, Unread] | None = None
-        self._searches: BoundedCalls | None = None
         self._searched: tuple[int, str, Pixels] | None = None
-        self._guiding: Guiding | None = None
         self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
         if self.settings.detections:
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)

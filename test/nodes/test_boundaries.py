@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -229,33 +228,6 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
     assert len(attack.results) == int(counts['sets: solved'])
     assert all(stamp in map(stamp_of, attack.results) for stamp in range(297, 302))
     assert 'cannot keep up' not in texts[-1]
-
-
-def test_at_any_rate_every_set_taken_has_one_result_or_is_counted(
-    graph: Callable[..., Graph]
-) -> None:
-    attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true', 'backlog:=20'))
-    attack.solves(1)
-    numbers = iter(range(2, 1000))
-
-    def tell(rate: float, count: int) -> None:
-        begun = time.monotonic()
-        for number in range(count):
-            time.sleep(max(0.0, begun + number / rate - time.monotonic()))
-            attack.tell_points(next(numbers))
-
-    for rate, count in ((10.0, 4), (100.0, 30), (1000.0, 250)):
-        camera = threading.Thread(target=tell, args=(rate, count))
-        camera.start()
-        attack.graph.until(lambda camera=camera: not camera.is_alive())
-    attack.graph.until(lambda: attack.counts()['sets: waiting'] == '0')
-    counts = attack.counts()
-    done = int(counts['sets: solved']) + int(counts['sets: not solved'])
-    attack.graph.until(lambda: len(attack.results) >= done)
-    answered = [stamp_of(message) for message in attack.results]
-    assert counts['sets: taken'] == '285' and len(set(sums(counts))) == 1
-    assert len(answered) == len(set(answered)) == done
-    assert done + int(counts['sets: dropped']) == 285
 
 
 def test_landmarks_that_are_not_latched_are_heard(graph: Callable[..., Graph]) -> None:

@@ -16,6 +16,10 @@ from fisheye_svp_ros import standalone
 
 if not standalone.is_genuine():
     pytest.importorskip('cyclonedds')
+standalone.install()
+
+from fisheye_svp_ros.nodes import NODES, base, executables  # noqa: E402
+
 _CODE = """
 import sys
 from fisheye_svp_ros import cli
@@ -76,3 +80,16 @@ def test_a_signal_while_a_node_starts_ends_it_quietly(
     status = node.finish(number)
     assert 'Traceback' not in '\n'.join(node.lines), node.lines
     assert status in (0, 130, -number)
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
+    name: str, ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(base.BaseNode, 'announce', interrupt)
+    monkeypatch.setattr(signal, 'signal', lambda *_: None)
+    assert executables.run(name, []) == 0
+    assert capfd.readouterr().err == ''
