@@ -1,6 +1,6 @@
 """What becomes of sets that come faster than they are solved: python -m benchmark.overload.
 
-A localizer, a process of its own, is told so many sets of 25 points a second; its /diagnostics
+A localizer, a process of its own, is told so many sets of 33 points a second; its /diagnostics
 says what became of each, and its results are counted where they come to.  Runs with ROS 2 and
 without it.  Leave the machine alone meanwhile.
 """

@@ -353,7 +353,7 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
         try:
             rclpy.init(args=args)
         except Exception as error:
-            return _refuse(kind, error)
+            return _refuse(kind, f'ROS arguments or environment: {error}')
         return _run(kind)
     except KeyboardInterrupt:
         # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
@@ -395,6 +395,6 @@ def _spin(node: BaseNode) -> None:
             node.unforeseen(error)
 
 
-def _refuse(kind: type[BaseNode], error: Exception) -> int:
+def _refuse(kind: type[BaseNode], error: Exception | str) -> int:
     print(f'{kind.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
     return 2
