@@ -22,6 +22,7 @@ from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_ma
 
 _SMALLEST, _LARGEST = 2.5, 10.0  # radius of the window, px
 _WITHIN = 0.62  # of the distance to the next edge
+_SKIRT = 2.5  # blurs of the next edge that stay out of the window
 _UNKNOWNS = 12  # u, v; of two edges angle, bend, log blur; brightness, contrast, its gradient
 _ITERATIONS = 25
 _FEW = 8  # corners of one photograph, whose noise tells little of each other's
@@ -77,6 +78,12 @@ def fit_corners(
     residual, jacobian, weight = problem.parts(values, np.arange(len(values)))
     shape = (2 * half + 1, round_)
     return _judged(values, residual, jacobian, weight, place, start, radius, square, shape)
+
+
+def room(clearance: Array, blur: Array) -> Array:
+    """Return the clearance (N,), px, that leaves an edge so far away, and so blurred, outside."""
+    reach = clearance - _SKIRT * np.sqrt(blur**2 + _PIXEL)
+    return np.asarray(np.maximum(reach, _SMALLEST) / _WITHIN)
 
 
 def _judged(

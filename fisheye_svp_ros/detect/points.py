@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
+from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
 from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.detect.photographs import Pixels
@@ -66,7 +66,7 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     if not pattern.marker and len(index) == len(pattern.points):
         uv = _right_handed(uv, pattern)
     axes = local_axes(pattern.points[index, :2], uv)
-    reach = pattern.clearance * _height(axes)
+    reach = pattern.clearance * _outwards(_height(axes), pattern)
     if detector == 'circles':
         none = np.zeros(len(uv))
         whole = Corners(uv, none + np.nan, none, none, np.ones(len(uv), dtype=bool))
@@ -90,6 +90,10 @@ def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Ex
 def _fitted(pixels: Pixels, start: Array, axes: Array, reach: Array, square: bool) -> Corners:
     """Fit corners; those too soft for their window again at half the size, if there is room."""
     corners = fit_corners(pixels, start, axes, reach, square)
+    # The next edge has its blur, too.
+    free = np.minimum(reach, room(reach, corners.blur))
+    if (corners.ok & (free < reach)).any():
+        corners = fit_corners(pixels, start, axes, np.where(corners.ok, free, reach), square)
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
     if not len(soft):
         return corners
@@ -120,6 +124,19 @@ def _height(axes: Array) -> Array:
     """Distance, px, of neighbouring parallel lines a metre apart on the board."""
     longer = np.linalg.norm(axes, axis=-1).max(axis=-1)
     return np.asarray(np.abs(np.linalg.det(axes)) / np.maximum(longer, 1e-9))
+
+
+def _outwards(height: Array, pattern: Pattern) -> Array:
+    """Return heights (M,) as they are on the outer side of a whole grid, where squares shrink.
+
+    Those of its sides are of half a square within, the next ones of a whole one.
+    """
+    if len(height) != pattern.rows * pattern.columns:
+        return height
+    grid = height.reshape(pattern.rows, pattern.columns).copy()
+    for side in (grid, grid[::-1], grid.T, grid.T[::-1]):
+        side[0] *= np.minimum(side[0] / side[1], 1.0) ** 2
+    return grid.ravel()
 
 
 def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cv2 import GaussianBlur
 
-from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
+from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
 
 SIDE, COUNT, BLUR, NOISE = 41, 150, 0.6, 1.5
 
@@ -54,3 +54,8 @@ def test_a_corner_by_the_edge_of_the_field_is_none() -> None:
     found, _ = corners(90, 40, False, band=12)
     assert not found.ok[0]
     assert found.ok[1:].all()
+
+
+def test_windows_of_soft_corners_end_before_the_next_edge() -> None:
+    assert room(np.array([12.0, 40.0]), np.array([0.6, 0.6])) == pytest.approx([15.1, 60.2], abs=1)
+    assert room(np.array([12.0]), np.array([2.5])) < 12

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from time import sleep
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 from helpers.photographs import (
     BOARD,
+    LENS,
     photograph,
     poses,
     printed_with,
@@ -33,7 +35,9 @@ from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
-from fisheye_svp_ros.simulate.render import Exposure, Print
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.simulate.board_views import board_views
+from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
 PATTERN = parse_pattern(BOARD)
 
@@ -97,6 +101,15 @@ class TestCorners:
         assert points.blur == pytest.approx(1.8, abs=0.2)
         error = points.uv - true_corners(pose)[points.ids]
         assert np.abs(error.mean(axis=0)).max() < 0.02
+
+    def test_a_soft_board_that_shrinks_outwards(self) -> None:
+        lens, board = replace(LENS, width=640, height=600, cx=320.0, cy=300.0), Print(9, 6, 0.025)
+        pose = board_views(lens, board, 8, (0.1, 0.2), np.random.default_rng(3)).take(7)
+        image = render(lens, board, pose, Exposure(blur=1.4), np.random.default_rng(0))
+        points = find_points(image, parse_pattern('chessboard:9x6:25mm'), 'saddle')
+        assert not isinstance(points, str)
+        error = points.uv - project(lens, pose.into_body(board.corners)).uv[points.ids]
+        assert np.abs(error / points.sigma[:, None]).max() < 5
 
     def test_a_large_soft_image(self) -> None:
         pose = poses(3, 1).take(1)
