@@ -33,6 +33,7 @@ setup(
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (share, ['package.xml']),
+        ('bin', ['resource/fisheye-svp']),  # setup.cfg sends the scripts to lib/, off the path
         *tree('config'),
         *tree('launch'),
     ],

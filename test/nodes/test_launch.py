@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,6 +72,14 @@ def graph(ros_domain: int) -> Iterator[Graph]:
 def test_every_launch_file_is_tested() -> None:
     files = {path.name for path in (SHARE / 'launch').glob('*.launch.py')}
     assert files == {*FILES, 'sweep.launch.py', 'camera.launch.py'}
+
+
+def test_fisheye_svp_is_on_the_path_of_a_workspace() -> None:
+    # Behind `ros2 run` a job of a shell would outlive its `kill`.
+    program = SHARE.parents[1] / 'bin' / 'fisheye-svp'
+    told = subprocess.run([program, '--help'], capture_output=True, text=True, check=True)
+    assert told.stdout.startswith('usage: fisheye-svp')
+    assert shutil.which('fisheye-svp')
 
 
 def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path) -> None:
@@ -205,7 +215,9 @@ def test_a_camera_is_localized_with_its_camera_info(
         [str(program), '--ros-args', '-p', 'rate:=2.0',
          '-p', f'photograph:={BOARD}', '-p', f'lens:={lens}', '-p', f'poses:={listed}',
          '-r', '__ns:=/camera'], dict(os.environ))
-    launch('camera.launch.py', 'image:=/camera/image', f'board:={BOARD}')
+    patient = tmp_path / 'patient.yaml'  # a busy machine takes its time
+    patient.write_text('detector: {ros__parameters: {longest_search: 60.0}}')
+    launch('camera.launch.py', 'image:=/camera/image', f'board:={BOARD}', f'params:={patient}')
     try:
         graph.until(lambda: any(read_key_values(m).get('rms_px') for m in results), 120)
         metrics = next(read_key_values(m) for m in results if read_key_values(m).get('rms_px'))
