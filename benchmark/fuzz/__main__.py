@@ -17,7 +17,7 @@ from pathlib import Path
 from random import Random
 
 from benchmark.fuzz.surfaces import Surface
-from benchmark.fuzz.trials import LARGEST, SLOWEST, Outcome, every, trial_of, work
+from benchmark.fuzz.trials import LARGEST, SLOWEST, WAITING, Outcome, every, trial_of, work
 
 _HUNG = 60.0  # s without an answer, then a worker is ended
 _CHUNK = 500  # inputs of a task
@@ -28,7 +28,7 @@ _BEGIN, _END = '<!-- fuzz -->', '<!-- end of fuzz -->'
 
 def _chunks(wanted: list[Surface], total: int, first: int) -> Iterator[Task]:
     whole = sum(surface.share for surface in wanted)
-    ends = {surface.name: round(total * surface.share / whole) for surface in wanted}
+    ends = {surface.name: -(-total * surface.share // whole) for surface in wanted}
     for begin in range(0, max(ends.values()), _CHUNK):
         for name, end in ends.items():
             if begin < end:
@@ -86,8 +86,11 @@ def run_all(wanted: list[Surface], total: int, first: int, workers: int) -> dict
     outcomes = {surface.name: Outcome() for surface in wanted}
     pending = list(_chunks(wanted, total, first))[::-1]
     running = [_Worker() for _ in range(workers)]
+    chunks = len(pending)
     try:
         while pending or any(worker.task for worker in running):
+            if sys.stderr.isatty():
+                print(f'\r{chunks - len(pending)} of {chunks} chunks', end='', file=sys.stderr)
             for number, worker in enumerate(running):
                 _look_after(worker, pending, outcomes)
                 if worker.lost():
@@ -132,8 +135,8 @@ def section(outcomes: dict[str, Outcome], command: str) -> str:
         'crashed', 'hung or died', 'wrong', 'slow', 'large'))
     lines = [
         f'`{command}`: {whole.tried} inputs, {whole.refused} refused, {said}. Slow is above '
-        f'{SLOWEST:g} s of processor time, large above {LARGEST:g} MB of memory more than ever '
-        'before.', '',
+        f'{SLOWEST:g} s of processor time or {WAITING:g} s on the clock, large above {LARGEST:g} '
+        'MB of memory more than ever before.', '',
         '| surface | inputs | refused | crashed | hung or died | wrong | slowest s | most MB |',
         '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
     ]

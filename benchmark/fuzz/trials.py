@@ -21,6 +21,7 @@ from benchmark.fuzz.surfaces import Surface, Trial, surfaces
 from fisheye_svp_ros.errors import FisheyeSvpError
 
 SLOWEST = 2.0  # s of processor time an input
+WAITING = 10.0  # s of wall time an input, on a machine that may be busy
 LARGEST = 200.0  # MB that an input adds to the memory ever used
 
 
@@ -53,7 +54,7 @@ class Outcome:
 
 def tried(name: str, trial: Trial, seed: int, outcome: Outcome) -> None:
     """Try one input."""
-    memory, begun = _memory(), time.process_time()
+    memory, begun, clock = _memory(), time.process_time(), time.monotonic()
     outcome.tried += 1
     try:
         wrong = trial(Random(f'{name} {seed}'))
@@ -68,8 +69,9 @@ def tried(name: str, trial: Trial, seed: int, outcome: Outcome) -> None:
         outcome.fault('crashed', name, seed, traceback.format_exc())
     seconds, growth = time.process_time() - begun, _memory() - memory
     outcome.slowest, outcome.largest = max(outcome.slowest, seconds), max(outcome.largest, growth)
-    if seconds > SLOWEST:
-        outcome.fault('slow', name, seed, f'{seconds:.1f} s')
+    waited = time.monotonic() - clock
+    if seconds > SLOWEST or waited > WAITING:
+        outcome.fault('slow', name, seed, f'{seconds:.1f} s, {waited:.1f} s on the clock')
     if growth > LARGEST:
         outcome.fault('large', name, seed, f'{growth:.0f} MB')
 
