@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors bench compare kills mutation poses fuzz test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors bench compare kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -84,6 +84,10 @@ poses: $(VENV)/ready
 # half an hour.
 fuzz: $(VENV)/ready
 	$(BIN)/python -m benchmark.fuzz
+
+# A million hostile messages over DDS against running nodes, into docs/reliability.md; half an hour.
+soak: $(VENV)/ready
+	$(BIN)/python -m benchmark.soak
 
 # What is left of a command that is killed, or may not write, into docs/reliability.md; needs root
 # for its small disks; an hour.

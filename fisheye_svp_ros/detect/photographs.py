@@ -125,12 +125,11 @@ def decoded(data: bytes, name: str) -> Pixels:
 
 def _whole_chunks(data: bytes) -> bool:
     """Whether the chunks of a PNG are within it; OpenCV makes room for what they announce."""
-    place = len(_PNG)
-    while place + 12 <= len(data):
-        if data[place + 4:place + 8] == b'IEND':
-            return True
+    place, kind = len(_PNG), b''
+    while place + 12 <= len(data) and kind != b'IEND':
+        kind = data[place + 4:place + 8]
         place += 12 + int.from_bytes(data[place:place + 4], 'big')
-    return False
+    return kind == b'IEND' and place <= len(data)
 
 
 def exif_turned(data: bytes) -> bool:

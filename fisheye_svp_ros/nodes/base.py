@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import functools
 import signal
-import struct
 import sys
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from copy import copy
-from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -23,14 +19,13 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.serialization import deserialize_message
 
-from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
-from fisheye_svp_ros.io.decoding import nanoseconds
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import changed, rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.declaration import declare
+from fisheye_svp_ros.nodes.inputs import Count, Unread, twins
 from fisheye_svp_ros.study.settings import Settings
 
 # All topics are reliable; inputs are deep enough for what comes while a solver is busy.
@@ -45,16 +40,8 @@ _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                QoSPolicyKind.DURABILITY)
 _KINDS_OF_ERRORS = 100  # that are told from each other
-_SHORTEST = 12  # bytes: the head of CDR and a stamp
-_TWINS = 100  # messages of which one of two subscriptions may be ahead of the other
 
 T = TypeVar('T')
-
-
-@dataclass
-class _Input:
-    received: int = 0
-    dropped: int = 0
 
 
 class Finished(Exception):
@@ -63,33 +50,6 @@ class Finished(Exception):
 
 class Failed(Finished):
     """A node cannot go on with what it was started for."""
-
-
-class Unread(NamedTuple):
-    """A message that has come and is not decoded yet."""
-
-    topic: str
-    kind: Any
-    data: bytes
-    decode: Callable[[Any, str], Any]
-
-    @property
-    def stamp(self) -> int:
-        """The stamp of its header, which every message starts with that a node listens to, ns."""
-        if len(self.data) < _SHORTEST:
-            raise ObservationError(f'{self.topic}: {len(self.data)} bytes are no message')
-        order = '<' if self.data[1] & 1 else '>'
-        sec, nanosec = struct.unpack_from(f'{order}iI', self.data, 4)
-        return nanoseconds(sec, nanosec, self.topic)
-
-    def read(self) -> Any:
-        """Return what it holds; raise ObservationError where it cannot be used."""
-        try:
-            message = deserialize_message(self.data, self.kind)
-        except Exception as cause:
-            kind = self.kind.__name__
-            raise ObservationError(f'{self.topic}: not a {kind} ({cause})') from cause
-        return self.decode(message, self.topic)
 
 
 class BaseNode(Node):  # type: ignore[misc]
@@ -111,7 +71,7 @@ class BaseNode(Node):  # type: ignore[misc]
         for name in self.given:
             self.undeclare_parameter(name)
         self.settings = declare(self, self.SETTINGS)
-        self._inputs: dict[str, _Input] = {}
+        self._inputs: dict[str, Count] = {}
         self._complaint = ''
         self._unforeseen: set[tuple[object, ...]] = set()
         self._failures = 0
@@ -219,12 +179,12 @@ class BaseNode(Node):  # type: ignore[misc]
 
         volatile_qos: of the second subscription of what is latched.
         """
-        count = self._inputs[topic] = _Input()
+        count = self._inputs[topic] = Count()
 
         def receive(data: bytes) -> None:
             count.received += 1
             try:
-                unread = Unread(topic, kind, bytes(data), read)
+                unread = Unread(topic, kind, bytes(data), read, count)
                 use(unread.stamp, unread)
             except Finished:
                 raise
@@ -316,7 +276,8 @@ class BaseNode(Node):  # type: ignore[misc]
     def _publish_diagnostics(self) -> None:
         counts: dict[str, object] = {}
         for topic, count in self._inputs.items():
-            counts |= {f'{topic}: received': count.received, f'{topic}: dropped': count.dropped}
+            counts |= {f'{topic}: received': count.received, f'{topic}: read': count.read,
+                       f'{topic}: dropped': count.dropped}
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
         trouble = trouble or ('' if now else 'use_sim_time is true, but /clock has no time yet')
@@ -328,23 +289,6 @@ class BaseNode(Node):  # type: ignore[misc]
         name = f'{self.get_fully_qualified_name()}: inputs'
         self._diagnostics.publish(messages.key_values_message(
             name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
-
-
-def twins(receive: Callable[[bytes], None]) -> tuple[Callable[[bytes], None], ...]:
-    """Return callbacks for two subscriptions of one topic; what comes to both is received once."""
-    ahead: list[deque[bytes]] = [deque(maxlen=_TWINS), deque(maxlen=_TWINS)]
-
-    def callback(own: int) -> Callable[[bytes], None]:
-        def hear(data: bytes) -> None:
-            with suppress(ValueError):
-                ahead[1 - own].remove(data)
-                return
-            ahead[own].append(data)
-            receive(data)
-
-        return hear
-
-    return callback(0), callback(1)
 
 
 def run(kind: type[BaseNode], args: list[str] | None = None) -> int:

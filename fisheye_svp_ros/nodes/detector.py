@@ -22,8 +22,9 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, Unread, run
+from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, run
 from fisheye_svp_ros.nodes.guiding import Guiding
+from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
@@ -188,7 +189,7 @@ class Detector(BaseNode):
 
     def _finish(self, found: Any, stamp: int, frame: str, pixels: Pixels) -> None:
         if isinstance(found, Points):
-            self._near = found.uv
+            self._near, self._size = found.uv, pixels.shape
             self._points.publish(
                 messages.image_points_message(found.ids, found.uv, stamp, frame))
         else:
@@ -222,9 +223,7 @@ class Detector(BaseNode):
 
     def _check_size(self, pixels: Pixels) -> None:
         """Raise ObservationError where images change their size: no lens would fit both."""
-        if self._size is None:
-            self._size = pixels.shape
-        if pixels.shape != self._size:
+        if self._size is not None and pixels.shape != self._size:
             raise ObservationError(
                 f'image: {pixels.shape[1]}x{pixels.shape[0]} px, but it was '
                 f'{self._size[1]}x{self._size[0]}; start the node anew for another camera')

@@ -31,8 +31,9 @@ from fisheye_svp_ros.io.decoding import (
 from fisheye_svp_ros.io.parameters import rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT, Unread
+from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
+from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.join import LIMIT, Pending, StampJoin
 from fisheye_svp_ros.nodes.lifecycle import ManagedNode
 from fisheye_svp_ros.optics import engines

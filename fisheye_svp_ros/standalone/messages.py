@@ -204,8 +204,11 @@ def deserialize(data: bytes, cls: type[Message]) -> Message:
             bad = error.__cause__
             if not isinstance(bad, UnicodeDecodeError):
                 raise UnreadableError(f'not a {cls.TYPENAME} ({error!r:.80})') from error
-            # As long as before, so that everything else stays where it is.
-            data = data.replace(bad.object, bad.object.decode('utf-8', 'mark').encode())
+            # As long as before, so that everything else stays where it is; behind its length, so
+            # that numbers of the same bytes stay what they are.
+            length = (len(bad.object) + 1).to_bytes(4, 'little' if data[1] & 1 else 'big')
+            mended = bad.object.decode('utf-8', 'mark').encode()
+            data = data.replace(length + bad.object, length + mended, 1)
     raise UnreadableError(f'{cls.TYPENAME} with more than {_BAD_STRINGS} strings not in UTF-8')
 
 

@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.nodes import access, base, messages
+from fisheye_svp_ros.nodes import access, inputs, messages
 from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
@@ -139,10 +139,11 @@ def test_a_hostile_message_is_refused_with_a_reason_and_counted(
 
 def test_less_than_a_stamp_is_refused_and_counted(graph: Callable[..., Graph]) -> None:
     node = graph('lens:=fish214').start(Localizer)
+    count = inputs.Count()
     for data in (b'', bytes(3), bytes(11)):
         with pytest.raises(ObservationError, match='bytes are no message'):
-            _ = base.Unread('image_points', PointCloud2, data, messages.header).stamp
-    assert node._failures == 0
+            _ = inputs.Unread('image_points', PointCloud2, data, messages.header, count).stamp
+    assert node._failures == 0 and count.read == 3
 
 
 def test_a_board_file_is_named_below_the_folder_alone(
@@ -248,7 +249,7 @@ def test_landmarks_that_are_latched_are_heard_late_and_once(graph: Callable[...,
 
 def test_twins_take_every_message_once_and_in_order() -> None:
     heard: list[bytes] = []
-    one, other = base.twins(heard.append)
+    one, other = inputs.twins(heard.append)
     for hear, data in ((one, b'a'), (one, b'b'), (other, b'a'), (other, b'b'), (other, b'c'),
                        (one, b'a'), (other, b'a')):
         hear(data)

@@ -165,6 +165,15 @@ def test_text_that_is_not_utf_8_is_replaced() -> None:
     assert back.key == 'lens' and back.value == 'fish???('
 
 
+def test_numbers_keep_the_bytes_of_text_that_is_not_utf_8() -> None:
+    pose = message_class('geometry_msgs/msg/PoseStamped')
+    message = pose()
+    message.header.frame_id, message.pose.position.x = '?', float('-inf')
+    data = serialize(message).replace(b'?\0', b'\xff\0', 1)
+    back = deserialize(data, pose)
+    assert back.header.frame_id == '?' and back.pose.position.x == float('-inf')
+
+
 @pytest.mark.parametrize('cut', [0, 3, 4, 7, 12])
 def test_what_is_no_message_is_one_error(cut: int) -> None:
     pair = message_class('diagnostic_msgs/msg/KeyValue')
