@@ -27,6 +27,7 @@ from fisheye_svp_ros.standalone import dds  # noqa: E402
 
 _AHEAD = 1000  # messages that a node has not counted yet, in the first round
 _CHUNK = 100
+_LONG = 600.0  # s for all nodes to come up, on a machine that may be busy
 _STEADY = 0.2  # of a round, after which memory is compared
 _DOC = Path(__file__).parents[2] / 'docs' / 'reliability.md'
 _BEGIN, _END = '<!-- soak -->', '<!-- end of soak -->'
@@ -49,7 +50,7 @@ def _attacked(
     victims: dict[str, Victim], watch: Watch, total: int, exactly: bool
 ) -> tuple[list[str], list[str], int]:
     everybody = victims.values()
-    if not watch.until(victims, lambda: all(v.connected() and v.counts for v in everybody), 120):
+    if not watch.until(victims, lambda: all(v.connected() and v.counts for v in everybody), _LONG):
         raise SystemExit(f'not all nodes have come up: {[v.trouble() for v in everybody]}')
     each = -(-total // len(victims))
     measured = time.monotonic()
