@@ -34,6 +34,7 @@ _WRITING = 0.15  # of a run: the end, where most is written
 _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent
 _LONGEST = 240.0  # s for the kills of one command
 _NOBODY = 65534
+_PAGE = 4096  # bytes
 _BOARD = 'chessboard:6x5:25mm'
 _CALIBRATE = ('calibrate', '{obs}', '--model', 'kannala_brandt', '-o', '{out}/lens.yaml')
 COMMANDS = {
@@ -91,7 +92,9 @@ class Outcome:
 
 def call(words: Sequence[str], before: Sequence[str] = ()) -> subprocess.Popen[str]:
     """Start `fisheye-svp WORDS` in a session of its own; before: what is to start it."""
-    environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '97'}
+    # One engine: another one, once it is compiled, gives other last digits.
+    environment = {**os.environ, 'OMP_NUM_THREADS': '1', 'ROS_DOMAIN_ID': '97',
+                   'FISHEYE_SVP_ENGINE': 'numpy'}
     return subprocess.Popen(
         [*before, sys.executable, '-m', 'fisheye_svp_ros.cli', *words], env=environment,
         start_new_session=True, text=True, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
@@ -271,9 +274,10 @@ def refused(words: Sequence[str], folder: Path, size: int) -> Outcome:
     """
     outcome = Outcome()
     for part in (0.0, 0.3, 0.9):
-        with disk(folder / 'disk', max(4, int(part * size / 1024))) as mounted:
-            if not part:
-                (mounted / 'full').write_bytes(bytes(4096))
+        # A disk has room for whole pages, and one of none is a disk without bounds.
+        pages = int(part * size / _PAGE)
+        with disk(folder / 'disk', (pages + 1) * _PAGE // 1024) as mounted:
+            (mounted / 'full').write_bytes(bytes(_PAGE))
             _judge(outcome, f'disk of {part:.1f} of it', mounted / 'out', words)
     with disk(folder / 'disk', 64) as mounted:
         subprocess.run(['mount', '-o', 'remount,ro', mounted], check=True)
