@@ -22,23 +22,28 @@ LARGEST_YAML = 1 << 22  # characters
 _MOST_VALUES, _DEEPEST = 100_000, 50
 
 _Base: Any = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
-_TIMESTAMP = 'tag:yaml.org,2002:timestamp'
+_INT, _FLOAT, _TIMESTAMP = (f'tag:yaml.org,2002:{kind}' for kind in ('int', 'float', 'timestamp'))
 
 
 class _Loader(_Base):  # type: ignore[misc]
-    """YAML 1.1 as PyYAML reads it, but for 1e-3, a number in ROS and YAML 1.2, and dates."""
+    """YAML 1.1 as PyYAML reads it, but for dates, and with the numbers of YAML 1.2.
+
+    So 1e-3 is one, 0800 is eight hundred, and 1:30 is not 90.
+    """
 
     # A date is nothing that any file here has; 2001-99-99 may be a name.
     yaml_implicit_resolvers: ClassVar = {
-        first: [(tag, pattern) for tag, pattern in resolvers if tag != _TIMESTAMP]
+        first: [(tag, pattern) for tag, pattern in resolvers
+                if tag not in (_INT, _FLOAT, _TIMESTAMP)]
         for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
 
 
 _Loader.add_implicit_resolver(
-    'tag:yaml.org,2002:float', re.compile(r'[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$'),
-    list('-+0123456789'),
-)
+    _INT, re.compile(r'[-+]?(0|[1-9][0-9]*|0x[0-9a-fA-F]+)$'), list('-+0123456789'))
+_Loader.add_implicit_resolver(
+    _FLOAT, re.compile(r'[-+]?((\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|\.(inf|Inf|INF))$'
+                       r'|\.(nan|NaN|NAN)$'), list('-+.0123456789'))
 # OpenCV's matrices are mappings; those of other types are none that a lens has.
 _Loader.add_constructor('tag:yaml.org,2002:opencv-matrix', _Loader.construct_yaml_map)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -51,6 +52,12 @@ def test_plain_values_stay() -> None:
         'name': '2001-99-99', 'when': '2001-01-01', 'a': 1e-3, 'b': [1, 2.5, True]}
     shared = [1.0, 2.0]
     assert parse_yaml(dump_yaml({'a': shared, 'b': shared}), 'x', LensError)['b'] == shared
+
+
+def test_numbers_are_those_of_yaml_1_2() -> None:
+    text = 'a: 01536\nb: 1:30:00\nc: 0x10\nd: -.inf\ne: 1_0\nf: 08.5\n'
+    assert parse_yaml(text, 'x', LensError) == {
+        'a': 1536, 'b': '1:30:00', 'c': 16, 'd': -math.inf, 'e': '1_0', 'f': 8.5}
 
 
 @pytest.mark.parametrize(('text', 'said'), [

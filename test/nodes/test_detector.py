@@ -103,10 +103,9 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(
     g.until(lambda: (images.publish(raw(good, 5)), points)[1])
     noise = np.random.default_rng(0).integers(0, 256, good.shape, dtype=np.uint8)
     noise = np.kron(noise, np.ones((3, 3), np.uint8))
-    node._size = None
     # Nothing else is held up meanwhile: that the executor goes round shows it.
-    g.until(lambda: (images.publish(raw(noise, 6)), node._counts['searches broken off'])[1])
-    node._size = None
+    g.until(lambda: (setattr(node, '_size', None), images.publish(raw(noise, 6)),
+                     node._counts['searches broken off'])[2])
     g.until(lambda: (images.publish(raw(good, 7)),
                      any(p.header.stamp.nanosec == 7 for p in points))[1])
     g.until(lambda: any(pair.key == 'searches broken off' and int(pair.value)
