@@ -255,6 +255,8 @@ def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
             **{method: float(np.median(values)) for method, values in table.items()},
             **{f'at_most_half_of_{m}': float(np.mean(2 * table['chosen'] <= table[m]))
                for m in ('random', 'intrinsics')},
+            **{f'ratio_to_{m}': float(np.median(table['chosen'] / table[m]))
+               for m in ('random', 'intrinsics')},
         }
     found['at_20_mm'] = {m: 1e3 * float(np.median([one['at_20_m'][m] for one in cameras]))
                          for m in ('chosen', 'intrinsics', 'random')}

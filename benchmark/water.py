@@ -3,8 +3,9 @@
 Cameras calibrated in air (another noise than that of the photographs, so that their lens is a
 little off) photograph a board through a tilted port into a hidden medium, or do not: decoys look
 through a plate with air on both sides, have another focal length or another curve.  Lens and
-table alone are handed to `diagnose`.  Rays are traced here by bisection, as nowhere else in the
-package.  Writes docs/water/trials.json.
+table alone are handed to `diagnose`; with --air the lens is what `calibrate` makes of photographs
+in air.  Rays are traced here by bisection, as nowhere else in the package.  Writes
+docs/water/trials.json.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 KINDS = ('water', 'water', 'water', 'plate', 'focal', 'curve', 'air')
 _HALVINGS = 60
@@ -48,6 +50,7 @@ class Outcome:
     thickness: float
     noise: float
     rough: bool
+    air: bool
     causes: list[str]
     found: dict[str, list[float]]
     rms_px: float
@@ -59,6 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.water')
     parser.add_argument('--trials', type=int, default=120)
     parser.add_argument('--rough', action='store_true', help='with errors of board and frames')
+    parser.add_argument('--air', action='store_true', help='lenses calibrated in air')
     parser.add_argument('--workers', type=int, default=os.cpu_count())
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/water/trials.json'))
     asked = parser.parse_args(arguments)
@@ -68,11 +72,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         progress('trials', asked.trials) as advance,
         ProcessPoolExecutor(asked.workers, multiprocessing.get_context('spawn')) as pool,
     ):
-        for outcome in pool.map(partial(run_trial, rough=asked.rough), range(asked.trials)):
+        run = partial(run_trial, rough=asked.rough, air=asked.air)
+        for outcome in pool.map(run, range(asked.trials)):
             outcomes.append(outcome)
             advance()
     lines = ',\n'.join(json.dumps(asdict(one)) for one in outcomes)
     command = f'python -m benchmark.water --trials {asked.trials}' + ' --rough' * asked.rough
+    command += ' --air' * asked.air
     asked.output.parent.mkdir(parents=True, exist_ok=True)
     write_text(asked.output, f'{{"command": "{command}", "trials": [\n{lines}\n]}}\n')
     sys.stdout.write(summary(outcomes))
@@ -105,10 +111,10 @@ def _accuracy(named: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def run_trial(number: int, rough: bool = False) -> Outcome:
+def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
     """Run one trial; the same number always gives the same data.
 
-    rough: with errors of board and frames.
+    rough: with errors of board and frames; air: the lens from photographs in air.
     """
     rng = np.random.default_rng([17, number])
     kind = KINDS[number % len(KINDS)]
@@ -132,13 +138,17 @@ def run_trial(number: int, rough: bool = False) -> Outcome:
 
     seen = _photographs(true, see, noise, rough, rng)
     given = _calibrated(lens, rng, free, rough)
+    if air:
+        table = _photographs(lens, lambda points: _central(lens, points), noise, rough, rng)
+        given = calibrate(table, 'kannala_brandt', (lens.width, lens.height)).adjusted.lens
+        given = given if free else replace(given, calibration=None)
     found = diagnose(seen, given, free_intrinsics=free)
     port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
     values = {} if port is None else {
         name: [entry['value'], entry['stderr']] for name, entry in port.parameters.items()
     }
     return Outcome(number, kind, free, index, float(distance), float(np.hypot(*tilt)),
-                   float(thickness), noise, rough, [c.effect for c in found.causes], values,
+                   float(thickness), noise, rough, air, [c.effect for c in found.causes], values,
                    found.named.rms_px, found.named.heldout_rms_px)
 
 
