@@ -1,12 +1,12 @@
 """Do 95 % intervals cover?  `python -m benchmark.coverage DATA.csv... --image-size 1280x800`.
 
 A lens is calibrated and diagnosed on half of the frames.  In each frame of the other half the
-camera is posed twice, from the left and from the right half of the points: the difference should
-lie within its interval in 95 of 100 cases, by noise alone, with the lens's parameters, and with
-the misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with
-displaced landmarks and an image field that no catalogue holds, of which the truth is known: poses
-of the other half, and points that two of the cameras see as a rig, by what the lens files carry
-(`diagnosis.lens_errors`).  Writes docs/coverage.json.
+camera is posed from the left and from the right half of the points, and from the upper and the
+lower one: the differences should lie within their intervals in 95 of 100 cases, by noise alone,
+with the lens's parameters, and with the misfit that remains (`diagnosis.uncertainty`).  Without a
+table: simulated cameras with displaced landmarks and an image field that no catalogue holds, of
+which the truth is known: poses of the other half, and points that two of the cameras see as a rig,
+by what the lens files carry (`diagnosis.lens_errors`).  Writes docs/coverage.json.
 """
 
 from __future__ import annotations
@@ -153,16 +153,21 @@ def _pulls(difference: Array, parts: ErrorParts) -> Array:
 
 
 def pulls_of(found: Diagnosis, test: Observations) -> Array:
-    """Return differences of poses over their standard deviations (F, levels, 6)."""
+    """Return differences of poses over their standard deviations (2 F, levels, 6).
+
+    Poses from the left and the right half of the points, and from the upper and the lower one.
+    """
     data = prepare(test)
     state = start_poses(data, found.after.state)
-    middle = np.array([np.median(v[w > 0]) for v, w in zip(
-        data.views.uv[..., 0], data.views.weight, strict=True)])
-    left = data.views.uv[..., 0] < middle[:, None]
-    sides = [side(data, state, mask) for mask in (left, ~left)]
-    difference = sides[0][0].pose.difference(sides[1][0].pose)
-    linear = Linearised(data, state, found.after.free)
-    return _pulls(difference, found.errors.through(linear, sides[0][1] - sides[1][1]))
+    linear, pulls = Linearised(data, state, found.after.free), []
+    for axis in (0, 1):
+        middle = np.array([np.median(v[w > 0]) for v, w in zip(
+            data.views.uv[..., axis], data.views.weight, strict=True)])
+        first = data.views.uv[..., axis] < middle[:, None]
+        sides = [side(data, state, mask) for mask in (first, ~first)]
+        difference = sides[0][0].pose.difference(sides[1][0].pose)
+        pulls.append(_pulls(difference, found.errors.through(linear, sides[0][1] - sides[1][1])))
+    return np.concatenate(pulls)
 
 
 def side(data: Data, state: State, mask: Mask) -> tuple[State, Array]:
