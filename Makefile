@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# setuptools has a long notice for every editable installation.
+QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
 .PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors bench compare kills mutation poses fuzz soak test-oldest clean
 
@@ -57,7 +59,7 @@ bench: .venv-bench/ready
 	@echo "Installing what is compared into .venv-bench: some minutes, this once"
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/pip install --quiet --upgrade pip
-	.venv-bench/bin/pip install --quiet -e '.[standalone]' -r benchmark/requirements.txt
+	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[standalone]' -r benchmark/requirements.txt
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
@@ -72,7 +74,7 @@ compare: .venv-compare/ready
 .venv-compare/ready: setup.py
 	@echo "Installing what is compared into .venv-compare: some minutes, this once"
 	$(COMPARE_PYTHON) -m venv .venv-compare
-	.venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging
+	$(QUIETLY) .venv-compare/bin/pip install --quiet -e '.[fast]' numpysane gnuplotlib packaging
 	.venv-compare/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
 	touch $@
 
@@ -103,14 +105,14 @@ mutation: $(VENV)/ready
 test-oldest:
 	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
-	.venv-oldest/bin/pip install --quiet -e '.[standalone,fast,parquet,test]' -c test/oldest.txt
+	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[standalone,fast,parquet,test]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
 
 $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(BIN)/pip install --quiet -e '.[standalone,fast,parquet,dask,test,lint]'
+	$(QUIETLY) $(BIN)/pip install --quiet -e '.[standalone,fast,parquet,dask,test,lint]'
 	touch $@
 
 clean:
