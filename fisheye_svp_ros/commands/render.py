@@ -1,4 +1,4 @@
-"""`fisheye-svp render`: photographs of a chessboard through a lens, and the truth about them."""
+"""`fisheye-svp render`: photographs of chessboards through a lens, and the truth about them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
     from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.pose import Pose
-    from fisheye_svp_ros.simulate.render import Exposure, Field, Print
+    from fisheye_svp_ros.simulate.render import Exposure, Field, Placed
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,15 +21,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='a lens file, or the name of one that comes with the package')
     parser.add_argument('--board', required=True, metavar='SPEC',
                         help='the board: chessboard:9x6:25mm (inner corners)')
+    parser.add_argument('--target', choices=('board', 'cube', 'room'), default='board',
+                        help='one board, or six: on the faces of a cube, on the walls of a room')
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
                         help='folder for the photographs, observations.csv (the true corners) and '
                         'poses.csv')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help="poses of the camera in the board's frame; at random by default")
+                        help="poses of the camera in the frame of the board, or of the target's "
+                        'middle; at random by default')
     parser.add_argument('--count', type=int, default=30, metavar='N',
                         help='how many photographs from random poses (30)')
     parser.add_argument('--ranges', type=float, nargs=2, default=(0.12, 0.35), metavar='M',
-                        help='nearest and furthest, m, of random poses (0.12 0.35)')
+                        help='nearest and furthest, m, of random poses (0.12 0.35), to the middle '
+                        'of a cube')
     parser.add_argument('--bow', type=float, default=0.0, metavar='MM',
                         help='how far the middle of the board stands out from its ends, mm')
     parser.add_argument('--blur', type=float, default=0.6, metavar='PX',
@@ -48,8 +52,10 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.io.share import lens_path
+    from fisheye_svp_ros.pose import identity
     from fisheye_svp_ros.simulate.board_views import board_views
-    from fisheye_svp_ros.simulate.render import Exposure, Print
+    from fisheye_svp_ros.simulate.render import Exposure, Placed, Print
+    from fisheye_svp_ros.simulate.targets import TARGETS, target_views
 
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
@@ -61,10 +67,16 @@ def run(args: argparse.Namespace) -> None:
     if args.bow:
         printed = Print(pattern.columns, pattern.rows, pattern.size,
                         bow=bowed(printed.corners, 1e-3 * args.bow))
-    poses = read_poses(args.poses).pose if args.poses else board_views(
-        lens, printed, args.count, tuple(args.ranges), rng)
+    boards = TARGETS[args.target](printed) if args.target in TARGETS else (
+        Placed(printed, identity()),)
+    if args.poses:
+        poses = read_poses(args.poses).pose
+    elif len(boards) > 1:
+        poses = target_views(lens, args.target, boards, args.count, tuple(args.ranges), rng)
+    else:
+        poses = board_views(lens, printed, args.count, tuple(args.ranges), rng)
     with together():
-        write_photographs(lens, printed, poses, Exposure(blur=args.blur, noise=args.noise),
+        write_photographs(lens, boards, poses, Exposure(blur=args.blur, noise=args.noise),
                           args.seed, args.output, args.output)
     print(f'{args.output}: {len(poses.position)} photographs, observations.csv with their true '
           'corners, poses.csv')
@@ -81,29 +93,34 @@ def bowed(corners: Array, height: float) -> Field:
 
 
 def write_photographs(
-    lens: Lens, printed: Print, poses: Pose, exposure: Exposure, seed: int, folder: Path,
-    truth: Path,
+    lens: Lens, boards: tuple[Placed, ...], poses: Pose, exposure: Exposure, seed: int,
+    folder: Path, truth: Path,
 ) -> None:
     """Write a photograph a pose (P,); the true corners, observations.csv, poses.csv to `truth`."""
     import cv2
     import numpy as np
 
-    from fisheye_svp_ros.effects.forward import project
     from fisheye_svp_ros.io.files import write_bytes
     from fisheye_svp_ros.io.readers import write_observations, write_poses
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.scene.observations import make_observations
     from fisheye_svp_ros.simulate.render import render
+    from fisheye_svp_ros.simulate.targets import visible
 
-    count, corners = len(poses.position), printed.corners
+    count = len(poses.position)
+    uv: list[Array] = []
+    seen: list[Array] = []
     with progress('rendering', count) as done:
         for number in range(count):
-            rng = np.random.default_rng([seed, number])
-            image = render(lens, printed, poses.take(number), exposure, rng)
+            rng, pose = np.random.default_rng([seed, number]), poses.take(number)
+            image = render(lens, boards, pose, exposure, rng)
             write_bytes(folder / f'{number:03d}.png', cv2.imencode('.png', image)[1].tobytes())
+            for kept, part in zip((uv, seen), visible(lens, boards, pose), strict=True):
+                kept.append(part)
             done()
-    seen = project(lens, poses.into_body(printed.true_corners()))
-    frame, corner = np.nonzero(seen.valid)
+    frame, board, corner = np.nonzero(seen)
+    points = np.stack([one.pose.transform(one.printed.corners) for one in boards])
     write_observations(truth / 'observations.csv', make_observations(
-        frame, corner, seen.uv[frame, corner], corners[corner]))
+        frame, board * points.shape[1] + corner, np.stack(uv)[frame, board, corner],
+        points[board, corner], board=board))
     write_poses(truth / 'poses.csv', np.arange(count), poses)

@@ -32,7 +32,7 @@ def board_views(
         azimuth, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(*np.log(ranges)))
         sine = np.sqrt(1 - cosine**2)
         sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
-        board = _facing(sight, rng)
+        board = facing(sight, rng)
         camera = Pose(board, distance * sight - board @ middle).inverse()
         if _whole(lens, camera.into_body(corners), printed):
             found.append(camera)
@@ -42,8 +42,8 @@ def board_views(
                         f'{ranges[1]:g} m; choose a smaller board or other ranges')
 
 
-def _facing(sight: Array, rng: np.random.Generator) -> Array:
-    """Return the turn of a board that looks back along `sight`, tilted and rolled at random."""
+def facing(sight: Array, rng: np.random.Generator) -> Array:
+    """Return the turn (3, 3) of a board that looks back along `sight`, tilted and rolled."""
     across = np.cross([0.0, 0.0, 1.0], sight)
     angle = np.arctan2(np.linalg.norm(across), sight[2])
     towards = rotation_from_vector(angle * across / max(float(np.linalg.norm(across)), 1e-12))

@@ -1,4 +1,4 @@
-"""Photographs of a board as a lens with a moving viewpoint takes them.
+"""Photographs of a board, or of several, as a lens with a moving viewpoint takes them.
 
 Each pixel's own ray, with its origin on the axis, is met with the board, which may be bowed; what
 is printed there is averaged over the pixel exactly for straight edges.  Blur, vignetting, gain,
@@ -7,9 +7,9 @@ noise, rolling shutter and errors of the print are what a camera and a printer a
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
 _BETWEEN = 3  # samples along each side of a pixel
 _ROUNDS = 6  # to meet a bowed board
@@ -62,6 +62,17 @@ class Print:
         return points
 
 
+class Placed(NamedTuple):
+    """A board and its pose in the target: one face of a cube, one wall of a room."""
+
+    printed: Print
+    pose: Pose
+
+    def true_corners(self) -> Array:
+        """Where the inner corners really are (N, 3), m, in the target's frame."""
+        return self.pose.transform(self.printed.true_corners())
+
+
 @dataclass(frozen=True)
 class Exposure:
     """What a camera makes of the light.
@@ -85,7 +96,7 @@ class Exposure:
 
 def render(
     lens: Lens,
-    printed: Print,
+    printed: Print | Sequence[Placed],
     camera: Pose,
     exposure: Exposure,
     rng: np.random.Generator,
@@ -93,6 +104,7 @@ def render(
 ) -> NDArray[np.uint8]:
     """Return a photograph (H, W) of a board from a camera's pose in the board's frame.
 
+    printed: also the boards of a target, in whose frame the camera is then; none may hide another.
     moved: what else moves the image of a place (..., 2), m, on the board, px (..., 2): effects
     that are not among the lens's own.  The same rng gives the same photograph.
     """
@@ -100,16 +112,13 @@ def render(
     uv = np.stack([u, v], axis=-1)
     theta = back_project(lens, uv).theta
     light = np.full(theta.shape, _ROOM)
-    window = _window(lens, printed, camera)
+    boards = [Placed(printed, identity())] if isinstance(printed, Print) else printed
+    window = _window(lens, boards, camera)
     part = uv[window]
     if part.size:
-        places = _seen_places(lens, printed, camera, exposure, part)
-        for _ in range(3 if moved is not None else 0):
-            # The image of a place is moved: look where the unmoved image of what is seen lies.
-            off = moved(_near(places, printed)) if moved is not None else 0.0
-            places = _seen_places(lens, printed, camera, exposure, part - off)
+        seen = sum(_of_board(lens, board, camera, exposure, part, moved) for board in boards)
         light[window] = _blurred(
-            _light(printed, places), theta[window], exposure, lens.max_incidence)
+            np.asarray(_ROOM + seen, np.float32), theta[window], exposure, lens.max_incidence)
     outwards = np.nan_to_num(theta / lens.max_incidence)
     light *= exposure.gain * (1 - exposure.vignetting * outwards**2)
     light *= 1 + (uv / lens.width - 0.5) @ np.array(exposure.slope)
@@ -120,37 +129,54 @@ def render(
     return np.asarray(np.clip(level, 0, 255), dtype=np.uint8)
 
 
-def _window(lens: Lens, printed: Print, camera: Pose) -> tuple[slice, slice]:
-    """Return the rows and columns in which the sheet lies, and a little more."""
-    low, high = np.array([-1.0, -1.0]) - printed.margin, printed.margin + np.array(
-        [printed.columns, printed.rows], dtype=float)
-    steps = np.linspace(0.0, 1.0, 25)
-    sheet = np.stack(np.meshgrid(*(low + steps[:, None] * (high - low)).T), axis=-1) * printed.size
-    height = np.zeros(sheet.shape[:2]) if printed.bow is None else printed.bow(sheet)
-    points = np.concatenate([sheet, height[..., None]], axis=-1).reshape(-1, 3)
-    image = project(lens, camera.into_body(points))
-    if not image.valid.all():
-        return slice(None), slice(None)
-    first = np.floor(image.uv.min(axis=0) - _AROUND).astype(int).clip(0)
-    last = np.ceil(image.uv.max(axis=0) + _AROUND).astype(int).clip(0)
-    return slice(first[1], last[1]), slice(first[0], last[0])
+def _window(lens: Lens, boards: Sequence[Placed], camera: Pose) -> tuple[slice, slice]:
+    """Return the rows and columns in which the sheets lie, and a little more."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for printed, place in boards:
+        first = np.array([-1.0, -1.0]) - printed.margin
+        last = printed.margin + np.array([printed.columns, printed.rows], dtype=float)
+        steps = np.linspace(0.0, 1.0, 25)
+        sheet = np.stack(np.meshgrid(*(first + steps[:, None] * (last - first)).T), axis=-1)
+        sheet *= printed.size
+        height = np.zeros(sheet.shape[:2]) if printed.bow is None else printed.bow(sheet)
+        points = np.concatenate([sheet, height[..., None]], axis=-1).reshape(-1, 3)
+        image = project(lens, camera.into_body(place.transform(points)))
+        if not image.valid.all():
+            return slice(None), slice(None)
+        low, high = np.minimum(low, image.uv.min(axis=0)), np.maximum(high, image.uv.max(axis=0))
+    low = np.floor(low - _AROUND).astype(int).clip(0)
+    high = np.ceil(high + _AROUND).astype(int).clip(0)
+    return slice(low[1], high[1]), slice(low[0], high[0])
+
+
+def _of_board(
+    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array, moved: Field | None
+) -> NDArray[np.float32]:
+    """Return what a board adds to the light of the parts of pixels uv (H, W, 2)."""
+    places = _seen_places(lens, board, camera, exposure, uv)
+    for _ in range(3 if moved is not None else 0):
+        # The image of a place is moved: look where the unmoved image of what is seen lies.
+        off = moved(_near(places, board.printed)) if moved is not None else 0.0
+        places = _seen_places(lens, board, camera, exposure, uv - off)
+    return _light(board.printed, places) - np.float32(_ROOM)
 
 
 def _seen_places(
-    lens: Lens, printed: Print, camera: Pose, exposure: Exposure, uv: Array
+    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array
 ) -> Array:
     """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
     flat = uv.reshape(-1, 2)
     parts = [
-        _seen_part(lens, printed, camera, exposure, flat[i:i + _CHUNK])
+        _seen_part(lens, board, camera, exposure, flat[i:i + _CHUNK])
         for i in range(0, len(flat), _CHUNK)
     ]
     return np.concatenate(parts).reshape(uv.shape)
 
 
 def _seen_part(
-    lens: Lens, printed: Print, camera: Pose, exposure: Exposure, uv: Array
+    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array
 ) -> Array:
+    printed = board.printed
     rays = back_project(lens, uv)
     origin, direction = rays.origin, rays.direction
     if exposure.line_time:
@@ -163,6 +189,7 @@ def _seen_part(
     else:
         origin = origin @ camera.rotation.T + camera.position
         direction = direction @ camera.rotation.T
+    origin, direction = board.pose.into_body(origin), direction @ board.pose.rotation
     height: Array | float = 0.0
     with np.errstate(divide='ignore', invalid='ignore'):
         for _ in range(_ROUNDS if printed.bow is not None else 1):

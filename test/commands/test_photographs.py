@@ -14,7 +14,7 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
-from fisheye_svp_ros.io.readers import read_observations, write_observations
+from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
@@ -136,3 +136,14 @@ def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
                          '--count', '2', '--bow', '1', '-o', str(tmp_path / name)]) == 0
     assert (tmp_path / 'one/001.png').read_bytes() == (tmp_path / 'two/001.png').read_bytes()
     assert len(read_observations(tmp_path / 'one/observations.csv').frames) == 2
+
+
+def test_the_truth_about_a_room(tmp_path: Path) -> None:
+    save_lens(LENS, tmp_path / 'lens.yaml')
+    assert cli.main(['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD, '--target',
+                     'room', '--count', '3', '-o', str(tmp_path)]) == 0
+    assert len(set(read_observations(tmp_path / 'observations.csv').board.tolist())) > 3
+    assert cli.main(['localize', str(tmp_path / 'observations.csv'), '--lens',
+                     str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'found')]) == 0
+    found, true = (read_poses(tmp_path / name).pose for name in ('found/poses.csv', 'poses.csv'))
+    assert np.abs(found.position - true.position).max() < 1e-6

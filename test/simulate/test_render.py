@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, true_corners
 
+from fisheye_svp_ros.detect.corner_fit import fit_corners
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.detect.points import find_points
+from fisheye_svp_ros.detect.points import find_points, local_axes
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
+from fisheye_svp_ros.simulate.targets import TARGETS, target_views, visible
 
 QUIET = Exposure(noise=0.0)
 PATTERN = parse_pattern(BOARD)
@@ -99,3 +101,31 @@ def test_blur_grows_outwards_and_light_falls_off() -> None:
 def test_a_board_that_does_not_fit_is_refused() -> None:
     with pytest.raises(GeometryError, match='does not see the whole board'):
         board_views(LENS, Print(60, 50, 0.03), 1, (0.1, 0.2), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize('kind', TARGETS)
+def test_corners_of_a_cube_and_a_room_are_where_they_are_said_to_be(kind: str) -> None:
+    boards = TARGETS[kind](Print(5, 5, 0.02))
+    pose = target_views(LENS, kind, boards, 1, (0.12, 0.16), np.random.default_rng(2)).take(0)
+    image = render(LENS, boards, pose, QUIET, np.random.default_rng(0)).astype(float)
+    uv, seen = visible(LENS, boards, pose)
+    assert (seen.sum(axis=1) > 3).sum() >= 2
+    checked = 0
+    for board, points, mine in zip(boards, uv, seen, strict=True):
+        if mine.sum() < 12:
+            continue
+        axes = local_axes(board.printed.corners[mine, :2], points[mine])
+        reach = 0.02 * np.abs(np.linalg.det(axes)) / np.linalg.norm(axes, axis=-1).max(axis=-1)
+        found = fit_corners(image, points[mine], axes, 0.7 * reach)
+        error = np.linalg.norm(found.uv - points[mine], axis=-1)[found.ok & (reach > 8)]
+        assert not len(error) or np.median(error) < 0.02
+        checked += len(error)
+    assert checked > 10
+
+
+def test_a_face_that_looks_away_is_not_seen() -> None:
+    boards = TARGETS['cube'](Print(5, 5, 0.02))
+    poses = target_views(LENS, 'cube', boards, 5, (0.12, 0.3), np.random.default_rng(1))
+    for i in range(5):
+        seen = visible(LENS, boards, poses.take(i))[1].any(axis=1).reshape(3, 2)
+        assert not seen.all(axis=1).any()
