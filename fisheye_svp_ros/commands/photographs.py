@@ -69,6 +69,10 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         say(line)
     if len(odd) > _SHOWN:
         say(f'and {len(odd) - _SHOWN} more such photographs')
+    found = sum(one.points is not None for one in detection.searched)
+    if 2 * found < len(detection.searched):
+        say(f'most photographs show no {args.board}: check kind and size of the board'
+            + (', which counts inner corners' if pattern.kind == 'chessboard' else ''))
     return detection
 
 

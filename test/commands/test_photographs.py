@@ -129,6 +129,16 @@ def test_real_photographs(
     assert figures['rms_px'] < rms
 
 
+def test_few_boards_may_be_another_board(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blank = np.full((LENS.height, LENS.width), 128, np.uint8)
+    write(tmp_path, [photograph(poses(1).take(0)), blank, blank + 1])
+    assert cli.main(['detect', str(tmp_path), '--board', BOARD]) == 0
+    said = capsys.readouterr().err
+    assert f'most photographs show no {BOARD}: check kind and size of the board' in said
+
+
 def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
     for name in ('one', 'two'):
