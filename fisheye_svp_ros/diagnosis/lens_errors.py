@@ -126,19 +126,20 @@ class LensErrors:
             lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, GONE)
             finest = entry['finest_px']
             rows = np.array(entry['landmarks'], dtype=float).reshape(-1, 5)
+            ids, boards = (np.array([*map(int, rows[:, i])], dtype=np.int64) for i in (0, 1))
             setting = Setting(
                 np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
-                np.nan if finest is None else float(finest), rows[:, 0].astype(np.int64),
-                rows[:, 1].astype(np.int64), rows[:, 2:])
+                np.nan if finest is None else float(finest), ids, boards, rows[:, 2:])
             names = tuple(map(str, entry['parameters']))
             covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
             found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']), names,
                         covariance, Variances(1.0, lam, np.zeros(0)), setting)
-        except (AttributeError, KeyError, TypeError, ValueError) as cause:
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as cause:
             raise LensError(f'lens {lens.name!r}: uncertainty is incomplete ({cause})') from cause
-        numbers = (found.noise, found.misfit, *covariance.ravel(), *setting.extents.ravel(),
-                   *setting.points.ravel(), *size)
-        if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows)):
+        numbers = (found.noise, found.misfit, *covariance.ravel(), *size)
+        wide = np.diff(setting.extents, axis=1) > 0
+        if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows) and wide.all()
+                and np.isfinite(setting.points).all() and (np.diag(covariance) >= 0).all()):
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
         return found
 

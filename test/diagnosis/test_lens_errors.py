@@ -180,6 +180,9 @@ def test_a_lens_without_errors_or_with_half_of_them_is_refused():
     with pytest.raises(LensError, match='no uncertainty'):
         LensErrors.of(replace(lens, uncertainty=None))
     for name, value in (('noise_px', -1.0), ('covariance', [[1.0]]), ('extent_px', None),
-                        ('landmarks', []), ('components', {'image_coarse': float('nan')})):
+                        ('landmarks', []), ('landmarks', [[float('nan'), 0, 0, 0, 0]]),
+                        ('extent_px', [[5.0, 5.0], [5.0, 9.0]]), ('noise_px', 10**400),
+                        ('covariance', (-np.eye(6)).tolist()),
+                        ('components', {'image_coarse': float('nan')})):
         with pytest.raises(LensError, match='uncertainty'):
             LensErrors.of(replace(lens, uncertainty={**lens.uncertainty, name: value}))
