@@ -25,7 +25,7 @@ from benchmark.soak.victims import KINDS, Victim, Watch  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.standalone import dds  # noqa: E402
 
-_AHEAD = 1000  # messages that a node has not counted yet, in the first round
+_AHEAD = 1000  # messages that a node has not counted, and sets that wait, in the first round
 _CHUNK = 100
 _LONG = 600.0  # s for all nodes to come up, on a machine that may be busy
 _STEADY = 0.2  # of a round, after which memory is compared
@@ -57,7 +57,7 @@ def _attacked(
     with progress('counted' if exactly else 'flooded', total) as advance:
         while pending := [v for v in everybody if v.alive() and v.hostile.total() < each]:
             watch.look(victims)
-            ready = [v for v in pending if not exactly or v.behind() < _AHEAD]
+            ready = [v for v in pending if not exactly or v.behind() + v.waiting() < _AHEAD]
             for victim in ready:
                 victim.attack(_CHUNK)
                 advance(_CHUNK)
@@ -135,7 +135,8 @@ def row(victim: Victim, answers_well: str) -> str:
     counts = victim.counts
     unusable = '' if victim.name == 'detector' else victim.unusable.total()
     dropped = victim.received('dropped')
-    sets = [counts.get(f'sets: {end}', '') for end in ('taken', 'solved', 'not solved')]
+    sets = [counts.get(f'sets: {end}', '')
+            for end in ('taken', 'solved', 'not solved', 'dropped', 'incomplete')]
     cells = (victim.name, victim.hostile.total(), victim.sent.total(), victim.lost.total(),
              victim.received(), victim.received('read'), unusable, dropped,
              *sets, counts.get('internal errors', ''), f'{grown(victim):.0f}', answers_well)
@@ -145,8 +146,9 @@ def row(victim: Victim, answers_well: str) -> str:
 def section(rounds: list[list[str]], total: int, how: str) -> str:
     """Return the section of docs/reliability.md."""
     head = ('| node | hostile | sent | lost by the sender | received | read | unusable | dropped '
-            '| sets taken | solved | not solved | internal errors | memory grown MB | answers |')
-    rule = '| --- ' + '| ---: ' * 12 + '| --- |'
+            '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
+            '| memory grown MB | answers |')
+    rule = '| --- ' + '| ---: ' * 14 + '| --- |'
     lines = [f'`{how}`: {total} hostile messages.', '', 'All counted:', '', head, rule, *rounds[0],
              '', 'Flooded, as nodes are by default:', '', head, rule, *rounds[1]]
     return '\n'.join(lines)

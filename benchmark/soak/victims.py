@@ -96,7 +96,7 @@ class Victim:
                     if end == 'subscription' or topic == 'landmarks':
                         at = f'qos_overrides.{self._space}/{topic}.{end}'
                         given += [f'{at}.history:=keep_all', f'{at}.reliability:=reliable']
-        self._log = folder / f'{self.name}.log'
+        self._log = folder / f'{self.name}_{exactly}.log'
         with self._log.open('ab') as log:
             self._process = subprocess.Popen(
                 [sys.executable, '-m', 'fisheye_svp_ros.cli', 'run', self.name, '--ros-args', '-r',
@@ -176,6 +176,10 @@ class Victim:
     def behind(self) -> int:
         """Return how many of the messages that were sent the node has not counted yet."""
         return self.sent.total() - self.lost.total() - self.received()
+
+    def waiting(self) -> int:
+        """Return how many sets the node has not come to yet."""
+        return self.counts.get('sets: waiting', 0)
 
     def measure(self) -> None:
         """Note the memory of the node and its children, MB."""

@@ -148,12 +148,17 @@ def triangulate_optimally(
     solved = levenberg_marquardt(problem, (start.points[valid],))
     _, (hessian, _) = problem.linearise(solved.state, np.arange(len(solved.cost)))
     uv, _ = problem.image(solved.state[0], np.arange(len(solved.cost)))
-    found = np.flatnonzero(valid)[solved.converged]
-    valid[valid] = solved.converged
+    # Rays that are parallel to the last digit say nothing of the depth.
+    fixed = solved.converged & np.isfinite(hessian).all(axis=(-2, -1))
+    hessian = np.where(fixed[:, None, None], hessian, np.eye(3))
+    fixed &= np.linalg.matrix_rank(hessian, hermitian=True) == 3
+    hessian[~fixed] = np.eye(3)
+    found = np.flatnonzero(valid)[fixed]
+    valid[valid] = fixed
 
     def filled(field: Array) -> Array:
         whole = np.full((len(valid), *field.shape[1:]), np.nan)
-        whole[found] = field[solved.converged]
+        whole[found] = field[fixed]
         return whole.reshape(*pairs.shape, *field.shape[1:])
 
     return OptimalPoints(

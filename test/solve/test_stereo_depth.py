@@ -277,3 +277,17 @@ def test_rays_that_meet_behind_one_camera_measure_nothing(behind):
     assert image[0].valid and image[1].valid
     solved = triangulate(model, model, pair, image[0].uv, image[1].uv)
     assert not solved.valid and np.isnan(solved.points).all() and np.isnan(solved.gap)
+
+
+def test_rays_that_are_parallel_to_the_last_digit_measure_nothing():
+    """Their information is singular."""
+    model = SVP['fish214']
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        uv = rng.uniform(300, 1200, (20, 2))
+        one = Pose(np.eye(3), np.array([10.0 ** -rng.integers(1, 20), 0, 0]))
+        for off in (0.0, 1e-13, 1e-9):
+            found = triangulate_optimally(
+                model, model, one, uv, uv + off * rng.standard_normal(uv.shape))
+            assert np.isfinite(found.covariance[found.valid]).all()
+            assert np.isnan(found.points[~found.valid]).all()
