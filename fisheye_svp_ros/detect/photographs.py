@@ -25,6 +25,7 @@ RECORDINGS = ('.mcap', '.db3')
 # Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
 _PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
 _COMPRESSED = '/compressed'
+_MOST_SCANS = 32  # of a JPEG, each of which may take as long as the whole image; ten are usual
 _PNG = b'\x89PNG\r\n\x1a\n'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
 _ORIENTATION = re.compile(
@@ -110,6 +111,8 @@ def decoded(data: bytes, name: str) -> Pixels:
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
         raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
+    if data[:2] == b'\xff\xd8' and data.count(b'\xff\xda') > _MOST_SCANS:
+        raise ObservationError(f'{name}: a JPEG of more than {_MOST_SCANS} scans')
     if data[:8] == _PNG and not _whole_chunks(data):
         raise ObservationError(f'{name}: the PNG ends before its image does; fetch it again')
     try:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
+from urllib.parse import quote
 
 from rosbags.interfaces import (
     Connection,
@@ -228,6 +231,9 @@ class Bag:
     def _read(self, note: Callable[[str], None]) -> Iterator[RawMessage]:
         """Yield the messages of a recording that has no checksums, or is compressed as files."""
         try:
+            for file in self._files():
+                if file.suffix == '.db3':
+                    _refuse_made_up(file)
             with Reader(self.path) as reader:
                 for connection, when, data in reader.messages():
                     yield RawMessage(connection.topic, connection.msgtype, when, bytes(data))
@@ -240,6 +246,21 @@ class Bag:
         text = read_text(about, BagError) if about.is_file() else ''
         found = re.search('compression_mode: *["\']?(message|file)', text, re.IGNORECASE)
         return found is not None
+
+
+def _refuse_made_up(file: Path) -> None:
+    """Raise BagError for a database whose cells are computed, or stand for more than they hold.
+
+    A few bytes of SQL can stand for gigabytes, and so can a number where a message ought to be.
+    """
+    address = f'file:{quote(str(file.absolute()))}?mode=ro'
+    with closing(sqlite3.connect(address, uri=True)) as database:
+        made_up = database.execute(
+            "SELECT 1 FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE c.hidden "
+            "OR m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL %' LIMIT 1").fetchone()
+        if made_up or database.execute(
+                "SELECT 1 FROM messages WHERE typeof(data) <> 'blob' LIMIT 1").fetchone():
+            raise BagError('its tables hold what no recording does')
 
 
 def _profile(offered: Offered) -> Qos:

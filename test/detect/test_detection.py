@@ -439,6 +439,15 @@ def test_a_png_that_announces_more_than_it_holds(tmp_path: Path) -> None:
             decoded(bytes(data), 'x')
 
 
+def test_a_jpeg_of_thousands_of_scans_is_not_decoded() -> None:
+    data = cv2.imencode('.jpg', np.zeros((48, 64), np.uint8),
+                        [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
+    assert decoded(data, 'x').shape == (48, 64)
+    again = data[data.rindex(b'\xff\xda'):-2]
+    with pytest.raises(ObservationError, match='more than 32 scans'):
+        decoded(data[:-2] + 40 * again + data[-2:], 'x')
+
+
 def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
     """In a process of its own: the bound holds from before OpenCV is loaded."""
     path, side = tmp_path / 'a.pgm', 20_000
