@@ -166,7 +166,8 @@ def moments(count: int, rng: random.Random) -> Iterator[float]:
 
 def tables(folder: Path) -> dict[str, bytes]:
     """Return the tables of a command's folder by name, as they are."""
-    return {name: (folder / name).read_bytes() for name in files(folder) if name.endswith('.csv')}
+    return {name: (folder / name).read_bytes() for name in files(folder)
+            if name.endswith('.csv') and not temporary([name])}
 
 
 def killed(
