@@ -272,7 +272,8 @@ def todo(trials: int, seed: int) -> list[tuple[str, int]]:
 def load() -> list[Trial]:
     """Return the trials that were run."""
     lines = KEPT.read_text().splitlines() if KEPT.is_file() else []
-    return [Trial(**json.loads(line)) for line in lines]
+    trials = [Trial(**json.loads(line)) for line in lines]
+    return list({(t.effect, t.size, t.seed): t for t in trials}.values())
 
 
 def report(trials: Sequence[Trial], size: float) -> str:

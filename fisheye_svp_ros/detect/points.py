@@ -66,7 +66,8 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     if not pattern.marker and len(index) == len(pattern.points):
         uv = _right_handed(uv, pattern)
     axes = local_axes(pattern.points[index, :2], uv)
-    reach = pattern.clearance * _outwards(_height(axes), pattern)
+    every = pattern.kind == 'chessboard' and len(index) == len(pattern.points)
+    reach = _least_square(uv, pattern) if every else pattern.clearance * _height(axes)
     if detector == 'circles':
         none = np.zeros(len(uv))
         whole = Corners(uv, none + np.nan, none, none, np.ones(len(uv), dtype=bool))
@@ -126,17 +127,21 @@ def _height(axes: Array) -> Array:
     return np.asarray(np.abs(np.linalg.det(axes)) / np.maximum(longer, 1e-9))
 
 
-def _outwards(height: Array, pattern: Pattern) -> Array:
-    """Return heights (M,) as they are on the outer side of a whole grid, where squares shrink.
+def _least_square(uv: Array, pattern: Pattern) -> Array:
+    """Return the height (M,), px, of the least square at each point of a whole grid.
 
-    Those of its sides are of half a square within, the next ones of a whole one.
+    Beyond the outer points squares are taken to go on shrinking as they do up to there.
     """
-    if len(height) != pattern.rows * pattern.columns:
-        return height
-    grid = height.reshape(pattern.rows, pattern.columns).copy()
-    for side in (grid, grid[::-1], grid.T, grid.T[::-1]):
-        side[0] *= np.minimum(side[0] / side[1], 1.0) ** 2
-    return grid.ravel()
+    grid = uv.reshape(pattern.rows, pattern.columns, 2)
+    right, down = np.diff(grid, axis=1), np.diff(grid, axis=0)
+    sides = np.stack([right[1:] + right[:-1], down[:, 1:] + down[:, :-1]], axis=-2) / 2
+    height = _height(sides)
+    for _ in range(2):
+        first, last = height[:1], height[-1:]
+        height = np.concatenate([first * np.minimum(first / height[1:2], 1), height,
+                                 last * np.minimum(last / height[-2:-1], 1)]).T
+    return np.asarray(np.minimum.reduce(
+        [height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]]).ravel())
 
 
 def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | None:

@@ -31,7 +31,7 @@ from fisheye_svp_ros.detect.photographs import (
     find_photographs,
     message_pixels,
 )
-from fisheye_svp_ros.detect.points import find_points
+from fisheye_svp_ros.detect.points import _least_square, find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
@@ -110,6 +110,13 @@ class TestCorners:
         assert not isinstance(points, str)
         error = points.uv - project(lens, pose.into_body(board.corners)).uv[points.ids]
         assert np.abs(error / points.sigma[:, None]).max() < 5
+
+    def test_outer_squares_are_smaller_than_the_last_ones_between_corners(self) -> None:
+        steps = 0.8 ** np.arange(PATTERN.columns)
+        u, v = np.meshgrid(100 * np.cumsum(steps), 200.0 * np.arange(PATTERN.rows))
+        least = _least_square(np.stack([u, v], axis=-1).reshape(-1, 2), PATTERN)
+        expected = 100 * 0.8 ** np.minimum(np.arange(1, PATTERN.columns + 1), PATTERN.columns)
+        assert least.reshape(PATTERN.rows, -1)[2] == pytest.approx(expected)
 
     def test_a_large_soft_image(self) -> None:
         pose = poses(3, 1).take(1)
