@@ -55,6 +55,8 @@ class _Storage(McapWriter):
         self.path = self.path.rename(path / f'{path.name}_0.mcap')
 
     def close_chunk(self) -> None:
+        if not self.chunk.msgs:  # rosbag2 plays nothing of a file that begins with such a chunk
+            return
         start, checksum = self.bio.tell(), zlib.crc32(self.chunk.bio.getbuffer())
         super().close_chunk()
         end = self.bio.tell()

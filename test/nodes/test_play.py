@@ -101,6 +101,8 @@ def test_who_comes_late_to_a_recording_that_is_played_hears_its_landmarks(
         now[0] += 4 * 10 ** 9 if now[0] == 10 ** 9 else 10 ** 8
 
     with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/image_points', CLOUD)
+        bag.flush()  # as the recorder does, which knows topics before their messages
         write_sets(bag, pause)
     g = graph('lens:=fish180', f'use_sim_time:={bool(more)}'.lower(), 'patience:=0.1')
     results = g.hear(DiagnosticArray, 'localizer/result')

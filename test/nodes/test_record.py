@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 import yaml
 from helpers.nodes import ROOT, NodeProcess, until
+from mcap.reader import make_reader
 
 pytest.importorskip('rosbags')
 from helpers import graph  # noqa: F401 - supplies the message packages
@@ -221,6 +222,19 @@ def test_reading_takes_little_memory_however_long_the_recording(tmp_path: Path) 
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert count == 40 and peak < 15e6
+
+
+def test_no_chunk_is_without_messages(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.add('/landmarks', CLOUD)
+        bag.flush()
+        bag.write('/scenario', DIAGNOSTICS, b'')
+        bag.flush()
+        bag.add('/image_points', CLOUD)
+    with (tmp_path / 'bag' / 'bag_0.mcap').open('rb') as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and len(summary.channels) == 3
+    assert [len(chunk.message_index_offsets) for chunk in summary.chunk_indexes] == [1]
 
 
 def test_a_recording_says_what_its_publishers_offered(tmp_path: Path) -> None:
