@@ -16,6 +16,8 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_text, write_text
 
+_LARGEST = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
+
 
 class CsvTable:
     """The cells of a CSV file by column, in any column order."""
@@ -57,8 +59,11 @@ class CsvTable:
         return self._columns[name]
 
     def numbers(self, *names: str) -> Array:
-        """Return columns as finite numbers, (N, len(names))."""
-        return np.stack([self._numbers(name) for name in names], axis=-1)
+        """Return columns as finite numbers (N, len(names)) of at most 1e12."""
+        values = np.stack([self._numbers(name) for name in names], axis=-1)
+        for name, column in zip(names, values.T, strict=True):
+            self.refuse(np.abs(column) > _LARGEST, name, f'a number of at most {_LARGEST:g}')
+        return values
 
     def whole(self, name: str, most: int = 2**53) -> Index:
         """Return a column of whole numbers (N,) from 0 to `most`."""

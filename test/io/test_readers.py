@@ -118,6 +118,7 @@ class TestObservationsCsv:
     @pytest.mark.parametrize(('row', 'says'), [
         ('0,6,nan,20,0,0,0', "u is 'nan'; a finite number"),
         ('0,6,10,20,inf,0,0', "x is 'inf'; a finite number"),
+        ('0,6,10,20,-1e308,0,0', "x is '-1e308'; a number of at most 1e+12"),
         ('0,6,10,abc,0,0,0', "v is 'abc'; a number"),
         ('0,6,10,,0,0,0', "v is ''; a number"),
         ('0,1.5,10,20,0,0,0', "landmark is '1.5'; a whole number"),
