@@ -186,12 +186,12 @@ def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) 
 
     allowed: variance of a row.
     """
-    with np.errstate(invalid='ignore'):
+    with np.errstate(divide='ignore', invalid='ignore'):  # where no view has a pose
         largest = np.nanmax(np.where(
             views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0), axis=1)
-    mean = found.cost / np.maximum(freedom, 1)
-    stands_out = largest > 2 * _STANDS_OUT**2 * mean
-    return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
+        mean = found.cost / np.maximum(freedom, 1)
+        stands_out = largest > 2 * _STANDS_OUT**2 * mean
+        return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
 
 
 def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: float) -> Pose:
@@ -246,7 +246,8 @@ def _spread_of(views: Views, found: Localization) -> Array:
     length = np.where(views.weight > 0, np.linalg.norm(found.residual, axis=-1), np.inf)
     count = (views.weight > 0).sum(axis=1)
     hidden = np.sqrt(count / np.maximum(count - 3, 1))
-    return np.asarray(_median(length * views.weight, views) / _MEDIAN * hidden)
+    with np.errstate(invalid='ignore'):  # no weight, no residual
+        return np.asarray(_median(length * views.weight, views) / _MEDIAN * hidden)
 
 
 def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:

@@ -5,6 +5,7 @@ import pytest
 
 from benchmark.poses import CASES, SCENES, SIGMA, UNTESTABLE, lost_minima, spoilt, tried
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import project
@@ -90,6 +91,15 @@ def test_an_estimated_noise_that_no_detector_has_is_doubted():
     found = localize_measured(model, table_of(views, range(6)))
     assert found.sigma > 2
     assert all('which no detector has' in reason for reason in found.reasons)
+
+
+@pytest.mark.filterwarnings('error')
+def test_another_lens_without_sigma_is_no_warning_of_numpy():
+    model, views, _ = spoilt('lens', 'room', 12, np.random.default_rng(0))
+    table = table_of(views, range(12))
+    some = np.sort(np.random.default_rng(0).permutation(len(table))[:-3])
+    with pytest.raises(GeometryError, match='fix a pose'):
+        localize_measured(model, table.take(some))
 
 
 def test_a_direction_that_is_missing_ends_no_search():
