@@ -124,7 +124,7 @@ def _torn_frames(
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
         offset = _offset(model, body.take(other).compose(place), views)
-        median = np.nanmedian(np.where(np.isfinite(offset), offset, 1e9), axis=1)
+        median = np.nanmedian(np.where(np.isinf(offset), 1e9, offset), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
         apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
     usual = float(np.median(misfit[several])) if several.any() else 0.0

@@ -48,6 +48,16 @@ def test_reversed_frames_are_found_among_cameras_that_fit_badly():
     assert torn == set(seen.reversed_frames) and len(torn) == 2
 
 
+def test_a_view_of_few_points_does_not_contradict_the_other_camera():
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    table = seen.table
+    few = (table.camera == 0) & (table.frame == 3) & (table.landmark >= 8)
+    data = prepare(table.take(~few))
+    first, *others = seen.lenses.values()
+    _, gross = find_gross_errors(data, start(data, first, others))
+    assert FRAME not in gross.why
+
+
 def test_what_the_user_knows_of_lenses_each_camera_of_a_rig_has_for_itself():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     data = prepare(seen.table)
