@@ -24,8 +24,8 @@ class Forms:
     """Effects in all their forms.
 
     effects: every form; at: the columns of each (a form of several cameras has those of each);
-    columns (F, M, K), whitened; generic (K,): those of the richest forms; count: forms by name;
-    untestable: why, by name.
+    columns (F, M, K), whitened; generic (K,): those of the richest forms, of equals all; count:
+    forms by name; untestable: why, by name.
     """
 
     effects: tuple[Effect, ...]
@@ -64,7 +64,8 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
                 richest += _longest_pauses(own)
             elif lasting := [form for form in own if not form.per_frame]:
                 # What every frame has anew would take up the frames' own variance.
-                richest.append(max(lasting, key=lambda form: len(form.parameters)))
+                most = max(len(form.parameters) for form in lasting)
+                richest += [form for form in lasting if len(form.parameters) == most]
     ends = np.cumsum([0, *(len(effect.parameters) for effect in effects)])
     at = [np.arange(*ends[i : i + 2]) for i in range(len(effects))]
     blocks = [linear.effect_columns(effect) for effect in effects]
