@@ -35,9 +35,9 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.lens_files import save_lens
     from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
     from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.pose import identity
     from fisheye_svp_ros.simulate.board_views import board_views
-    from fisheye_svp_ros.simulate.render import Exposure, Placed, Print
+    from fisheye_svp_ros.simulate.render import Exposure, Print
+    from fisheye_svp_ros.simulate.targets import board
 
     lens = Lens('example', 848, 800, 285.0, 285.3, 424.7, 398.2,
                 KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> None:
     poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
     with together():
-        write_photographs(lens, (Placed(printed, identity()),), poses, Exposure(), 0,
+        write_photographs(lens, board(printed), poses, Exposure(), 0,
                           args.output / 'photographs', truth)
         save_lens(lens, truth / 'lens.yaml')
         write_text(args.output / 'README.md', _README)

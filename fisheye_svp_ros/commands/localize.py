@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.solve.measured import MeasuredPoses
 
 _SHOWN = 40  # frames in the table for people
+_Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
 _AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 
@@ -40,7 +40,6 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
     from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
     from fisheye_svp_ros.commands.photographs import measured as read
-    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.measured import localize_measured
@@ -48,22 +47,26 @@ def run(args: argparse.Namespace) -> None:
     given = load_lenses(args.lens)
     observations, _ = read(args.observations, args)
     for camera, (name, lens) in enumerate(lenses_of(observations.cameras, given).items()):
-        model, parts = ForwardModel(lens), None
+        model, uncertainty = ForwardModel(lens), None
         table = observations.take(observations.camera == camera)
         with progress('localizing'):
             if args.model_error:
+                from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
+                from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
+
                 measured, parts = localize_with_errors(LensErrors.of(lens), table)
+                uncertainty = pose_summary(parts)
             else:
                 measured = localize_measured(model, table)
-        _print(measured, parts, ' '.join(filter(None, (args.observations, name))))
+        _print(measured, uncertainty, ' '.join(filter(None, (args.observations, name))))
         note_left_out(measured.left_out)
         note_doubtful(measured.views.frame.tolist(), measured.reasons)
         if args.output:
             with together():
-                _write(args.output / name, model, measured, parts)
+                _write(args.output / name, model, measured, uncertainty)
 
 
-def _print(measured: MeasuredPoses, parts: ErrorParts | None, source: str) -> None:
+def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> None:
     import numpy as np
 
     from fisheye_svp_ros.reporting.tables import noise_text, print_table
@@ -89,14 +92,12 @@ def _print(measured: MeasuredPoses, parts: ErrorParts | None, source: str) -> No
     )
     if len(views.frame) > _SHOWN:
         print(f'  and {len(views.frame) - _SHOWN} more frames')
-    said = noise_text(measured.sigma) if parts is None else _parts_text(parts)
+    said = noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty)
     print(f'  {said}, in the worst direction')
 
 
-def _parts_text(parts: ErrorParts) -> str:
-    from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
-
-    by = pose_summary(parts)['position_m']
+def _parts_text(uncertainty: _Parts) -> str:
+    by = uncertainty['position_m']
     shares = ', '.join(f'{words} {1000 * by[name]:.3g} mm' for name, words in (
         ('noise', 'noise'), ('parameters', 'parameters of the lens'),
         ('misfit', 'what remains without a name')))
@@ -104,11 +105,10 @@ def _parts_text(parts: ErrorParts) -> str:
 
 
 def _write(
-    folder: Path, model: ForwardModel, measured: MeasuredPoses, parts: ErrorParts | None
+    folder: Path, model: ForwardModel, measured: MeasuredPoses, uncertainty: _Parts | None
 ) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
     from fisheye_svp_ros.io.csv_table import write_table
     from fisheye_svp_ros.io.readers import write_poses
     from fisheye_svp_ros.io.results import write_json
@@ -147,5 +147,5 @@ def _write(
             {'frame': int(frame), 'reason': reason}
             for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
         ],
-        **({} if parts is None else {'uncertainty': pose_summary(parts)}),
+        **({} if uncertainty is None else {'uncertainty': uncertainty}),
     })

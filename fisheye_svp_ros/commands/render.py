@@ -52,10 +52,9 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.io.share import lens_path
-    from fisheye_svp_ros.pose import identity
     from fisheye_svp_ros.simulate.board_views import board_views
-    from fisheye_svp_ros.simulate.render import Exposure, Placed, Print
-    from fisheye_svp_ros.simulate.targets import TARGETS, target_views
+    from fisheye_svp_ros.simulate.render import Exposure, Print
+    from fisheye_svp_ros.simulate.targets import TARGETS, board, target_views
 
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
@@ -67,8 +66,7 @@ def run(args: argparse.Namespace) -> None:
     if args.bow:
         printed = Print(pattern.columns, pattern.rows, pattern.size,
                         bow=bowed(printed.corners, 1e-3 * args.bow))
-    boards = TARGETS[args.target](printed) if args.target in TARGETS else (
-        Placed(printed, identity()),)
+    boards = TARGETS.get(args.target, board)(printed)
     if args.poses:
         poses = read_poses(args.poses).pose
     elif len(boards) > 1:

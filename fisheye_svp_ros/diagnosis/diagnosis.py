@@ -54,8 +54,9 @@ _STEP_OVER_NOISE = 0.1
 class Diagnosis:
     """The answer; `before` and `after` are the linearised states for whoever draws them.
 
-    errors: of poses and image points by the extended lens; cameras: what each two cameras of a rig
-    say of each other; against: what another data set of the camera says.
+    errors: of poses and image points by the extended lens; uncertainty: their summary; cameras:
+    what each two cameras of a rig say of each other; against: what another data set of the camera
+    says.
     """
 
     verdict: str
@@ -78,6 +79,7 @@ class Diagnosis:
     lenses: dict[str, Lens]
     local: Local
     errors: ModelError
+    uncertainty: dict[str, dict[str, float]]
     cameras: list[TwoCameras]
     before: Linearised
     after: Linearised
@@ -116,7 +118,7 @@ class Diagnosis:
             'untestable': [{'effect': e, 'why': why} for e, why in self.untestable.items()],
             'gain': self.gain._asdict(),
             'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
-            'uncertainty': self.errors.summary(self.after),
+            'uncertainty': self.uncertainty,
             'trace': [asdict(step) for step in self.trace],
             **({'external': external} if external else {}),
         }
@@ -177,6 +179,7 @@ def _judged(
     noise_causes: list[Cause], cameras: list[TwoCameras], held_out: Observations | None,
 ) -> Diagnosis:
     evidence, errors = found.evidence, ModelError.of(found.evidence)
+    uncertainty = errors.summary(evidence.linear)
     components = measured.components({c.effect: c.p_value for c in noise_causes})
     causes = measured.causes(components) + noise_causes
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
@@ -207,10 +210,11 @@ def _judged(
         gain=measured.gain,
         intrinsics=measured.intrinsics,
         lenses=with_uncertainty(
-            errors, evidence.linear, measured.noise,
+            errors, evidence.linear, measured.noise, uncertainty['image_px']['misfit'],
             lambda state: extended_lenses(lenses, state, observations)),
         local=measured.local,
         errors=errors,
+        uncertainty=uncertainty,
         cameras=cameras,
         before=measured.before,
         after=evidence.linear,

@@ -33,14 +33,13 @@ _AT_ONCE = 500  # stereo points
 
 
 def with_uncertainty(
-    errors: ModelError, linear: Linearised, noise: float,
+    errors: ModelError, linear: Linearised, noise: float, misfit: float,
     lenses_of: Callable[[State], Mapping[str, Lens]],
 ) -> dict[str, Lens]:
     """Return the lenses of a diagnosis, each with what is known of its errors.
 
-    linear: the fit; noise, px; lenses_of: makes lenses of its state.
+    linear: the fit; noise, and misfit that remains, px; lenses_of: makes lenses of its state.
     """
-    misfit = errors.summary(linear)['image_px']['misfit']
     lenses, by = lenses_of(linear.state), {}
     for name in lenses:
         by[name] = np.zeros((len(_numbers(lenses[name])), len(errors.covariance)))

@@ -27,7 +27,7 @@ C = TypeVar('C', bound=Curve)
 
 _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
            'target', 'calibration', 'uncertainty', 'provenance'}
-_LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
+LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
@@ -124,7 +124,7 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
 def _read(path: str | Path) -> tuple[str, str]:
     """Return the text of a file and the camera after its name, as in FILE#cam1."""
     file, _, camera = str(path).rpartition('#') if '#' in str(path) else (str(path), '', '')
-    return read_text(file, LensError, _LARGEST), camera
+    return read_text(file, LensError, LARGEST), camera
 
 
 def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -10,11 +10,10 @@ import numpy as np
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
+from fisheye_svp_ros.io.lens_files import LARGEST
 from fisheye_svp_ros.io.lens_formats import radial, read_foreign
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 from fisheye_svp_ros.scene.observations import STEREO
-
-_LARGEST = 1 << 26  # bytes
 
 
 def save_rig(rig: Pose, path: str | Path, cameras: Sequence[str] = STEREO) -> None:
@@ -31,7 +30,7 @@ def load_rig(path: str | Path) -> Pose:
     Kalibr's camchain, Basalt, OpenCV's R and T, URDF, what `ros2 topic echo /tf_static` prints.
     Raises LensError, naming file and field, where there is none.
     """
-    text = read_text(path, LensError, _LARGEST)
+    text = read_text(path, LensError, LARGEST)
     foreign = read_foreign(path, text)
     if foreign is not None:
         if not foreign.rigs:

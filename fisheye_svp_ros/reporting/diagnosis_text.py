@@ -263,7 +263,7 @@ BUDGET_WORDS = ('part', 'stage')
 
 def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
     """Yield what noise, parameters and remaining misfit make uncertain, and all together."""
-    for name, parts in diagnosis.errors.summary(diagnosis.after).items():
+    for name, parts in diagnosis.uncertainty.items():
         label, factor, unit = _UNCERTAIN[name]
         sizes = (*parts.values(), math.hypot(*parts.values()))
         yield label, *(f'{factor * value:.3g}' for value in sizes), unit

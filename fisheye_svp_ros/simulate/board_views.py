@@ -27,13 +27,8 @@ def board_views(
     corners, middle = printed.true_corners(), printed.corners.mean(axis=0)
     found: list[Pose] = []
     for _ in range(count * _TRIES):
-        # Evenly over the sphere, so that the outer part of the image gets its share.
-        cosine = rng.uniform(np.cos(lens.max_incidence), 1.0)
-        azimuth, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(*np.log(ranges)))
-        sine = np.sqrt(1 - cosine**2)
-        sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
-        board = facing(sight, rng)
-        camera = Pose(board, distance * sight - board @ middle).inverse()
+        board, place = placed_in_sight(lens, ranges, rng)
+        camera = Pose(board, place - board @ middle).inverse()
         if _whole(lens, camera.into_body(corners), printed):
             found.append(camera)
         if len(found) == count:
@@ -42,7 +37,19 @@ def board_views(
                         f'{ranges[1]:g} m; choose a smaller board or other ranges')
 
 
-def facing(sight: Array, rng: np.random.Generator) -> Array:
+def placed_in_sight(
+    lens: Lens, ranges: tuple[float, float], rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return the turn (3, 3) of a board towards the camera, and a place (3,), m, in its sight."""
+    # Evenly over the sphere, so that the outer part of the image gets its share.
+    cosine = rng.uniform(np.cos(lens.max_incidence), 1.0)
+    azimuth, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(*np.log(ranges)))
+    sine = np.sqrt(1 - cosine**2)
+    sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
+    return _facing(sight, rng), distance * sight
+
+
+def _facing(sight: Array, rng: np.random.Generator) -> Array:
     """Return the turn (3, 3) of a board that looks back along `sight`, tilted and rolled."""
     across = np.cross([0.0, 0.0, 1.0], sight)
     angle = np.arctan2(np.linalg.norm(across), sight[2])

@@ -10,13 +10,18 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.simulate.board_views import facing
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.simulate.board_views import placed_in_sight
 from fisheye_svp_ros.simulate.render import Placed, Print
 
 _TRIES = 400  # a view
 _LEAST = 2  # boards of which something is seen
 _INSIDE = 0.3  # of half the room: how far from its middle the camera comes
+
+
+def board(printed: Print) -> tuple[Placed, ...]:
+    """Return one board, its own frame that of the target."""
+    return (Placed(printed, identity()),)
 
 
 def cube(printed: Print) -> tuple[Placed, ...]:
@@ -76,12 +81,8 @@ def target_views(
             camera = Pose(rotation_from_vector(rng.normal(size=3)),
                           _INSIDE * half * rng.uniform(-1, 1, 3))
         else:
-            cosine = rng.uniform(np.cos(lens.max_incidence), 1.0)
-            azimuth, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(*np.log(ranges)))
-            sine = np.sqrt(1 - cosine**2)
-            sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
-            turn = facing(sight, rng) @ rotation_from_vector(rng.normal(size=3))
-            camera = Pose(turn, distance * sight).inverse()
+            turn, place = placed_in_sight(lens, ranges, rng)
+            camera = Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
         if (visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _LEAST:
             found.append(camera)
         if len(found) == count:
