@@ -13,6 +13,7 @@ from fisheye_svp_ros.io.files import together
 if TYPE_CHECKING:
     from fisheye_svp_ros.arrays import Array
     from fisheye_svp_ros.diagnosis.calibration import Trust
+    from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
@@ -43,9 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
                         metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
                         + '; kannala_brandt by default')
-    parser.add_argument('--image-size', type=image_size, metavar='WxH',
-                        help='width and height of the image, px; photographs bring their own, and '
-                        'so do observations from `detect`')
+    parser.add_argument('--image-size', type=image_sizes, metavar='WxH',
+                        help='width and height of the image, px, for cameras whose images differ '
+                        'left=1280x960,right=640x480; photographs bring their own, and so do '
+                        'observations from `detect`')
     parser.add_argument('--free', type=_names, metavar='NAME,...',
                         help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
                         'model, those of a viewpoint shift (e0,e1,e2 or '
@@ -69,19 +71,22 @@ def run(args: argparse.Namespace) -> None:
     if args.lens and not (args.medium or args.port):
         raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
                              'water, or --port')
-    observations, size = measured(args.observations, args)
+    observations, sizes = measured(args.observations, args)
     if args.lens:
         air = load_lens(args.lens)
-        size = air.width, air.height
-    size = args.image_size or size or _size_beside(Path(args.observations))
-    if size is None:
+        sizes = {'': (air.width, air.height)}
+    sizes = args.image_size or sizes or _sizes_beside(Path(args.observations))
+    unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
+    if unknown:
+        head = f'{unknown[0]}=' if unknown[0] and sizes else ''
         raise ParameterError(f'{args.observations}: the size of the images is not known; add '
-                             '--image-size 1280x800')
+                             f'--image-size {head}1280x800')
     results: dict[str, Calibration] = {}
     trusts: dict[str, Trust] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
+        size = sizes.get(camera) or sizes['']
         results[camera] = _calibrated(table, args, size, name)
         trusts[camera] = _trusted(table, results[camera])
     # Written before a word is printed: nobody may be reading.
@@ -153,17 +158,23 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
             'turns back; another model may suit this lens')
 
 
-def _size_beside(path: Path) -> tuple[int, int] | None:
-    """Return the image size that `detect` wrote beside its observations."""
+def _sizes_beside(path: Path) -> dict[str, tuple[int, int]]:
+    """Return the image size of each camera that `detect` wrote beside its observations."""
     from fisheye_svp_ros.io.documents import read_json
 
     beside = path.with_suffix('.detect.json')
     if not beside.exists():
-        return None
-    match read_json(beside, ObservationError).get('image_size'):
-        case [int(width), int(height)] if width > 0 < height:
-            return width, height
-    raise ObservationError(f'{beside}: image_size is not two whole numbers; give --image-size')
+        return {}
+    document = read_json(beside, ObservationError)
+    entries = document.get('image_sizes', {'': document.get('image_size')})
+    sizes: dict[str, tuple[int, int]] = {}
+    for camera, entry in entries.items() if isinstance(entries, dict) else ():
+        match entry:
+            case [int(width), int(height)] if width > 0 < height:
+                sizes[camera] = width, height
+    if not sizes:
+        raise ObservationError(f'{beside}: image_sizes are no whole numbers; give --image-size')
+    return sizes
 
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:
@@ -179,8 +190,6 @@ def _rig(
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
-    import numpy as np
-
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.io.rig_files import save_rig
@@ -189,10 +198,11 @@ def _rig(
     from fisheye_svp_ros.study.solutions import calibrated
 
     left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
-    seen = [set(table.frame.tolist()) for table in (
-        observations.take(observations.camera == observations.cameras.index(name))
-        for name in names)]
-    both = observations.take(np.isin(observations.frame, sorted(seen[0] & seen[1])))
+    try:
+        both = _of_both(observations, {name: results[name].adjusted.lens for name in names})
+    except ObservationError as cause:
+        say(f'rig: {cause}')
+        return
     found = calibrated((left, right), *stereo_views(both))
     fitted, reason = found.solution, found.reasons[0]
     if reason and sigma_known(both):
@@ -202,6 +212,46 @@ def _rig(
           f'{place[2]:.3f} mm, from {len(both.frames)} frames')
     if folder:
         save_rig(fitted.rig.take(0), folder / 'rig.yaml', names)
+
+
+def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observations:
+    """Return the rows of the frames that both cameras of a rig have, without gross errors.
+
+    Raises ObservationError where there is no such frame, or no rig explains most of them.
+    """
+    from dataclasses import replace
+
+    import numpy as np
+
+    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.diagnosis.inputs import posable
+    from fisheye_svp_ros.diagnosis.model import prepare, start
+    from fisheye_svp_ros.diagnosis.moments import unrelated
+    from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
+
+    def shared(table: Observations) -> Observations:
+        one, other = (table.frame[table.camera == camera] for camera in (0, 1))
+        return table.take(np.isin(table.frame, np.intersect1d(one, other)))
+
+    first, second = map(observations.cameras.index, lenses)
+    pair = observations.take(np.isin(observations.camera, (first, second)))
+    pair = replace(pair, cameras=tuple(lenses), camera=(pair.camera == second).astype(np.int64))
+    both = shared(posable(pair, lenses)[0])
+    if not len(both):
+        raise ObservationError(f'{observations.source}: no frame was seen by both cameras; '
+                               'photographs of one moment must have one frame number')
+    data, (left, right) = prepare(both), lenses.values()
+    state = start(data, left, [right])
+    if unrelated(data, state):
+        raise ObservationError(
+            f'{observations.source}: none explains where {" and ".join(lenses)} stand in most '
+            'frames; photographs of one moment must have one frame number, others different ones')
+    _, gross = find_gross_errors(data, state)
+    torn = sorted({int(both.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
+                   if why == FRAME})
+    if torn:
+        say(f'rig: frames {", ".join(map(str, torn))} are left out: {FRAME}')
+    return shared(both.take(~np.isin(np.arange(len(both)), gross.rows)))
 
 
 def _print(result: Calibration, trust: Trust) -> None:
@@ -252,6 +302,12 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
         'stderr': trust.stderr,
         'admissible': {name: asdict(range_) for name, range_ in trust.admissible.items()},
     }
+
+
+def image_sizes(text: str) -> dict[str, tuple[int, int]]:
+    """Return the image size of each camera, or of all under '', of a text such as 1280x800."""
+    parts = [part.rpartition('=') for part in text.split(',')]
+    return {camera.strip(): image_size(size) for camera, _, size in parts}
 
 
 def image_size(text: str) -> tuple[int, int]:

@@ -72,6 +72,7 @@ def _document(detection: Detection, board: str) -> dict[str, Any]:
     return {
         'board': board,
         'image_size': list(detection.image_size),
+        'image_sizes': detection.image_sizes,
         'photographs': [
             {
                 'name': one.name, 'camera': one.camera, 'frame': frame,

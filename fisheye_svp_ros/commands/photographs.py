@@ -30,8 +30,10 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         help='take one of N photographs or video frames')
 
 
-def measured(path: str, args: argparse.Namespace) -> tuple[Observations, tuple[int, int] | None]:
-    """Return observations from a file, or from photographs, with the size of their images.
+def measured(
+    path: str, args: argparse.Namespace
+) -> tuple[Observations, dict[str, tuple[int, int]]]:
+    """Return observations from a file, or from photographs, with the image size of each camera.
 
     Raises ObservationError for anything missing or malformed, ParameterError for photographs
     without a board.
@@ -41,11 +43,11 @@ def measured(path: str, args: argparse.Namespace) -> tuple[Observations, tuple[i
 
     if args.board:
         detection = search([path], args)
-        return detection.observations, detection.image_size
+        return detection.observations, detection.image_sizes
     if is_photographs(Path(path)):
         raise ParameterError(f'{path}: these are photographs; say what they show, for example '
                              '--board chessboard:9x6:24mm')
-    return read_observations(path), None
+    return read_observations(path), {}
 
 
 def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:

@@ -55,15 +55,21 @@ class Searched:
 class Detection(NamedTuple):
     """observations of all photographs with a board; searched: all of them, in their order.
 
-    frame of each is that of its row in `frames` (S,), -1 without a board; image_size: width,
-    height; certainty (S,): of the order of corners, 1 where the board tells it, NaN unknown.
+    frame of each is that of its row in `frames` (S,), -1 without a board; image_sizes: width,
+    height of each camera; certainty (S,): of the order of corners, 1 where the board tells it, NaN
+    unknown.
     """
 
     observations: Observations
     searched: tuple[Searched, ...]
     frames: Index
-    image_size: tuple[int, int]
+    image_sizes: dict[str, tuple[int, int]]
     certainty: Array
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """Width and height, px, of the first camera's images."""
+        return next(iter(self.image_sizes.values()))
 
 
 class _Task(NamedTuple):
@@ -204,7 +210,8 @@ def _table(searched: tuple[Searched, ...], pattern: Pattern, source: str) -> Det
         searched = tuple(next(again) if one.points is not None else one for one in searched)
     frames = np.array([number[one.key] if one.points else -1 for one in searched])
     observations = _observations(found, pattern, cameras, number, source)
-    return Detection(observations, searched, frames, found[0].size, certainty)
+    sizes = {name: next(one.size for one in found if one.camera == name) for name in cameras}
+    return Detection(observations, searched, frames, sizes, certainty)
 
 
 def _agreed(

@@ -23,6 +23,7 @@ from fisheye_svp_ros.diagnosis.model import (
     prepare,
     start,
 )
+from fisheye_svp_ros.diagnosis.moments import each_alone, loose, unrelated
 from fisheye_svp_ros.diagnosis.noise import (
     find_gross_errors,
     quantisation_step,
@@ -149,8 +150,15 @@ def diagnose(
         observations = thinned(observations)
     progress('fitting the simulation as it is', 0.0)
     everything = prepare(observations, poses)
-    data, gross = find_gross_errors(everything, start(everything, first, others))
+    simulated = start(everything, first, others)
+    if unrelated(everything, simulated):
+        everything = each_alone(everything)
+        simulated = start(everything, first, others)
+    data, gross = find_gross_errors(everything, simulated)
     base = fit(data, start(data, first, others), free)
+    if loose(data, (first, *others), base, free):
+        data = each_alone(data)
+        base = fit(data, start(data, first, others), free)
     step = quantisation_step(observations.uv)
     rounded = step / np.sqrt(6) > _STEP_OVER_NOISE * rms_px(Linearised(data, base, free))
     if rounded:

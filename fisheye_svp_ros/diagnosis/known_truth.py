@@ -45,13 +45,13 @@ def known_errors(
     if after.data.cameras == 2 and not any(e.stage == 'target' for e, _ in after.state.terms):
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_trained(linear, free)) for linear in (before, after)] if measured else []
-    return {
-        name: compared(*(
-            np.concatenate([errors(held_out, state) for held_out, state in folds])
-            for folds in pairs
-        ))
+    found = {
+        name: [np.concatenate([errors(held_out, state) for held_out, state in folds])
+               for folds in pairs]
         for name, errors in measured.items()
     }
+    return {name: compared(*both) for name, both in found.items()
+            if np.isfinite(both[0] + both[1]).any()}
 
 
 def _trained(linear: Linearised, free: Sequence[str]) -> Iterator[tuple[Data, State]]:

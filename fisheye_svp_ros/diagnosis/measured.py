@@ -29,6 +29,7 @@ from fisheye_svp_ros.diagnosis.model import (
     prepare,
     start_poses,
 )
+from fisheye_svp_ros.diagnosis.moments import each_alone, posed_alone
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
     Gain,
@@ -83,6 +84,8 @@ class Measured:
         if held_out is not None:
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
+            if posed_alone(found.evidence.linear.data):
+                test = each_alone(test)
             solved = start_poses(test, self._there(test, found.state))
             self.test, self.test_gross = find_gross_errors(test, solved)
             self.test_pose = fit_poses(self.test, solved).pose

@@ -25,6 +25,7 @@ VIEW = 'the whole view is off: its points may be in another order'
 FRAME = 'its cameras contradict each other: points in another order, or another moment'
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
 _FRAME = 6.0  # times the median frame: cameras that contradict each other
+_FEW_TORN = 0.4  # of the views, at most
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _SETTLED = 0.1  # of the scale: how little predictions may move
@@ -110,14 +111,27 @@ def _torn_frames(
     board turned by half.  But then no pose of the rig explains two of them, whichever is asked to
     predict the other, as little as in most frames.
     """
+    if data.cameras < 2:
+        return np.zeros(len(data.frame_of), dtype=bool), np.zeros(data.views.used.shape)
+    misfit, apart = between_cameras(data, state, alone)
+    several = np.isfinite(misfit)
+    usual = float(np.median(misfit[several])) if several.any() else 0.0
+    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
+    return np.asarray(torn & (torn.mean() < _FEW_TORN)), apart
+
+
+def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array]:
+    """Return how far off, px, each view is from where another camera of its frame has it.
+
+    alone: poses (S,) of the views, each by itself; another camera is the one that predicts it
+    best, by the rig of the state.  Returns medians (S,), infinite where no other camera saw the
+    frame, and the distances (S, N) of all points.
+    """
     views, model = data.views, state.cameras
     apart = np.zeros(views.used.shape)
-    if data.cameras < 2:
-        return np.zeros(len(views.frame), dtype=bool), apart
     place = state.rig.take(data.camera_of)
     body = alone.compose(place.inverse())
     misfit = np.full(len(views.frame), np.inf)
-    several = np.bincount(data.frame_of)[data.frame_of] > 1
     for step in range(1, data.cameras):
         # From another view of the same frame: views are in the order of frames.
         other = np.arange(len(views.frame))
@@ -127,9 +141,7 @@ def _torn_frames(
         median = np.nanmedian(np.where(np.isinf(offset), 1e9, offset), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
         apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
-    usual = float(np.median(misfit[several])) if several.any() else 0.0
-    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
-    return np.asarray(torn & (torn.mean() < 0.2)), apart
+    return misfit, apart
 
 
 def set_aside(data: Data, mask: Mask) -> Data:

@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis.carried import (
 )
 from fisheye_svp_ros.diagnosis.known_truth import Compared, compared
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
+from fisheye_svp_ros.diagnosis.moments import posed_alone
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import Found
@@ -57,7 +58,8 @@ class TwoCameras:
 
     target: its shape found by one, tried on the other; rig: translation_m and rotation_rad, mean
     distance of a frame's rig from the middle of all, before and after; withdrawn: the causes that
-    were given up because the two contradict each other.
+    were given up because the two contradict each other; posed_alone: whether each view was posed
+    by itself, since the two did not keep their places, or were not photographed together.
     """
 
     cameras: tuple[str, str]
@@ -65,13 +67,15 @@ class TwoCameras:
     maps: Maps | None
     rig: dict[str, Compared]
     withdrawn: tuple[str, ...] = ()
+    posed_alone: bool = False
 
     @property
     def verdict(self) -> str:
         """Whether they agree on the target: agree, contradict, undecided; nothing: no shape."""
         if not self.target:
             return 'nothing'
-        apart = bool(self.rig) and all(moved.high < 0 for moved in self.rig.values())
+        apart = bool(self.rig) and not self.posed_alone and all(
+            moved.high < 0 for moved in self.rig.values())
         if apart or any(one.worse for one in self.target):
             return 'contradict'
         return 'agree' if all(one.better for one in self.target) else 'undecided'
@@ -83,7 +87,7 @@ class TwoCameras:
             'target': [one.to_dict() for one in self.target],
             'maps': self.maps and self.maps._asdict(),
             'rig': {name: value._asdict() for name, value in self.rig.items()},
-            'withdrawn': list(self.withdrawn),
+            'withdrawn': list(self.withdrawn), 'posed_alone': self.posed_alone,
         }
 
 
@@ -127,7 +131,9 @@ def two_cameras(found: Found, free: Sequence[str]) -> list[TwoCameras]:
     known = KnownTarget.of(data.views)
     cameras = [_alone(found, free, camera, known) for camera in range(data.cameras)
                if (data.camera_of == camera).sum() >= _FEWEST]
-    return [_compared(one, other, known) for one, other in combinations(cameras, 2)]
+    alone = posed_alone(data)
+    return [replace(_compared(one, other, known), posed_alone=alone)
+            for one, other in combinations(cameras, 2)]
 
 
 def _alone(found: Found, free: Sequence[str], camera: int, known: KnownTarget) -> _Camera:
@@ -209,14 +215,14 @@ def _scatter(
     if len(shared) < _FEWEST:
         return {}
     before, after = (
-        _deviations(one.take(first).inverse().compose(other.take(second)))
+        deviations(one.take(first).inverse().compose(other.take(second)))
         for one, other in zip(*poses, strict=True)
     )
     names = ('translation_m', 'rotation_rad')
     return {name: compared(b, a) for name, b, a in zip(names, before, after, strict=True)}
 
 
-def _deviations(rig: Pose) -> tuple[Array, Array]:
+def deviations(rig: Pose) -> tuple[Array, Array]:
     """Return how far (F,), m and rad, each rig is from the middle of all."""
     turn = vector_from_rotation(np.swapaxes(rig.rotation[:1], -1, -2) @ rig.rotation)
     place, angle = (

@@ -16,6 +16,8 @@ from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quant
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
 CARRIED_WORDS = ('found in', 'tried on', 'what')
 _APART, _MOST = 3.0, 4
+_ALONE = ('; they do not keep their places, or were not photographed at the same moments, so that '
+          'each view was posed by itself: nothing rests on their rig')
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'The two cameras as each other\'s truth'
 
@@ -79,8 +81,12 @@ def _agreement(pair: TwoCameras) -> str:
 
 
 def _rig(pair: TwoCameras) -> str:
-    if not pair.rig or pair.verdict in ('nothing', 'contradict'):
+    if pair.posed_alone:
+        return _ALONE
+    if pair.verdict in ('nothing', 'contradict'):
         return ''
+    if not pair.rig:
+        return '; too few frames were seen by both to say how their rig scatters'
     said = []
     for label, before, after, less in _rig_rows(pair.rig):
         said.append(f'{label} {before} before and {after} after ({less} less)')

@@ -57,7 +57,8 @@ def _overlay(pixels: np.ndarray, searched: Searched) -> np.ndarray:
 
 def write_coverage(detection: Detection, path: Path) -> None:
     """Draw all corners on the image, and, as a first calibration has them, angles and ranges."""
-    table, (width, height) = detection.observations, detection.image_size
+    table = detection.observations
+    width, height = np.max([*detection.image_sizes.values()], axis=0).tolist()
     with picture(path, 10.0, 4.5) as figure:
         image, field = figure.subplots(1, 2)
         image.plot(table.uv[:, 0], table.uv[:, 1], '.', color=OURS, markersize=2)
@@ -74,7 +75,7 @@ def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:
     table = detection.observations
     try:
         fitted = calibrate(table.take(table.camera == camera), 'kannala_brandt',
-                           detection.image_size)
+                           detection.image_sizes[name])
     except FisheyeSvpError:
         return
     views, lens = fitted.views, fitted.adjusted.lens

@@ -1,14 +1,23 @@
 """Two cameras that see one bent board say the same of it, and of where they stand."""
 
+import warnings
 from dataclasses import replace
 
+import numpy as np
+import pytest
+
 from benchmark.two_cameras import Hidden, pair
+from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.known_truth import known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare, start
 from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.reporting.external_text import sections
 
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
@@ -66,3 +75,48 @@ def test_what_the_user_knows_of_lenses_each_camera_of_a_rig_has_for_itself():
     effect = simplest_form(ViewpointShiftEffect, Linearised(data, state, ()).scene, state.labels)
     assert [parameter.name for parameter in effect.parameters] == ['left.e0', 'right.e0']
     assert effect.kinds == ('left.viewpoint_shift', 'right.viewpoint_shift')
+
+
+def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys):
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    both = np.intersect1d(*(seen.table.frame[seen.table.camera == i] for i in (0, 1)))
+    one, other = both[:2]
+    swapped = {one: other, other: one}
+    frame = [swapped.get(f, f) if camera else f for f, camera in
+             zip(seen.table.frame, seen.table.camera, strict=True)]
+    write_observations(tmp_path / 'rig.csv', replace(seen.table, frame=np.array(frame)))
+    words = ['calibrate', str(tmp_path / 'rig.csv'), '--image-size']
+    assert cli.main([*words, 'left=1280x960']) == 2
+    assert 'add --image-size right=1280x800' in capsys.readouterr().err
+    assert cli.main([*words, 'left=1280x960,right=1024x768', '-o', str(tmp_path / 'rig')]) == 0
+    assert f'frames {one}, {other} are left out' in capsys.readouterr().err
+    assert [load_lens(tmp_path / 'rig' / f'{name}.yaml').width for name in ('left', 'right')] == [
+        1280, 1024]
+    place = load_rig(tmp_path / 'rig' / 'rig.yaml').position
+    assert np.abs(np.linalg.norm(place) - 0.1205) < 0.003
+
+
+@pytest.mark.parametrize('late', [0.002, 0.0])
+def test_cameras_that_were_not_photographed_together(late):
+    seen = pair(replace(SMALL, reversed_frames=0, late=late), 1)
+    # Of another moment altogether: with the next frame's number.
+    table = seen.table if late else replace(
+        seen.table, frame=seen.table.frame + seen.table.camera)
+    found = diagnose(table, seen.lenses, wanted=Wanted(quick=True))
+    (said,) = found.cameras
+    assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
+    assert 'each view was posed by itself' in sections(found)[0].sentence
+    assert found.extended.heldout_rms_px < 0.15
+
+
+def test_cameras_without_a_common_frame():
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    apart = replace(seen.table, frame=seen.table.frame + 100 * seen.table.camera)
+    found = diagnose(apart, seen.lenses, wanted=Wanted(quick=True))
+    (said,) = found.cameras
+    assert said.verdict == 'agree' and said.maps.correlation > 0.95 and not said.rig
+    assert not said.posed_alone
+    assert 'too few frames were seen by both' in sections(found)[0].sentence
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert known_errors(found.before, found.after, ()) == {}

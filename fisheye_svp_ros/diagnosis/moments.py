@@ -1,0 +1,65 @@
+"""Cameras whose photographs are not of the same moments: each view is a frame of its own then."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit, start
+from fisheye_svp_ros.diagnosis.noise import between_cameras
+from fisheye_svp_ros.diagnosis.residuals import rms_px
+from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.effects.base import Untestable
+from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
+from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
+from fisheye_svp_ros.optics.lens import Lens
+
+_UNRELATED = 0.05  # of the image, by which most frames contradict a rig: none is there
+_LOOSE = 2.0  # times the misfit that each camera has by itself: they do not stand still
+_EXPLAINED = 1.1  # times that misfit, if an effect of a rig is all that moves them
+
+
+def each_alone(data: Data) -> Data:
+    """Return the data with a pose for every view, whatever rig the cameras are said to be."""
+    return replace(data, frame_of=np.arange(len(data.frame_of)))
+
+
+def posed_alone(data: Data) -> bool:
+    """Whether there are frames of several cameras that `each_alone` has taken apart."""
+    views = len(data.views.frame)
+    return data.frames == views > len(np.unique(data.views.frame))
+
+
+def unrelated(data: Data, state: State) -> bool:
+    """Whether no rig explains where the cameras stand in most frames that several of them saw."""
+    if data.cameras < 2 or data.poses is not None:
+        return False
+    misfit, _ = between_cameras(data, state, state.cameras.localize(data.views))
+    several = np.isfinite(misfit)
+    extent = float(np.ptp(data.views.uv[data.views.used], axis=0).max())
+    return bool(several.any() and np.median(misfit[several]) > _UNRELATED * extent)
+
+
+def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) -> bool:
+    """Whether the cameras do not keep their places, beyond what any effect of a rig allows.
+
+    lenses: as they were given; base: the fit of the data as a rig's.
+    """
+    shared = len(data.frame_of) > data.frames
+    if data.cameras < 2 or data.poses is not None or not shared:
+        return False
+    alone = each_alone(data)
+    posed = fit(alone, start(alone, lenses[0], lenses[1:]), free)
+    own = rms_px(Linearised(alone, posed, ()))
+    if rms_px(Linearised(data, base, ())) < _LOOSE * own:
+        return False
+    scene = Linearised(data, base, ()).scene
+    for kind in (RigFlexEffect, StereoTimeOffsetEffect):
+        try:
+            effect = kind.candidates(scene)[-1]
+        except Untestable:
+            continue
+        base = with_effect(base, effect, np.zeros(len(effect.parameters)))
+    return rms_px(Linearised(data, fit(data, base, free), ())) > _EXPLAINED * own
