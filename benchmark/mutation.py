@@ -1,9 +1,10 @@
 """Mutation study: how many of a random sample of small faults the tests find.
 
-`python -m benchmark.mutation --sample 300 --workers 2` changes one operator or number at a time in
-a copy of the tree, runs the tests of that room, and writes docs/mutation.md: what died, and each
-survivor with its change.  Mutants that the compiler cannot tell from the original (annotations,
-docstrings) are not drawn.  Interrupted runs go on where they were (--state).
+`python -m benchmark.mutation --sample 300` changes one operator or number at a time in a copy of
+the tree, runs the tests that reach it (`mutation_reach`), the quickest first and up to the first
+that fails, and writes docs/mutation.md: what died, and each survivor with its change.  Mutants
+that the compiler cannot tell from the original (annotations, docstrings) are not drawn.
+Interrupted runs go on where they were (--folder).
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ import os
 import random
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor, as_completed
-from itertools import islice
+from contextlib import suppress
+from importlib import import_module
+from itertools import accumulate, islice
+from multiprocessing import get_context
 from pathlib import Path
-from queue import SimpleQueue
+from types import ModuleType
 from typing import Any, NamedTuple
 
 from cosmic_ray.ast import ast_nodes, get_ast
@@ -31,18 +33,21 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator, operator_names
 from rich.progress import track
 
+from benchmark.mutation_reach import Reach, load, trace
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path('fisheye_svp_ros')
-# The tests that speak for a room, the quickest first.
-TESTS = {
-    'optics': ('optics', 'solve', 'simulate', 'effects'),
-    'scene': ('scene', 'io', 'solve', 'simulate', 'diagnosis'),
-    'solve': ('solve', 'study', 'commands/test_cli.py'),
-    'diagnosis': ('diagnosis', 'commands/test_diagnose_command.py'),
-    'io': ('io', 'scene', 'optics/test_lens.py', 'study/test_sweep.py', 'nodes/test_record.py',
-           'nodes/test_node_parameters.py', 'commands/test_cli.py'),
-    'nodes': ('nodes',),
+ROOMS = ('optics', 'scene', 'solve', 'diagnosis', 'io', 'nodes')
+# Compiled, or part of what is: tried uncompiled first, which spares a minute where that fails.
+COMPILED = {
+    'optics/formulas.py', 'optics/rays.py', *(f'optics/engines/{name}.py' for name in (
+        'kernels', 'adjustment', 'entries', 'marquardt')),
 }
+FORK = get_context('fork')
+# What the tests import of others, loaded once for all mutants.
+PRELOADED = ('pytest', 'hypothesis', 'numpy', 'scipy.optimize', 'scipy.stats', 'scipy.spatial',
+             'scipy.sparse.linalg', 'numba', 'cv2', 'matplotlib.pyplot', 'rosbags.highlevel', 'yaml',
+             'pyarrow.parquet', 'cyclonedds.domain', 'rich.console', 'jinja2')
 KINDS = {
     'NumberReplacer': 'a number one off',
     'ReplaceComparisonOperator': 'another comparison',
@@ -68,7 +73,7 @@ class Mutant(NamedTuple):
         return Path(self.path).parts[1]
 
 
-def mutants_of(path: Path) -> Iterator[Mutant]:
+def mutants_of(tree: Path, path: Path) -> Iterator[Mutant]:
     """Yield every mutant of a file."""
     nodes = list(ast_nodes(get_ast(path.read_text(encoding='utf-8'))))
     for name in operator_names():
@@ -78,12 +83,12 @@ def mutants_of(path: Path) -> Iterator[Mutant]:
             continue
         starts = [start for node in nodes for start, _ in operator.mutation_positions(node)]
         for occurrence, (line, column) in enumerate(starts):
-            yield Mutant(str(path.relative_to(ROOT)), line, column, name, occurrence)
+            yield Mutant(str(path.relative_to(tree)), line, column, name, occurrence)
 
 
-def changes_meaning(mutant: Mutant) -> bool:
+def changes_meaning(mutant: Mutant, tree: Path) -> bool:
     """Say whether a mutant changes what the file computes."""
-    source = (ROOT / mutant.path).read_text(encoding='utf-8')
+    source = (tree / mutant.path).read_text(encoding='utf-8')
     try:
         changed = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
     except AttributeError:  # cosmic-ray replaces no exception of a dotted name
@@ -109,65 +114,108 @@ def _meaning(source: str) -> str:
     return ast.dump(tree)
 
 
-def sample(count: int, seed: int) -> list[Mutant]:
+def sample(count: int, seed: int, tree: Path) -> list[Mutant]:
     """Return mutants that change what is computed: random places, at each a random operator."""
     places: dict[tuple[str, int, int], list[Mutant]] = {}
-    for room in TESTS:
-        for path in sorted((ROOT / PACKAGE / room).rglob('*.py')):
-            for mutant in mutants_of(path):
+    for room in ROOMS:
+        for path in sorted((tree / PACKAGE / room).rglob('*.py')):
+            for mutant in mutants_of(tree, path):
                 places.setdefault(mutant[:3], []).append(mutant)
     rng = random.Random(seed)
     drawn = [rng.choice(mutants) for mutants in places.values()]
     rng.shuffle(drawn)
-    return list(islice(filter(changes_meaning, drawn), count))
+    return list(islice((one for one in drawn if changes_meaning(one, tree)), count))
 
 
-def survives(mutant: Mutant, tree: Path, patience: float) -> bool:
-    """Run the tests of the room on a copy of the tree with one fault in it."""
+def verdict(tests: list[str], compiled: bool, tree: Path, budget: float, seconds: list[float],
+            log: Path) -> str:
+    """Say what the tests, the quickest first, make of the fault in a copy of the tree.
+
+    'survived', 'survived N s of tests' where that is not all that reach it, 'nothing reaches it',
+    'hung', or the test that found it.
+    """
+    if not tests:
+        return 'nothing reaches it'
+    within = max(1, sum(total <= budget for total in accumulate(seconds)))
+    chosen, patience = tests[:within], 120.0 + 4.0 * sum(seconds[:within])
+    kinds = [{'NUMBA_DISABLE_JIT': '1'}] if compiled else []
+    for environment in [*kinds, {'NUMBA_DISABLE_JIT': '0'}]:
+        found = _failing(chosen, tree, environment, patience, log)
+        if found and (found != 'hung' or environment['NUMBA_DISABLE_JIT'] == '0'):
+            return found
+    return 'survived' if within == len(tests) else f'survived {budget:g} s of tests'
+
+
+def _failing(tests: list[str], tree: Path, environment: dict[str, str], patience: float,
+             log: Path) -> str:
+    """Return the first test that fails, 'hung', or nothing, in a process that is forked."""
+    child = FORK.Process(target=_run_tests, args=(tests, tree, environment, log))
+    child.start()
+    child.join(patience)
+    hung = child.exitcode is None
+    with suppress(ProcessLookupError):
+        os.killpg(child.pid or 0, signal.SIGKILL)  # with what tests have started
+    child.join()
+    if hung or child.exitcode == 0:
+        return 'hung' if hung else ''
+    lines = log.read_text(encoding='utf-8', errors='replace').splitlines()
+    failed = [line for line in lines if line.startswith(('FAILED ', 'ERROR '))]
+    return failed[0].split(' ', 1)[1].split(' - ')[0] if failed else f'exit {child.exitcode}'
+
+
+def _run_tests(tests: list[str], tree: Path, environment: dict[str, str], log: Path) -> None:
+    os.setsid()
+    with log.open('wb') as stream:
+        for descriptor in (1, 2):
+            os.dup2(stream.fileno(), descriptor)
+    os.chdir(tree)
+    sys.path.insert(0, str(tree))
+    for name in [name for name in sys.modules if name.startswith('benchmark')]:
+        del sys.modules[name]
+    sys.modules['__main__'] = ModuleType('__main__')  # which processes of the tests import, too
+    os.environ |= environment | {'PYTHONPATH': str(tree), 'OMP_NUM_THREADS': '1'}
+    sys.dont_write_bytecode = True  # a fault may have the size and the second of its original
+    os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
+    if (numba := sys.modules.get('numba')) is not None:
+        numba.config.DISABLE_JIT = int(environment['NUMBA_DISABLE_JIT'])
+    import pytest
+    os._exit(int(pytest.main(['-x', '-q', '-p', 'no:cacheprovider', *tests])))
+
+
+def attempt(mutant: Mutant, tree: Path, reach: Reach, budget: float) -> str:
+    """Put one fault into the tree, run the tests that reach it, and take it out again."""
     target = tree / mutant.path
-    source = target.read_text(encoding='utf-8')
+    source, times = target.read_text(encoding='utf-8'), target.stat()
+    tests = reach.of(tree, mutant.path, mutant.line)
     operator = get_operator(mutant.operator)()
     target.write_text(mutate_code(source, operator, mutant.occurrence), encoding='utf-8')
-    paths = [str(path) for name in TESTS[mutant.room] if (path := tree / 'test' / name).exists()]
-    command = [sys.executable, '-m', 'pytest', '-x', '-q', '-p', 'no:cacheprovider', *paths]
-    environment = os.environ | {
-        'PYTHONPATH': str(tree), 'OMP_NUM_THREADS': '1', 'PYTHONDONTWRITEBYTECODE': '1',
-    }
-    process = subprocess.Popen(command, cwd=tree, env=environment, stdout=subprocess.DEVNULL,
-                               stderr=subprocess.DEVNULL, start_new_session=True)
-    try:
-        return process.wait(patience) == 0
-    except subprocess.TimeoutExpired:
-        os.killpg(process.pid, signal.SIGKILL)  # a fault that hangs is found, too
-        process.wait()
-        return False
-    finally:
-        target.write_text(source, encoding='utf-8')
+    with tempfile.TemporaryDirectory() as folder:
+        compiled = mutant.path.removeprefix(f'{PACKAGE}/') in COMPILED
+        if compiled:
+            os.environ['XDG_CACHE_HOME'] = folder
+        try:
+            return verdict(tests, compiled, tree, budget, [reach.seconds[one] for one in tests],
+                           Path(folder, 'log'))
+        finally:
+            os.environ.pop('XDG_CACHE_HOME', None)
+            target.write_text(source, encoding='utf-8')
+            os.utime(target, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
-def run(mutants: list[Mutant], workers: int, patience: float, state: Path) -> dict[str, bool]:
-    """Try every mutant that `state` does not know yet; return which ones survived, by key."""
-    known: dict[str, bool] = json.loads(state.read_text()) if state.exists() else {}
+def run(mutants: list[Mutant], folder: Path, budget: float) -> dict[str, str]:
+    """Try every mutant that the folder does not know yet; return the verdicts by key."""
+    state, tree = folder / 'verdicts.jsonl', folder.resolve() / 'tree'
+    known: dict[str, str] = dict(
+        json.loads(line) for line in state.read_text().splitlines()) if state.exists() else {}
     open_ones = [mutant for mutant in mutants if _key(mutant) not in known]
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(workers) as pool:
-        trees: SimpleQueue[Path] = SimpleQueue()
-        for number in range(workers):
-            tree = Path(folder, str(number))
-            shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns('.venv*', '.git', 'out'))
-            trees.put(tree)
-
-        def attempt(mutant: Mutant) -> tuple[Mutant, bool]:
-            tree = trees.get()
-            try:
-                return mutant, survives(mutant, tree, patience)
-            finally:
-                trees.put(tree)
-
-        tried = as_completed([pool.submit(attempt, mutant) for mutant in open_ones])
-        for future in track(tried, 'mutants', total=len(open_ones)):
-            mutant, survived = future.result()
-            known[_key(mutant)] = survived
-            state.write_text(json.dumps(known, indent=1))
+    reach = load(tree, folder / 'reach')
+    for name in PRELOADED:
+        with suppress(ImportError):
+            import_module(name)
+    with state.open('a', encoding='utf-8') as stream:
+        for mutant in track(open_ones, 'mutants'):
+            known[_key(mutant)] = attempt(mutant, tree, reach, budget)
+            print(json.dumps([_key(mutant), known[_key(mutant)]]), file=stream, flush=True)
     return known
 
 
@@ -179,20 +227,21 @@ def _kind(operator: str) -> str:
     return next((text for name, text in KINDS.items() if name in operator), 'another fault')
 
 
-def report(mutants: list[Mutant], survived: dict[str, bool], command: str) -> str:
+def report(mutants: list[Mutant], verdicts: dict[str, str], command: str) -> str:
     """Return the page: a table by room, and the survivors by kind."""
-    rooms: dict[str, Counter[bool]] = {room: Counter() for room in TESTS}
-    alive: dict[str, list[Mutant]] = {}
+    rooms: dict[str, Counter[bool]] = {room: Counter() for room in ROOMS}
+    alive: dict[str, list[tuple[Mutant, str]]] = {}
     for mutant in mutants:
-        lives = survived[_key(mutant)]
+        said = verdicts[_key(mutant)]
+        lives = said.startswith(('survived', 'nothing'))
         rooms[mutant.room][lives] += 1
         if lives:
-            alive.setdefault(_kind(mutant.operator), []).append(mutant)
+            alive.setdefault(_kind(mutant.operator), []).append((mutant, said))
     total: Any = sum(rooms.values(), Counter())
     lines = [
         '# Which faults the tests find', '',
         f'`{command}` puts one small fault at a time into a copy of the package and runs the '
-        'tests of its room.', '',
+        'tests that reach it.', '',
         '| room | mutants | found | share |', '|---|---|---|---|',
     ]
     for room, count in [*rooms.items(), ('all', total)]:
@@ -202,8 +251,8 @@ def report(mutants: list[Mutant], survived: dict[str, bool], command: str) -> st
     for kind, ones in sorted(alive.items()):
         lines += ['', f'## Not found: {kind}', '']
         lines += [
-            f'- `{m.path}`, line {m.line}: {m.operator.removeprefix("core/")}'
-            for m in sorted(ones)
+            f'- `{m.path}`, line {m.line}: {m.operator.removeprefix("core/")}, {said}'
+            for m, said in sorted(ones)
         ]
     return '\n'.join(lines) + '\n'
 
@@ -213,16 +262,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--sample', type=int, default=300)
     parser.add_argument('--seed', type=int, default=1)
-    parser.add_argument('--workers', type=int, default=2)
-    parser.add_argument('--patience', type=float, default=600.0, help='s a mutant may take')
-    parser.add_argument('--state', type=Path, default=Path('out/mutation.json'))
+    parser.add_argument('--budget', type=float, default=60.0, help='s of tests a mutant')
+    parser.add_argument('--folder', type=Path, default=Path('out/mutation'), help='goes on here')
     parser.add_argument('-o', '--output', type=Path, default=ROOT / 'docs/mutation.md')
     args = parser.parse_args()
-    mutants = sample(args.sample, args.seed)
-    args.state.parent.mkdir(parents=True, exist_ok=True)
-    survived = run(mutants, args.workers, args.patience, args.state)
+    tree = args.folder.resolve() / 'tree'
+    if not tree.exists():
+        shutil.copytree(ROOT, tree, ignore=shutil.ignore_patterns('.venv*', '.git', 'out'))
+    trace(tree, args.folder / 'reach')
+    mutants = sample(args.sample, args.seed, tree)
+    verdicts = run(mutants, args.folder, args.budget)
     command = f'python -m benchmark.mutation --sample {args.sample} --seed {args.seed}'
-    args.output.write_text(report(mutants, survived, command), encoding='utf-8')
+    args.output.write_text(report(mutants, verdicts, command), encoding='utf-8')
 
 
 if __name__ == '__main__':

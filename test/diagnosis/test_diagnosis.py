@@ -10,7 +10,7 @@ from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import thinned
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
-from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors, quantisation_step
+from fisheye_svp_ros.diagnosis.noise import VIEW, Gross, find_gross_errors, quantisation_step
 from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -149,6 +149,20 @@ def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
     gross = find_gross_errors(data, start(data, lens()))[1]
     assert 40 in gross.rows.tolist()
     assert gross.px[gross.rows == 40] == pytest.approx(10 * SIGMA * np.sqrt(2), rel=0.3)
+
+
+@pytest.mark.parametrize(('bad', 'named'), [([7], True), ([1, 4, 7, 11, 15, 19, 22], False)])
+def test_a_view_is_off_as_a_whole_where_most_are_not(bad, named):
+    rng = np.random.default_rng(17)
+    pose, views = scene(rng)
+    clean = observe(lens(), (), pose, views, SIGMA, rng)
+    off = 30 * rng.normal(size=clean.uv.shape) * np.isin(clean.frame, bad)[:, None]
+    data = prepare(replace(clean, uv=clean.uv + off))
+    gross = find_gross_errors(data, start(data, lens()))[1]
+    assert (VIEW in gross.why) == named
+    frames = {int(clean.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
+              if why == VIEW}
+    assert frames == (set(bad) if named else set())
 
 
 def test_quantisation_is_read_off_the_numbers():

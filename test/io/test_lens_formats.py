@@ -186,6 +186,9 @@ def test_boofcv() -> None:
     (CAMCHAIN.replace('158.0', '0', 1), 'no numbers of a lens'),
     (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r"camera_model is"),
     (CAMCHAIN.replace('0.00020293673', '1e300'), 'must be a list of 4 finite numbers'),
+    (CAMCHAIN.replace('T_cn_cnm1:\n  - [ 0.99998854, 0.00216014, 0.00427195,-0.11003785]',
+                      'T_cn_cnm1:\n  - [{}, 0.00216014, 0.00427195,-0.11003785]'),
+     'T_cn_cnm1 must be a matrix of 4 x 4'),
     (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
     ('{"camera_type": 1}', 'not a whole Basalt'),
     ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
@@ -245,7 +248,7 @@ URDF = """<?xml version="1.0"?>
 """
 
 
-def of_opencv(folder: Path, suffix: str) -> Path:
+def of_opencv(folder: Path, suffix: str, shape: tuple[int, int] = (3, 1)) -> Path:
     path = folder / f'stereo{suffix}'
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     storage.write('image_width', 848)
@@ -255,9 +258,13 @@ def of_opencv(folder: Path, suffix: str) -> Path:
             [[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]]))
         storage.write(f'D{number}', np.array([lens.image_height.coefficients[:4]]).T)
     storage.write('R', RIG.rotation)
-    storage.write('T', RIG.position[:, None])
+    storage.write('T', RIG.position.reshape(shape))
     storage.release()
     return path
+
+
+def of_opencv_in_a_row(folder: Path, suffix: str) -> Path:
+    return of_opencv(folder, suffix, (1, 3))
 
 
 def of_urdf(folder: Path, suffix: str) -> Path:
@@ -289,8 +296,8 @@ def of_ours(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize(('write', 'suffix'), [
-    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_urdf, '.urdf'), (of_tf, '.yaml'),
-    (of_ours, '.yaml'),
+    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_opencv_in_a_row, '.yml'),
+    (of_urdf, '.urdf'), (of_tf, '.yaml'), (of_ours, '.yaml'),
 ])
 def test_rigs(tmp_path: Path, write: Callable[[Path, str], Path], suffix: str) -> None:
     rig = load_rig(write(tmp_path, suffix))

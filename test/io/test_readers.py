@@ -124,6 +124,7 @@ class TestObservationsCsv:
         ('0,1.5,10,20,0,0,0', "landmark is '1.5'; a whole number"),
         ('0,-1,10,20,0,0,0', "landmark is '-1'; a whole number from 0"),
         ('1e30,4,10,20,0,0,0', "frame is '1e30'; a whole number"),
+        ('0,4294967296,10,20,0,0,0', "landmark is '4294967296'; a whole number from 0"),
         ('first,4,10,20,0,0,0', "frame is 'first'; a number"),
         ('0,4,10,20,0,0', '6 fields where the header has 7'),
         ('0,4,10,20,0,0,0,0', '8 fields where the header has 7'),
@@ -131,6 +132,11 @@ class TestObservationsCsv:
     ])
     def test_bad_row(self, csv, row, says):
         fails(csv(f'{HEADER}\n0,4,1,2,3,4,5\n\n0,5,1,2,3,4,5\n{row}\n'), 'line 5', says)
+
+    def test_the_largest_numbers(self, csv):
+        table = read_observations(csv(f'{HEADER}\n{2**53},{2**32 - 1},1,2,-1e12,4,1e12\n'))
+        assert (table.frame[0], table.landmark[0]) == (2**53, 2**32 - 1)
+        assert table.xyz[0].tolist() == [-1e12, 4.0, 1e12]
 
     @pytest.mark.parametrize(('name', 'cell', 'says'), [
         ('sigma', '0', "sigma is '0'; a number above 0"),

@@ -100,6 +100,13 @@ def test_a_shared_parameter_that_the_blocks_absorb_carries_no_information(rows):
     assert np.all(np.abs(eigenvalue) < 1e-9 * np.diagonal(normal[2], axis1=1, axis2=2)[:, 0])
     (block_step, shared_step), _ = arrow_step(normal, np.zeros(SYSTEMS))
     assert np.all(np.isfinite(block_step)) and np.all(np.isfinite(shared_step))
+    covariance = arrow_covariance(normal).shared
+    for s in range(SYSTEMS):
+        known = in_full(block, shared[..., 1:], s)
+        full = np.linalg.inv(known.T @ known)
+        np.testing.assert_allclose(covariance[s, 1:, 1:], full[1 - SHARED:, 1 - SHARED:], rtol=1e-6)
+        step = np.linalg.lstsq(known, -residual[s].ravel(), rcond=None)[0]
+        np.testing.assert_allclose(shared_step[s, 1:], step[1 - SHARED:], rtol=1e-6)
 
 
 def test_systems_do_not_mix(rows):

@@ -1,0 +1,175 @@
+"""Which tests reach a line of the package, and how long each takes: what a mutant is tried on.
+
+One run of the suite under coverage, a context a test, tells the tests of every line, in processes
+that a test starts, too.  What Numba compiles is traced uncompiled.
+"""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from coverage import CoverageData
+
+# Traced one after the other, so that an interrupted trace goes on where it was.
+GROUPS = {
+    'numbers': ['optics', 'scene', 'io', 'effects', 'simulate', 'solve', 'study', 'test_pose.py',
+                'test_library.py', 'test_registry.py'],
+    'uncompiled': ['optics', 'solve/test_least_squares.py', '-k', 'numba or engine or compiled'],
+    'diagnosis': ['diagnosis'],
+    'nodes': ['nodes'],
+    'commands': ['commands', 'detect', 'reporting', 'paper'],
+}
+_SETTINGS = """[run]
+include = {tree}/fisheye_svp_ros/*
+parallel = True
+patch = subprocess
+context = ${{PYTEST_CURRENT_TEST-}}
+data_file = {folder}/{group}
+disable_warnings = no-data-collected, module-not-measured, already-imported
+"""
+_DURATION = re.compile(r'([\d.]+)s (?:call|setup|teardown) +(test/.*)')
+_PHASE = re.compile(r'\|(run|setup|teardown)$| \((call|setup|teardown)\)$')
+
+
+class Reach(NamedTuple):
+    """Tests by file and line, and the seconds that each test takes."""
+
+    tests: dict[str, dict[int, set[str]]]
+    seconds: dict[str, float]
+
+    def of(self, tree: Path, path: str, line: int) -> list[str]:
+        """Return the tests that a fault in a line of a file can change, the quickest first."""
+        syntax = ast.parse((tree / path).read_text(encoding='utf-8'))
+        statement, function = _innermost(syntax, line)
+        if function is not None:
+            found = self._within(path, statement)
+        elif isinstance(statement, ast.FunctionDef):  # a default or a decorator
+            found = self._within(path, statement, whole=True)
+        else:  # what runs once, when the module is imported, shows where its names are used
+            found = self._uses(tree, _targets(statement)) or self._within(path, syntax)
+        return sorted(found & self.seconds.keys(), key=lambda test: (self.seconds[test], test))
+
+    def _within(self, path: str, node: ast.AST, whole: bool = False) -> set[str]:
+        """Return the tests of a statement, of its head alone if it is a compound one."""
+        by_line = self.tests.get(path, {})
+        if isinstance(node, ast.Module):
+            lines = _lines_of_functions(node)
+        elif whole:
+            lines = _lines_of_functions(ast.Module([node], []))  # type: ignore[list-item]
+        else:
+            body = getattr(node, 'body', None)
+            last = body[0].lineno - 1 if isinstance(body, list) else node.end_lineno  # type: ignore
+            lines = set(range(node.lineno, max(last, node.lineno) + 1))  # type: ignore
+        return set().union(*(by_line.get(line, set()) for line in lines))
+
+    def _uses(self, tree: Path, names: set[str]) -> set[str]:
+        """Return the tests of every function of the package that mentions one of the names."""
+        found: set[str] = set()
+        for path in self.tests if names else ():
+            text = (tree / path).read_text(encoding='utf-8')
+            if any(name in text for name in names):
+                for function in _functions(ast.parse(text)):
+                    if names & _mentions(function):
+                        found |= self._within(path, function, whole=True)
+        return found
+
+
+def trace(tree: Path, folder: Path) -> None:
+    """Run the suite of a tree under coverage, group by group, those left out that are done."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for group, arguments in GROUPS.items():
+        log = folder / f'{group}.log'
+        if log.exists():
+            continue
+        settings = folder / f'{group}.ini'
+        settings.write_text(_SETTINGS.format(tree=tree, folder=folder.resolve(), group=group))
+        paths = [f'test/{word}' if (tree / 'test' / word).exists() else word
+                 for word in arguments]
+        environment = os.environ | {'PYTHONPATH': str(tree), 'OMP_NUM_THREADS': '1'}
+        if group == 'uncompiled':
+            environment['NUMBA_DISABLE_JIT'] = '1'
+        done = subprocess.run(
+            [sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', '--cov',
+             f'--cov-config={settings.resolve()}', '--cov-context=test', '--cov-report=',
+             '--durations=0', '--durations-min=0', '-vv', *paths],
+            cwd=tree, env=environment, capture_output=True, text=True)
+        log.write_text(done.stdout, encoding='utf-8')
+
+
+def load(tree: Path, folder: Path) -> Reach:
+    """Read what `trace` left, without the tests that failed."""
+    seconds: dict[str, float] = defaultdict(float)
+    failed: set[str] = set()
+    for log in sorted(folder.glob('*.log')):
+        for line in log.read_text(encoding='utf-8').splitlines():
+            if match := _DURATION.match(line):
+                seconds[match[2].strip()] += float(match[1])
+            elif line.startswith(('FAILED ', 'ERROR ')):
+                failed.add(line.split(' ', 1)[1].split(' - ')[0])
+    tests: dict[str, dict[int, set[str]]] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix in {'.log', '.ini'}:
+            continue
+        data = CoverageData(str(file))
+        data.read()
+        for path in data.measured_files():
+            by_line = tests.setdefault(str(Path(path).relative_to(tree)), defaultdict(set))
+            for line, contexts in data.contexts_by_lineno(path).items():
+                by_line[line] |= {_PHASE.sub('', context) for context in contexts} - {''}
+    return Reach(tests, {test: s for test, s in seconds.items() if test not in failed})
+
+
+def _functions(node: ast.AST) -> Iterator[ast.FunctionDef]:
+    return (one for one in ast.walk(node) if isinstance(one, ast.FunctionDef))
+
+
+def _lines_of_functions(node: ast.AST) -> set[int]:
+    return {line for function in _functions(node)
+            for line in range(function.body[0].lineno, (function.end_lineno or 0) + 1)}
+
+
+def _innermost(syntax: ast.Module, line: int) -> tuple[ast.AST, ast.FunctionDef | None]:
+    """Return the innermost statement of a line, and the function in whose body it stands."""
+    statement: ast.AST = syntax
+    function: ast.FunctionDef | None = None
+    body: list[ast.stmt] = syntax.body
+    while body:
+        first = body[0]
+        inside = [one for one in body if _first_line(one) <= line <= (one.end_lineno or 0)]
+        if not inside:
+            break
+        if isinstance(statement, ast.FunctionDef) and line >= first.lineno:
+            function = statement
+        statement = inside[0]
+        body = [one for name in ('body', 'orelse', 'finalbody', 'handlers', 'cases')
+                for one in getattr(statement, name, ())
+                if isinstance(one, ast.stmt | ast.ExceptHandler | ast.match_case)]
+        body = [inner for one in body
+                for inner in ([one] if isinstance(one, ast.stmt) else one.body)]
+    return statement, function
+
+
+def _first_line(statement: ast.stmt) -> int:
+    decorators = getattr(statement, 'decorator_list', ())
+    return min([statement.lineno, *(one.lineno for one in decorators)])
+
+
+def _targets(statement: ast.AST) -> set[str]:
+    targets = getattr(statement, 'targets', None) or [getattr(statement, 'target', None)]
+    return {one.id for target in targets if target is not None
+            for one in ast.walk(target) if isinstance(one, ast.Name)}
+
+
+def _mentions(function: ast.FunctionDef) -> set[str]:
+    nodes = list(ast.walk(function))
+    return ({one.id for one in nodes if isinstance(one, ast.Name)}
+            | {one.attr for one in nodes if isinstance(one, ast.Attribute)}
+            | {one.arg for one in nodes if isinstance(one, ast.keyword) and one.arg})
