@@ -46,8 +46,8 @@ COMPILED = {
 FORK = get_context('fork')
 # What the tests import of others, loaded once for all mutants.
 PRELOADED = ('pytest', 'hypothesis', 'numpy', 'scipy.optimize', 'scipy.stats', 'scipy.spatial',
-             'scipy.sparse.linalg', 'numba', 'cv2', 'matplotlib.pyplot', 'rosbags.highlevel', 'yaml',
-             'pyarrow.parquet', 'cyclonedds.domain', 'rich.console', 'jinja2')
+             'scipy.sparse.linalg', 'numba', 'cv2', 'matplotlib.pyplot', 'rosbags.highlevel',
+             'yaml', 'pyarrow.parquet', 'cyclonedds.domain', 'rich.console', 'jinja2')
 KINDS = {
     'NumberReplacer': 'a number one off',
     'ReplaceComparisonOperator': 'another comparison',
@@ -143,7 +143,8 @@ def verdict(tests: list[str], compiled: bool, tree: Path, budget: float, seconds
         found = _failing(chosen, tree, environment, patience, log)
         if found and (found != 'hung' or environment['NUMBA_DISABLE_JIT'] == '0'):
             return found
-    return 'survived' if within == len(tests) else f'survived {budget:g} s of tests'
+    return 'survived' if within == len(tests) else (
+        f'survived {budget:g} s of {sum(seconds):.0f} s of tests')
 
 
 def _failing(tests: list[str], tree: Path, environment: dict[str, str], patience: float,
