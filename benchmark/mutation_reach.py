@@ -73,7 +73,7 @@ class Reach(NamedTuple):
     def _uses(self, tree: Path, names: set[str]) -> set[str]:
         """Return the tests of every function of the package that mentions one of the names."""
         found: set[str] = set()
-        for path in self.tests if names else ():
+        for path in filter(lambda one: one.endswith('.py'), self.tests if names else ()):
             text = (tree / path).read_text(encoding='utf-8')
             if any(name in text for name in names):
                 for function in _functions(ast.parse(text)):

@@ -1,6 +1,7 @@
 """Diagnosis: what it says of small scenes."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -282,6 +283,22 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     errors = standard_errors(found.evidence) * found.evidence.scale[own]
     assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
     assert np.abs(step / errors).max() < 0.1
+
+
+@pytest.mark.parametrize('spread', [1.0, 3.0])
+def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spread):
+    """One parameter, of which each frame gives an estimate of unit variance: their mean."""
+    def information(values):
+        return np.array([[len(values), values.sum()], [values.sum(), (values**2).sum()]])
+
+    values = spread * np.random.default_rng(27).normal(size=40)
+    evidence = SimpleNamespace(
+        own=1, scale=np.array([2.0]), information=information(values),
+        in_turn=[information(np.delete(values, i)) for i in range(40)],
+        linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
+    expected = 1 if spread == 1 else values.std(ddof=1)
+    assert standard_errors(evidence) == pytest.approx(expected / np.sqrt(40) / 2)
+    assert standard_errors(evidence, jackknife=False) == pytest.approx(1 / np.sqrt(40) / 2)
 
 
 def rig_table(seed, right_terms=(), frames=16):

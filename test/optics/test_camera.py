@@ -1,5 +1,7 @@
 """Projection, back-projection and Jacobians, against independent code."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from fisheye_svp_ros.optics.camera import (
     project_with_jacobian,
     unique_range,
 )
+from fisheye_svp_ros.optics.curves import FlatPort
 
 pytestmark = pytest.mark.usefixtures('engine')
 
@@ -151,7 +154,11 @@ def test_back_projection_round_trips_up_to_the_edge_of_the_field(lens):
     assert all(np.isnan(field).all() for field in outside[:3])
 
 
-@pytest.mark.parametrize('lens', [KITA[1], KITA[1].svp()], ids=['shiftvp', 'svp'])
+BOTH = replace(KITA[1], viewpoint_shift=KITA[1].viewpoint_shift.plus(FlatPort(0.01, 1.5)),
+               max_incidence=1.4)
+
+
+@pytest.mark.parametrize('lens', [KITA[1], KITA[1].svp(), BOTH], ids=['shiftvp', 'svp', 'both'])
 @pytest.mark.parametrize('shape', [(), (0,), (4,), (2, 3), (2, 0, 3)])
 def test_any_leading_shape(lens, shape):
     points = np.full((*shape, 3), 0.4) + np.arange(3) * 0.1
@@ -159,7 +166,11 @@ def test_any_leading_shape(lens, shape):
     assert image.uv.shape == (*shape, 2)
     assert np.shape(image.valid) == shape
     assert image.d_point.shape == (*shape, 2, 3)
-    assert lens_columns(lens, image, ['f', 'cx']).shape == (*shape, 2, 2)
+    names = ['f', *lens.parameters]
+    columns = lens_columns(lens, image, names)
+    assert columns.shape == (*shape, 2, len(names))
+    of_one = lens_columns(lens, project_with_jacobian(lens, np.array([0.4, 0.5, 0.6])), names)
+    np.testing.assert_allclose(columns, np.broadcast_to(of_one, columns.shape), atol=1e-12)
     assert project(lens, points).uv.shape == (*shape, 2)
     rays = back_project(lens, image.uv)
     assert rays.origin.shape == rays.direction.shape == (*shape, 3)
