@@ -311,6 +311,7 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     np.testing.assert_allclose(one.height, expected - expected.mean(), atol=1e-9)
     assert one.peak_to_valley == pytest.approx(0.002)
     np.testing.assert_allclose(one.slide, 0, atol=1e-12)
+    assert one.spread_out and not one._replace(place=one.place * [1.0, 0.0]).spread_out
 
 
 def test_the_depth_of_a_rig_gains_too():

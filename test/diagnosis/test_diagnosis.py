@@ -174,6 +174,11 @@ def test_quantisation_is_read_off_the_numbers():
     assert quantisation_step(np.round(uv)) == 1.0
     assert quantisation_step(np.round(uv * 4) / 4) == 0.25
     assert quantisation_step(uv) == 0.0
+    pose, views = scene(rng)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    cause, = diagnose(replace(table, uv=np.round(table.uv)), lens()).causes
+    assert cause.effect == 'quantisation' and cause.parameters['step']['value'] == 1.0
+    assert cause.parameters['step']['stderr'] == 0.0
 
 
 def test_noise_that_grows_with_the_angle_is_a_cause():

@@ -121,7 +121,7 @@ def cause(alike):
                  alike, '')
 
 
-def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear):
+def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
     doubt = next_photographs(linear, [cause(['radial_profile'])], NOISE, 2, room=ROOM)
     assert (doubt.asked, doubt.others) == ('viewpoint_shift', ('radial_profile',))
     assert [len(row) for row in rows(doubt)] == [6, 6] and 'sure' in rows(doubt)[-1][-1]
@@ -130,6 +130,9 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear):
     assert 'mm' in rows(sized)[0][-1]
     whole = next_photographs(fitted(photographs(AIR, None, 6)), [], NOISE, 2, room=ROOM)
     assert whole.asked == 'lens' and whole.answers[0] == 1.0 > whole.answers[-1]
+    away = np.linalg.norm(board.points.mean(axis=0) - linear.state.pose.position, axis=1)
+    anywhere = next_photographs(linear, [cause([])], NOISE, 2).shots.distance
+    assert (0.5 * away.min() <= anywhere).all() and (anywhere <= 3 * away.max()).all()
     named = next_photographs(linear, [], NOISE, 1, 'landmark_scale', ROOM)
     assert named.asked == 'landmark_scale' and named.to_list()[0]['distance_m'] > 0.2
 
