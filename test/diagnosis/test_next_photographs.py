@@ -24,6 +24,7 @@ from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.reporting.shot_list import instruction, rows
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import make_observations
@@ -76,6 +77,18 @@ def test_the_side_said_to_be_away_is_away(board, shots):
     assert 'bottom away' in instruction(shots, i)[2]
     bottom, top = local[local[:, 1].argmax()], local[local[:, 1].argmin()]
     assert np.linalg.norm(bottom) > np.linalg.norm(top)
+
+
+def test_the_board_is_turned_as_said(board, shots):
+    square = np.flatnonzero(shots.tilt == 0)
+    assert len(set(shots.roll[square].round(6))) == 8
+    for i in square:
+        azimuth = shots.azimuth[i]
+        aside = rotation_from_vector(
+            shots.angle[i] * np.array([-np.sin(azimuth), np.cos(azimuth), 0]))
+        right = aside.T @ shots.camera.rotation[i].T @ board.facing[0]
+        said = [np.cos(shots.roll[i]), np.sin(shots.roll[i]), 0]
+        np.testing.assert_allclose(right, said, atol=1e-9)
 
 
 def test_predicted_errors_are_those_of_noisy_refits(linear, board, shots):
