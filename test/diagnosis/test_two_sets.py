@@ -7,6 +7,8 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.diagnosis.carried import Carried
+from fisheye_svp_ros.diagnosis.prediction import Less
 from fisheye_svp_ros.diagnosis.two_sets import Shared, TwoSets, diagnose_against
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -60,6 +62,14 @@ def test_parameters_that_do_not_agree_are_named():
     said = TwoSets('b.csv', (None, None), {'e0': Shared(2.8e-3, 8e-5, 3.5e-3, 9e-5, 'm')})
     assert said.verdict == 'nothing'
     assert said.parameters['e0'].apart == pytest.approx(-5.8, abs=0.1)
+
+
+@pytest.mark.parametrize(('low', 'high', 'better', 'worse'), [
+    (0.01, 0.05, True, False), (-0.01, 0.05, False, False), (-0.05, -0.01, False, True),
+])
+def test_better_and_worse_are_beyond_chance(low, high, better, worse):
+    tried = Carried('a', 'b', 0.2, 0.18, Less((low + high) / 2, low, high))
+    assert (tried.better, tried.worse) == (better, worse)
 
 
 def test_command(tmp_path, capsys):

@@ -216,7 +216,7 @@ DSC = '0,3,3,10\nt25h7,2\n' + ''.join(
     f'-1,{i % 2},{i // 2},{i % 2},{i // 2},0\n' for i in range(4)
 )
 DSC_TWO = DSC + DSC.replace('0,3,3,10', '7,3,3,10')
-TP_TWO = '#calibrated\n0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n7\n0 -1 0 500\n1 0 0 0\n0 0 1 20\n'
+TP_TWO = '#calibrated\n0\n1 0 0 0\n0 1 0 0\n0 0 1 0\n7\n0 -0.9999999 0 500\n1 0 0 0\n0 0 1 20\n'
 ORPC = 'filename: a.png\nwidth: 9\nheight: 9\nnum_corners: 2\nencoding: ascii\n' \
     '0,1,1,10.5,20.5\n0,2,1,11.5,21.5\n'
 
