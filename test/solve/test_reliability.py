@@ -73,15 +73,19 @@ def table_of(views, frames):
                              views.points[rows].reshape(-1, 3))
 
 
-@pytest.mark.parametrize('frames', [[4], [1, 2, 3, 4, 5, 6]])
-def test_without_sigma_frames_are_held_against_each_other(frames):
+@pytest.mark.parametrize(('frames', 'sigma'), [
+    ([4], SIGMA), ([1, 2, 3, 4, 5, 6], SIGMA), ([1, 2, 3, 4, 5, 6], 0.01),
+])
+def test_without_sigma_frames_are_held_against_each_other(frames, sigma):
     model, views, true = spoilt('clean', 'board', 8, np.random.default_rng(7))
+    exact = model.predict(true, views).uv
+    views.uv[:] = exact + sigma / SIGMA * (views.uv - exact)
     views.uv[4, [2, 9]] += [[25.0, 0.0], [-10.0, 20.0]]
     found = localize_measured(model, table_of(views, frames))
     place = frames.index(4)
     assert [bool(reason) for reason in found.reasons] == [frame == 4 for frame in frames]
     assert set(found.views.landmark[found.gross]) == {2, 9}
-    assert found.sigma == pytest.approx(SIGMA, rel=0.3)
+    assert found.sigma == pytest.approx(sigma, rel=0.3)
     off = found.result.pose.difference(true.take(frames))[place, :3]
     assert np.linalg.norm(off) < 5 * np.sqrt(np.trace(found.result.covariance[place, :3, :3]))
 
