@@ -96,9 +96,10 @@ soak: $(VENV)/ready
 kills: $(VENV)/ready
 	$(BIN)/python -m benchmark.kills
 
-# How many of 300 small faults the tests find, into docs/mutation.md; takes an hour or two.
+# How many of 300 small faults the tests find, into docs/mutation.md; goes on where it was
+# interrupted; one and a half hours.
 mutation: $(VENV)/ready
-	$(BIN)/pip install --quiet 'cosmic-ray>=8.3'
+	$(BIN)/pip install --quiet 'cosmic-ray>=8.3' 'pytest-cov>=7'
 	$(BIN)/python -m benchmark.mutation --sample 300
 
 # The oldest versions that are supported: those of Ubuntu 24.04 and OpenCV 4.6.

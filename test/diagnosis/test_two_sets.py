@@ -51,10 +51,13 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
 
 
 def test_what_the_other_set_refutes_is_withdrawn():
-    one, other = table(33, (SKEW, np.array([0.003]))), table(34, (SKEW, np.array([-0.003])))
+    one, other = table(33, (SKEW, np.array([0.003]))), table(34)
     found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
     assert found.against.withdrawn == ('skew',) and found.against.verdict == 'contradict'
     assert 'skew' not in [cause.effect for cause in found.causes]
+    shear, = (said for name, said in found.against.parameters.items() if 'skew' in name)
+    assert shear.value == pytest.approx(0.003, abs=4 * shear.stderr)
+    assert shear.other_value == pytest.approx(0.0, abs=4 * shear.other_stderr) and shear.apart > 5
     assert 'withdrawn' in sections(found)[0].sentence
 
 

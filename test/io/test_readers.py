@@ -131,7 +131,9 @@ class TestObservationsCsv:
         ('0,4,10,20,0,0,0', 'the same frame, camera and landmark as in line 2'),
     ])
     def test_bad_row(self, csv, row, says):
-        fails(csv(f'{HEADER}\n0,4,1,2,3,4,5\n\n0,5,1,2,3,4,5\n{row}\n'), 'line 5', says)
+        text = f'{HEADER}\n0,4,1,2,3,4,5\n\n0,5,1,2,3,4,5\n{row}\n'
+        fails(csv(text), 'line 5', says)
+        fails(csv(text + f'2{row}\n'), 'line 5', says)  # the first of several
 
     def test_the_largest_numbers(self, csv):
         table = read_observations(csv(f'{HEADER}\n{2**53},{2**32 - 1},1,2,-1e12,4,1e12\n'))
