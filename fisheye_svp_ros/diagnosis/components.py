@@ -62,6 +62,11 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
     return _without_chance(eq, now)
 
 
+def called(eq: Equations, now: Variances, name: str) -> bool:
+    """Return whether the data call for one more component beside those that are there."""
+    return score_components(eq, now, [name]).get(name, 1.0) < _CALLED_LATE
+
+
 def _without_chance(eq: Equations, now: Variances) -> Variances:
     """Switch off what may as well be chance: a variance hardly known makes every test unsure.
 

@@ -16,16 +16,18 @@ from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
-from fisheye_svp_ros.diagnosis.components import find_variances
+from fisheye_svp_ros.diagnosis.components import called, find_variances
 from fisheye_svp_ros.diagnosis.fields import mean_fields
 from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
-from fisheye_svp_ros.diagnosis.reml import Variances, nothing_random, start_variances
+from fisheye_svp_ros.diagnosis.reml import GONE, Variances, nothing_random, start_variances
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
+_DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them fields are tried
+_FIELDS = (1.0, 5.0, 25.0)  # what a bump adds to the variance of what is seen of it, over noise
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
 
@@ -147,14 +149,50 @@ class Evidence:
     def confident(self, score: Score, included: Index, columns: Index) -> Score:
         """Return the score with what the uncertainty of the variances does to its p-value.
 
-        F test with Satterthwaite's degrees of freedom, of the direction that was estimated.
+        F test with Satterthwaite's degrees of freedom, of the direction that was estimated; where
+        it is not beyond doubt, the likelihood ratio beside a smooth image field, too: the variance
+        of one that was too small to be called for says nothing of its uncertainty.
         """
         covariance = self.variances.covariance
         if covariance is None or not score.rank:
             return score
         freedom = self._freedom(score.estimate * self.scale[columns], included, columns)
         p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
+        if p < _DOUBTFUL and score.statistic < _BEYOND_DOUBT:
+            p = max(p, float(special.chdtrc(score.rank, self._beside_fields(included, columns))))
         return score._replace(p_value=p, freedom=freedom)
+
+    def _beside_fields(self, included: Index, columns: Index) -> float:
+        """Return the likelihood ratio of columns, whatever the size of a smooth image field.
+
+        Its variance is found with the columns and without them.
+        """
+        count = self.full.rows - self.full.poses
+        without, beside = np.inf, np.inf
+        for logs, information in self.with_field:
+            rest = swept(self.restored(information, included), included)
+            remaining = rest[-1, -1]
+            without = min(without, logs + count * np.log(remaining))
+            inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], 1e-8, 1e-8)
+            remaining -= rest[columns, -1] @ inverse @ rest[columns, -1]
+            beside = min(beside, logs + count * np.log(remaining))
+        return max(float(without - beside), 0.0)
+
+    @cached_property
+    def with_field(self) -> list[tuple[float, Array]]:
+        """Log determinant and information of the border, for image fields of several sizes."""
+        kind = NAMES.index('image_broad')
+        found = [(self.factored.log_determinant, self.factored.information)]
+        own = start_variances(self.full, 1.0).lam[kind]
+        if own >= GONE:
+            return found
+        count = float((self.full.blocks.r_label == kind).sum())
+        for more in _FIELDS:
+            lam = self.variances.lam.copy()
+            lam[kind] = own * self.full.rows / count / more
+            f = factored(self.full.trimmed(lam < GONE), lam, self.variances.weight)
+            found.append((f.log_determinant, f.information))
+        return found
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
         info, f = self.factored.information, self.factored
@@ -180,10 +218,22 @@ def gather_evidence(
     before: variances to start from; left_out: effects; finest: with the finest image field.
     """
     bare = _multiplied(data, state, free, left_out, finest)
-    own = np.arange(bare.own)
-    free_ones = np.concatenate([own, bare.own + bare.forms.generic])
-    basis = identifiable(bare.linear.frame_columns, bare.border[..., :-1], free_ones)
-    return replace(bare, variances=find_variances(bare.full.bordered(basis), before))
+    return replace(bare, variances=find_variances(_all_free(bare), before))
+
+
+def finest_called(
+    data: Data, state: State, free: Sequence[str], variances: Variances, left_out: Sequence[str]
+) -> bool:
+    """Return whether the data call for the finest image field beside all that has a variance."""
+    return called(_all_free(_multiplied(data, state, free, left_out, True)), variances,
+                  'image_finest')
+
+
+def _all_free(bare: Evidence) -> Equations:
+    """Return the equations with what is in the model and the whole catalogue free."""
+    chosen = np.concatenate([np.arange(bare.own), bare.own + bare.forms.generic])
+    columns = bare.border[..., :-1]
+    return bare.full.bordered(identifiable(bare.linear.frame_columns, columns, chosen))
 
 
 def bare_evidence(

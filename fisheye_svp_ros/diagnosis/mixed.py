@@ -183,6 +183,14 @@ class Factored:
         except np.linalg.LinAlgError:
             return np.asarray(np.linalg.cholesky(info + _UNTOLD * np.diag(np.diag(info))))
 
+    @cached_property
+    def log_determinant(self) -> float:
+        """Of the covariance of the numbers over the noise variance, poses projected out."""
+        e, r = self.precision
+        priors = np.concatenate([e.ravel(), r])
+        logs = _log_square(self.factor) - _log_square(self.inverse)
+        return float(logs - np.log(priors[priors > 0]).sum())
+
     def coefficients(self, way: Array) -> tuple[Array, Array]:
         """Return the coefficients (E, k), (R,) that follow a combination (X,) of the border."""
         r = _back(self.factor, self.border @ way)
@@ -358,11 +366,11 @@ def posterior(f: Factored) -> Posterior:
 
 def _deviance(f: Factored, freedom: int, variance: float) -> float:
     """Return -2 log restricted likelihood, the noise variance profiled out."""
-    e, r = f.precision
-    priors = np.concatenate([e.ravel(), r])
-    priors = priors[priors > 0]
-    logs = sum(
-        2 * float(np.log(np.maximum(np.abs(np.diagonal(part, axis1=-2, axis2=-1)), 1e-300)).sum())
-        for part in (f.factor, f.root)
-    ) - 2 * float(np.log(np.diagonal(f.inverse, axis1=-2, axis2=-1)).sum())
-    return float(freedom * np.log(max(variance, 1e-300)) + logs - np.log(priors).sum())
+    logs = f.log_determinant + _log_square(f.root)
+    return float(freedom * np.log(max(variance, 1e-300)) + logs)
+
+
+def _log_square(root: Array) -> float:
+    """Return the logarithm of the square of the determinant of triangular matrices."""
+    diagonal = np.abs(np.diagonal(root, axis1=-2, axis2=-1))
+    return 2 * float(np.log(np.maximum(diagonal, 1e-300)).sum())

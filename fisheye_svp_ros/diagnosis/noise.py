@@ -32,6 +32,7 @@ _SETTLED = 0.1  # of the scale: how little predictions may move
 _ROUNDING = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
+_WITHIN = 2.6  # standard errors
 
 
 class Gross(NamedTuple):
@@ -215,7 +216,8 @@ def quantisation_step(uv: Array) -> float:
 def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
 
-    Those of outlying points count as little as the limit allows.
+    Those of outlying points count as little as the limit allows.  It is none where the same
+    landmarks do not scatter more at larger angles: some landmarks scatter more than others.
     """
     linear = fitted.linear
     used = linear.used
@@ -233,9 +235,20 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     tails = max(float(e2.var()) / 2, 1.0)
     gain = (deviance(0.0) - float(best.fun)) / tails
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    p = float(special.chdtrc(1, max(gain, 0.0)))
+    landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
+    rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
+    within = np.sign(best.x) * _within(e2, z, rows)
+    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN else 1.0
     level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
     return NoiseCause(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
+
+
+def _within(e2: Array, z: Array, group: Index) -> float:
+    """Return how squares e2 (M,) grow with z within groups (M,), in standard errors."""
+    count = np.maximum(np.bincount(group), 1)
+    mean, middle = (np.bincount(group, weights=of)[group] / count[group] for of in (e2, z))
+    products = (e2 / np.maximum(mean, 1e-300) - 1) * (z - middle)
+    return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
 
 
 def with_noise_growth(state: State, growth: float) -> State:

@@ -20,6 +20,7 @@ from fisheye_svp_ros.diagnosis.evidence import (
     Evidence,
     Placed,
     Score,
+    finest_called,
     gather_evidence,
     pseudo_inverse,
     swept,
@@ -116,10 +117,10 @@ def search(
                 state = with_noise_growth(state, growth.value)
         if fitted is not None and not finest and ripples(fitted) > _RIPPLES:
             # Points of different frames err alike where they fall on the same place.
-            finest = True
-            if not changed:
+            finest = finest_called(data, state, free, before, wanted.left_out)
+            if finest and not changed:
                 continue
-        elif not changed:
+        if not changed:
             break
         state = refit(data, state, free, before)
         if wanted.quick or (cleaned and settled):
