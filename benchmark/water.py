@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
@@ -140,8 +141,8 @@ def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
     given = _calibrated(lens, rng, free, rough)
     if air:
         table = _photographs(lens, lambda points: _central(lens, points), noise, rough, rng)
-        given = calibrate(table, 'kannala_brandt', (lens.width, lens.height)).adjusted.lens
-        given = given if free else replace(given, calibration=None)
+        found = calibrate(table, 'kannala_brandt', (lens.width, lens.height)).adjusted
+        given = with_stderr(found.lens, trust(table, found.lens, found.names))
     found = diagnose(seen, given, free_intrinsics=free)
     port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
     values = {} if port is None else {

@@ -178,10 +178,11 @@ def _sizes_beside(path: Path) -> dict[str, tuple[int, int]]:
 
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:
+    from fisheye_svp_ros.diagnosis.calibration import with_stderr
     from fisheye_svp_ros.io.lens_files import save_lens
     from fisheye_svp_ros.io.results import write_json
 
-    save_lens(result.adjusted.lens, path)
+    save_lens(with_stderr(result.adjusted.lens, trust), path)
     write_json(path.with_suffix('.calibrate.json'), _document(result, trust))
 
 

@@ -186,7 +186,7 @@ def _judged(
     observations: Observations, lenses: Mapping[str, Lens], found: Found, measured: Measured,
     noise_causes: list[Cause], cameras: list[TwoCameras], held_out: Observations | None,
 ) -> Diagnosis:
-    evidence, errors = found.evidence, ModelError.of(found.evidence)
+    evidence, errors = found.evidence, ModelError.of(found.evidence, found.fitted)
     uncertainty = errors.summary(evidence.linear)
     components = measured.components({c.effect: c.p_value for c in noise_causes})
     causes = measured.causes(components) + noise_causes

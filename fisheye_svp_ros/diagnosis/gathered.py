@@ -18,7 +18,9 @@ class Setting(NamedTuple):
     """What the columns rest on, for data other than those that the variances are of.
 
     extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
-    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers.
+    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
+    modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
+    boards, each as a sum of the modes, drawn once for all, and of what it has alone.
     """
 
     extents: Array
@@ -26,15 +28,17 @@ class Setting(NamedTuple):
     landmark: Index
     board: Index
     points: Array
+    modes: Array
+    alone: Array
 
     @classmethod
-    def of(cls, linear: Linearised, finest: float) -> Setting:
-        """Return that of a linearised state."""
+    def of(cls, linear: Linearised, finest: float, modes: Array, alone: Array) -> Setting:
+        """Return that of a linearised state; modes, alone: see above."""
         views = linear.data.views
         used = views.used
         landmark, first = np.unique(views.landmark[used], return_index=True)
         return cls(GatheredPoints.of(linear).extents, finest, landmark,
-                   views.board[used][first], views.points[used][first])
+                   views.board[used][first], views.points[used][first], modes, alone)
 
 
 class GatheredPoints(NamedTuple):

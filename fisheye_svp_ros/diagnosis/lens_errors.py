@@ -14,7 +14,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.gathered import Setting
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
-from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances
 from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, ModelError, pose_maps
 from fisheye_svp_ros.effects.base import Term
@@ -27,7 +27,6 @@ from fisheye_svp_ros.scene.observations import Observations, Views, make_observa
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured
 
-_OFFSETS = ('landmark_in_plane', 'landmark_normal', 'landmark')
 _STEP = 1e-3  # of a standard error
 _AT_ONCE = 500  # stereo points
 
@@ -80,9 +79,9 @@ def _entry(
     names: list[str],
 ) -> dict[str, Any]:
     setting, variances = errors.setting, errors.variances
-    sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True) if size}
-    sizes |= {name: sizes[name] * float(np.sqrt(variances.spread)) for name in _OFFSETS
-              if name in sizes}
+    sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True)
+             if size and STAGE_OF[name] != 'target'}
+    off = np.concatenate([setting.alone, setting.modes.reshape(len(setting.points), -1)], axis=1)
     known = np.diag(covariance) > 0
     return {
         'noise_px': noise, 'misfit_px': misfit,
@@ -91,8 +90,9 @@ def _entry(
         'components': sizes,
         'extent_px': setting.extents[camera].tolist(),
         'finest_px': float(setting.finest) if np.isfinite(setting.finest) else None,
-        'landmarks': [[*pair, *place] for *pair, place in zip(
-            setting.landmark.tolist(), setting.board.tolist(), setting.points.tolist(),
+        'landmarks': [[*pair, *place, *(float(f'{value:.6g}') for value in values)]
+                      for *pair, place, values in zip(
+            setting.landmark.tolist(), setting.board.tolist(), setting.points.tolist(), off,
             strict=True)],
     }
 
@@ -124,11 +124,15 @@ class LensErrors:
             size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
             lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, GONE)
             finest = entry['finest_px']
-            rows = np.array(entry['landmarks'], dtype=float).reshape(-1, 5)
+            rows = np.array(entry['landmarks'], dtype=float)
+            rows = rows.reshape(len(rows), -1)
+            if rows.shape[1] < 8:
+                raise ValueError('landmarks without how far they may be off')
             ids, boards = (np.array([*map(int, rows[:, i])], dtype=np.int64) for i in (0, 1))
             setting = Setting(
                 np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
-                np.nan if finest is None else float(finest), ids, boards, rows[:, 2:])
+                np.nan if finest is None else float(finest), ids, boards, rows[:, 2:5],
+                rows[:, 8:].reshape(len(rows), 3, -1), rows[:, 5:8])
             names = tuple(map(str, entry['parameters']))
             covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
             found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']), names,
@@ -138,7 +142,7 @@ class LensErrors:
         numbers = (found.noise, found.misfit, *covariance.ravel(), *size)
         wide = np.diff(setting.extents, axis=1) > 0
         if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows) and wide.all()
-                and np.isfinite(setting.points).all() and (np.diag(covariance) >= 0).all()):
+                and np.isfinite(rows).all() and (np.diag(covariance) >= 0).all()):
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
         return found
 

@@ -17,6 +17,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
+from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.model import (
     Data,
     Linearised,
@@ -58,6 +59,7 @@ class Medium:
 
     state, names: the fit, and what of the port was fitted; gross: errors set aside beside it; air:
     the simulation as it was, fitted to the same data;
+    magnified: relative standard error of the focal length in air, as far as the lens tells;
     p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well.
     """
 
@@ -69,6 +71,7 @@ class Medium:
     p_value: float
     share: float
     alike: bool
+    magnified: float = 0.0
 
     def held_out(self) -> HeldOut:
         """Predict parts of the frames in turn, in air."""
@@ -89,6 +92,10 @@ class Medium:
     def cause(self, stderr: dict[str, float], rms: float, gain: Gain) -> Cause:
         """Return the cause; stderr by name; rms, gain: of held-out frames once it is in."""
         values = self.state.lens.parameters
+        if INDEX in stderr:
+            # Nothing seen through the port tells the index from the focal length in air.
+            told = float(np.hypot(stderr[INDEX], self.magnified * values[INDEX]))
+            stderr = {**stderr, INDEX: told}
         parameters = {
             name.removeprefix('port_'): {
                 'value': float(values[name]), 'stderr': stderr.get(name, 0.0),
@@ -158,7 +165,19 @@ def find_medium(
     mine = _cost(air)
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(state, names, gross, air, tuple(free), p_value, max(0.0, 1 - after / mine),
-                  bool(merits[1] < merits[0]))
+                  bool(merits[1] < merits[0]), _of_focal(lens))
+
+
+def _of_focal(lens: Lens) -> float:
+    """Return the relative standard error of a focal length, 0 where a lens says nothing of it."""
+    match (lens.calibration or {}).get('stderr'):
+        case {'fx': float(error)} | {'f': float(error)} if error > 0:
+            return error / lens.fx
+    if lens.uncertainty is None:
+        return 0.0
+    known = LensErrors.of(lens)
+    errors = dict(zip(known.names, np.sqrt(np.diag(known.covariance)), strict=True))
+    return float(errors.get('fx', 0.0)) / lens.fx
 
 
 def _held(lens: Lens, fitted: Lens) -> Lens:

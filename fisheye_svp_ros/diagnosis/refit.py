@@ -32,6 +32,7 @@ from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
 _ROUNDS = 4
+_MODE, _MOST_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _SETTLED = 3e-3  # of the noise: what a step moves predictions by
 
 
@@ -137,3 +138,44 @@ def local_offsets(fitted: Fitted) -> Local:
             offset[:, axis] += field.values @ values
     in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
     return Local(random.landmark, in_target, tuple(grids))
+
+
+def target_modes(fitted: Fitted, sigma: float) -> tuple[Array, Array]:
+    """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.
+
+    Along the axes of their boards; the mean square about zero, given the data, of predicted
+    offsets: of a sum of the modes, each with a factor of variance 1, and of what each landmark has
+    alone.  sigma: of the whitened noise.
+    """
+    e, r = _columns_of_landmarks(fitted)
+    count = e.shape[-1]
+    none = np.zeros((len(fitted.scale), count))
+    ways = (e.reshape(-1, count), r)
+    mean = ways[0].T @ fitted.solution.e.ravel() + r.T @ fitted.solution.r
+    spread = fitted.factored.solved(e, r, none)
+    covariance = ways[0].T @ spread[0].reshape(-1, count) + r.T @ spread[1]
+    square = sigma**2 * (covariance + covariance.T) / 2 + np.outer(mean, mean)
+    values, vectors = np.linalg.eigh(square)
+    kept = np.flatnonzero(values > _MODE * values.sum())[-_MOST_MODES:]
+    modes = vectors[:, kept] * np.sqrt(values[kept])
+    alone = np.sqrt(np.maximum(np.diag(square) - (modes**2).sum(axis=1), 0.0))
+    return (MILLIMETRE * modes.reshape(count // 3, 3, -1), MILLIMETRE * alone.reshape(-1, 3))
+
+
+def _columns_of_landmarks(fitted: Fitted) -> tuple[Array, Array]:
+    """Return the coefficients (E, k, 3 L), (R, 3 L) whose sums the landmarks' offsets are."""
+    eq, random = fitted.factored.equations, fitted.design
+    landmarks = len(random.landmark)
+    own = np.eye(3 * landmarks).reshape(landmarks, 3, -1)
+    own = own * (random.landmark_label >= 0)[..., None]
+    shared = [np.zeros((2 * len(grid.centres), 3 * landmarks)) for grid in random.grids]
+    for field in random.fields:
+        for axis in field.axes:
+            moved = np.zeros((field.values.shape[1], landmarks, 3))
+            moved[..., axis] = field.values.T
+            shared.append(moved.reshape(-1, 3 * landmarks))
+    both = np.concatenate([np.zeros((0, 3 * landmarks)), *shared])
+    alive, frame = own[eq.landmarks], np.zeros((len(eq.pose_scale), eq.width, 3 * landmarks))
+    if eq.by_frame:
+        return frame, np.concatenate([both, alive.reshape(-1, 3 * landmarks)])
+    return alive, np.concatenate([frame.reshape(-1, 3 * landmarks), both])

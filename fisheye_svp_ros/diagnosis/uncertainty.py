@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
-from fisheye_svp_ros.diagnosis.gathered import Setting
+from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE, Setting
 from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows, is_shared
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, Design, design
+from fisheye_svp_ros.diagnosis.refit import Fitted, target_modes
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances
 
 
@@ -45,8 +46,8 @@ class ModelError:
     setting: Setting
 
     @classmethod
-    def of(cls, evidence: Evidence) -> ModelError:
-        """Return the errors of what was fitted under a null model.
+    def of(cls, evidence: Evidence, fitted: Fitted) -> ModelError:
+        """Return the errors of what was fitted under a null model; fitted: of the evidence.
 
         Parameters take up part of an image field that has no name: what it does to them is not
         counted beside the field.
@@ -58,8 +59,9 @@ class ModelError:
         inverse, _ = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
         scale = evidence.scale[own]
         finest = [grid.pitch for grid in evidence.design.grids if grid.name == 'image_finest']
+        modes, alone = target_modes(fitted, evidence.variances.sigma)
         return cls(evidence.variances, inverse / np.outer(scale, scale),
-                   Setting.of(evidence.linear, max(finest, default=np.nan)))
+                   Setting.of(evidence.linear, max(finest, default=np.nan), modes, alone))
 
     def of_poses(self, linear: Linearised) -> ErrorParts:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
@@ -77,13 +79,9 @@ class ModelError:
         random, variance = self._design(linear)
         own = maps @ random.frame
         misfit = (own * variance[random.frame_label]) @ np.swapaxes(own, -1, -2)
-        frames, count = random.slot.shape
-        moved = maps.reshape(frames, -1, count, 2).swapaxes(1, 2) @ random.place
-        moved = moved * np.sqrt(self._of_landmarks(random, variance))[:, :, None]
-        moved = moved.swapaxes(1, 2).reshape(frames, maps.shape[1], -1)
-        misfit = misfit + moved @ np.swapaxes(moved, -1, -2)
+        misfit = misfit + self._of_landmarks(random, maps)
         rows = maps.shape[-1]
-        for f in range(frames):
+        for f in range(len(maps)):
             field = (random.shared[f * rows:(f + 1) * rows].T @ turned[f]).T
             misfit[f] += (field * variance[random.shared_label]) @ field.T
         return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
@@ -124,16 +122,20 @@ class ModelError:
 
     def _design(self, linear: Linearised) -> tuple[Design, Array]:
         """Return the random columns of the frames, and the variance of each component, last 0."""
-        random = design(linear, setting=self.setting).kept(self.variances.alive)
+        alive = self.variances.alive & ~_of_the_target()
+        random = design(linear, setting=self.setting).kept(alive)
         return random, np.append(self.variances.tau**2, 0.0)
 
-    def _of_landmarks(self, random: Design, variance: Array) -> Array:
-        """Return the variances (F, N, 3) of the offset of each point's landmark.
-
-        A few landmarks are further off than the bulk: theirs is the mean.
-        """
-        label = np.where(random.slot[..., None] >= 0, random.landmark_label[random.slot], -1)
-        return np.asarray(self.variances.spread * variance[label])
+    def _of_landmarks(self, random: Design, maps: Array) -> Array:
+        """Return covariances (F, Q, Q) of linear functions (F, Q, M) by what the target is off."""
+        frames, count = random.slot.shape
+        shown = (random.slot >= 0)[..., None]
+        moved = maps.reshape(frames, -1, count, 2).swapaxes(1, 2) @ random.place / MILLIMETRE
+        alone = moved * (self.setting.alone[random.slot] * shown)[:, :, None]
+        alone = alone.swapaxes(1, 2).reshape(frames, maps.shape[1], -1)
+        modes = self.setting.modes[random.slot] * shown[..., None]
+        modes = np.einsum('fnqa,fnak->fqk', moved, modes, optimize=True)
+        return np.asarray(alone @ np.swapaxes(alone, -1, -2) + modes @ np.swapaxes(modes, -1, -2))
 
 
 def pose_summary(parts: ErrorParts) -> dict[str, dict[str, float]]:
@@ -156,6 +158,10 @@ def pose_maps(columns: Array) -> Array:
 
 def _of_the_image() -> Index:
     return np.array([i for i, name in enumerate(NAMES) if name.startswith('image_')])
+
+
+def _of_the_target() -> Mask:
+    return np.array([STAGE_OF[name] == 'target' for name in NAMES])
 
 
 def _of_the_lens(linear: Linearised) -> Array:

@@ -120,7 +120,7 @@ def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     views, pose = found.after.data.views, found.after.state.pose
     said, carried = found.errors.of_poses(found.after), errors.of_poses(views, pose)
     np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)
-    np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-4, atol=1e-12)
     assert errors.noise == pytest.approx(found.noise_px) and said.misfit.any()
     assert {'fx', 'k4', 'target_shape.board0.z20'} < set(errors.names)
 

@@ -37,6 +37,17 @@ def test_water_is_named_and_measured(lens, others):
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
 
 
+def test_an_index_is_no_surer_than_the_focal_length_in_air():
+    seen = photographs(AIR, PORT, 8)
+    index = {}
+    for percent in (0.0, 1.0):
+        lens = replace(AIR, calibration={'stderr': {'fx': percent / 100 * AIR.fx}})
+        found = diagnose(seen, lens, wanted=Wanted(quick=True))
+        index[percent] = medium_of(found).parameters['medium_index']
+    assert index[0.0]['stderr'] < 0.005 and index[0.0]['value'] == index[1.0]['value']
+    assert index[1.0]['stderr'] == pytest.approx(0.0134, rel=0.1)
+
+
 @pytest.mark.parametrize('true', [
     replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy),
     replace(AIR, port=FlatGlass(0.03, 1.0, 0.02, 0.0, 0.01)),

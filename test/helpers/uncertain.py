@@ -21,12 +21,12 @@ def uncertain(**components: float) -> Lens:
     covariance = np.diag(STDERR**2)
     covariance[0, 1] = covariance[1, 0] = 0.9 * STDERR[0] * STDERR[1]
     sizes = components or {
-        'image_coarse': COARSE, 'frame_bumps': BUMPS, 'frame_linear': LINEAR,
-        'landmark_in_plane': OFFSET, 'landmark_normal': OFFSET}
+        'image_coarse': COARSE, 'frame_bumps': BUMPS, 'frame_linear': LINEAR}
     return Lens(
         'lens', 1000, 800, 300.0, 300.0, 500.0, 400.0, KannalaBrandt(-0.01), 1.5,
         Gennery(e0=0.002), uncertainty={
             'noise_px': NOISE, 'misfit_px': 0.3, 'parameters': NAMES,
             'covariance': covariance.tolist(), 'components': sizes,
             'extent_px': [LOW.tolist(), HIGH.tolist()], 'finest_px': None,
-            'landmarks': [[i, 0, *place] for i, place in enumerate(BOARD.tolist())]})
+            'landmarks': [[i, 0, *place, *[1e-3 * OFFSET] * 3]
+                          for i, place in enumerate(BOARD.tolist())]})
