@@ -40,6 +40,7 @@ from fisheye_svp_ros.diagnosis.next_photographs import (
     information,
     look_alikes,
 )
+from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
@@ -104,17 +105,15 @@ def camera(number: int) -> dict[str, Any]:
     random = [rng.permutation(count)[:MOST] for _ in range(RANDOM)]
     goal = float(np.median([alone(order[:20]) for order in random]))
     by_shift = design.choose(without(design, e0), 20)[0]
-    by_name = design.choose(name, 20)[0]
     by_image = greedy(design, wizard, 30)
     return {
         'goal_m': goal,
-        'e0': {'chosen': needed(alone, by_shift, goal),
+        'e0': {'chosen': fewest(design, without(design, e0), lambda error: error <= goal),
                'intrinsics': needed(alone, by_image, goal),
                'random': float(np.median([needed(alone, o, goal) for o in random]))},
-        'named': {
+        'named': {'chosen': fewest(design, name, lambda sure: sure >= SURE)} | {
             method: float(np.median([sure(name, design, order) for order in orders]))
-            for method, orders in (('chosen', [by_name]), ('intrinsics', [by_image]),
-                                   ('random', random))
+            for method, orders in (('intrinsics', [by_image]), ('random', random))
         },
         'at_20_m': {'chosen': alone(by_shift[:20]), 'random': goal,
                     'intrinsics': alone(by_image[:20])},
@@ -154,6 +153,12 @@ def plain(design: Design, question: Question) -> Callable[[Index], float]:
     """Return the standard error of a number from some photographs, look-alikes absent."""
     own = without(design, question)
     return lambda taken: own.answer(design.known + design.added[taken].sum(axis=0))
+
+
+def fewest(design: Design, question: Question, settles: Callable[[float], bool]) -> float:
+    """Return how many photographs settle a question, those of each number chosen together."""
+    return next((float(n) for n in range(1, 21)
+                 if settles(design.choose(question, n)[1][-1])), np.inf)
 
 
 def needed(error: Callable[[Index], float], order: Index, goal: float) -> float:
@@ -216,33 +221,43 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     state = start(data, lens)
     state = fit(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
     linear = Linearised(data, state, free)
-    each = information(linear, ())
-    interest, rest = np.array([len(free)]), np.arange(len(free))
-    question = Question(interest, rest)
     square = float((linear.residual**2).sum()) / int(linear.used.sum())
-    each, everything = each / square, each.sum(axis=0) / square
-    prior = np.diag(1e-9 * np.diag(everything))
-    order: list[int] = []
-    for _ in range(len(each)):
-        merit = question.merit(prior + each[order].sum(axis=0) + each)
-        merit[order] = -np.inf
-        order.append(int(np.argmax(merit)))
-
-    def error(taken: Index) -> float:
-        return question.answer(prior + each[taken].sum(axis=0))
-
-    rng, all_frames = np.random.default_rng(0), np.arange(len(each))
-    random = [rng.permutation(len(each)) for _ in range(200)]
-    goal = 1.5 * error(all_frames)
-    counts = (3, 5, 10)
+    design = Taken(linear, look_alikes(linear, ('radial_profile', 'target_shape')), square)
+    e0 = without(design, design.question('e0'))
+    name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
+    count = len(design.added)
+    error = plain(design, e0)
+    by_image = greedy(design, over_the_image(linear, design), count)
+    rng = np.random.default_rng(0)
+    random = [rng.permutation(count) for _ in range(200)]
+    everything = error(np.arange(count))
+    goal = 1.5 * everything
     return {
-        'frames': len(each), 'stderr_all_m': error(all_frames), 'goal_m': goal,
-        'chosen': needed(error, np.array(order), goal),
-        'random': float(np.median([needed(error, o, goal) for o in random])),
-        'stderr_m': {str(n): {'chosen': error(np.array(order[:n])),
+        'frames': count, 'stderr_all_m': everything, 'goal_m': goal,
+        'e0': {'chosen': fewest(design, e0, lambda error: error <= goal),
+               'intrinsics': needed(error, by_image, goal),
+               'random': float(np.median([needed(error, o, goal) for o in random]))},
+        'named': {'chosen': fewest(design, name, lambda sure: sure >= SURE),
+                  'intrinsics': sure(name, design, by_image),
+                  'random': float(np.median([sure(name, design, o) for o in random]))},
+        'stderr_m': {str(n): {'chosen': design.choose(e0, n)[1][-1],
+                              'intrinsics': error(by_image[:n]),
                               'random': float(np.median([error(o[:n]) for o in random]))}
-                     for n in counts},
+                     for n in (3, 5, 10)},
     }
+
+
+class Taken(Design):
+    """The photographs that there are, in place of those that might be taken."""
+
+    def __init__(self, linear: Linearised, effects: Sequence[Effect], square: float) -> None:
+        """Take a fit, effects that are not in it, and the mean square of whitened residuals."""
+        terms = [*linear.state.terms, *((e, np.zeros(len(e.parameters))) for e in effects)]
+        self.names = (*linear.free, *(f'{e.name}.{p.name}' for e, _ in terms
+                                      for p in e.parameters))
+        self.values = np.concatenate([np.zeros(len(linear.free)), *(v for _, v in terms)])
+        self.added = information(linear, effects) / square
+        self.known = np.diag(1e-9 * np.diag(self.added.sum(axis=0)))
 
 
 def summary(cameras: Sequence[dict[str, Any]]) -> dict[str, Any]:
