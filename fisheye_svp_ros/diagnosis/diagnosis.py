@@ -168,7 +168,10 @@ def diagnose(
     if 'flat_port' not in wanted.left_out:
         medium = find_medium(everything, data, first, base, free, progress)
     if medium is not None:
-        # Index and lens curve look alike: the intrinsics stay as they were in air.
+        # Index and lens curve look alike: the intrinsics stay as they were in air.  Where they
+        # were off, a step after the first few frames would stand in for them.
+        if 'session_step' not in wanted.included:
+            wanted = replace(wanted, left_out=(*wanted.left_out, 'session_step'))
         data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
     found, cameras = agreed(found, free, wanted, lambda less: search(
