@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
@@ -9,6 +10,7 @@ from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.scene.observations import make_observations
 
 PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
 CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})
@@ -61,3 +63,17 @@ def test_a_medium_can_be_ruled_out():
     found = diagnose(photographs(AIR, PORT, 8), AIR,
                      wanted=Wanted(left_out=('flat_port',), quick=True))
     assert found.causes and all(c.effect != 'flat_port' for c in found.causes)
+
+
+def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alone():
+    """Unasked for, it would stand in for a calibration in air that is off."""
+    other = replace(AIR, fx=1.01 * AIR.fx, fy=1.01 * AIR.fy)
+    first, second = photographs(AIR, PORT, 6), photographs(other, PORT, 6, seed=1)
+    seen = make_observations(
+        np.concatenate([first.frame, second.frame + 6]),
+        *(np.concatenate([getattr(first, name), getattr(second, name)])
+          for name in ('landmark', 'uv', 'xyz')))
+    for known in ((), ('session_step',)):
+        found = diagnose(seen, AIR, wanted=Wanted(included=known, quick=True))
+        assert medium_of(found) is not None
+        assert known == tuple(c.effect for c in found.causes if c.effect == 'session_step')
