@@ -155,15 +155,13 @@ def _products(
     return own, ge, b.er[block, column][:, rest].T, b.ex[block, column].T
 
 
-def significance(
-    eq: Equations, now: Variances, names: Sequence[str] = NAMES
-) -> dict[str, float]:
-    """Return p-values of those of some components that are there, each by leaving it out.
+def significance(eq: Equations, now: Variances) -> dict[str, float]:
+    """Return p-values of the components that are there, each by leaving it out.
 
     Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
     JASA 82 (1987)); the other variances follow.
     """
-    full, ratios = likelihood_ratios(eq, now, names)
+    full, ratios = likelihood_ratios(eq, now, NAMES)
     return {n: _chance(ratio) for n, ratio in _followed(eq, now, full, ratios).items()}
 
 

@@ -15,6 +15,8 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.measured import posable_views
 
+_MANY, _FEWEST = 1500, 24  # points of a thinned table, and of a view that stays whole
+
 
 def rig_lenses(observations: Observations, lens: Lens | Mapping[str, Lens]) -> dict[str, Lens]:
     """Return the lens of each camera by name, or the one of all under ''.
@@ -61,16 +63,16 @@ def posable(
     return observations.take(kept), tuple(sorted(left_out))
 
 
-def thinned(observations: Observations, most: int = 1500, fewest: int = 24) -> Observations:
-    """Return about `most` points of many: every second landmark, every third ...
+def thinned(observations: Observations) -> Observations:
+    """Return about _MANY points of more: every second landmark, every third ...
 
-    A view that would be left with less than `fewest` stays whole.
+    A view that would be left with less than _FEWEST stays whole.
     """
-    step = max(len(observations) // most, 1)
+    step = max(len(observations) // _MANY, 1)
     views = np.stack([observations.frame, observations.camera])
     _, view, points = np.unique(views, axis=1, return_inverse=True, return_counts=True)
     place = np.unique(observations.landmark, return_inverse=True)[1].reshape(-1)
-    whole = points[view.reshape(-1)] < fewest * step
+    whole = points[view.reshape(-1)] < _FEWEST * step
     return observations.take(whole | (place % step == 0))
 
 

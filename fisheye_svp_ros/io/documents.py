@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import yaml
 
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.files import LARGEST, read_text
+from fisheye_svp_ros.io.files import read_text
 
 LARGEST_YAML = 1 << 22  # characters
 _MOST_VALUES, _DEEPEST = 100_000, 50
@@ -113,11 +113,9 @@ def parse_json(text: str, where: str | Path, error: type[FisheyeSvpError]) -> di
     return document
 
 
-def read_json(
-    path: str | Path, error: type[FisheyeSvpError], most: int = LARGEST
-) -> dict[str, Any]:
+def read_json(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:
     """Return the object a JSON file holds; raise `error`, naming the file."""
-    return parse_json(read_text(path, error, most), path, error)
+    return parse_json(read_text(path, error), path, error)
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

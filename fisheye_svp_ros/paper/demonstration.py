@@ -98,11 +98,11 @@ def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -
     return rows
 
 
-def residual_fields(records: Iterable[Any], spread: str = 'whole') -> list[ResidualField]:
-    """Return the residuals of every localization with landmarks of a spread (figure 6)."""
+def residual_fields(records: Iterable[Any]) -> list[ResidualField]:
+    """Return the residuals of every localization with the whole environment (figure 6)."""
     return [
         residual_field(one) for one in residual_sets(records)
-        if one.tags.get('environment') == spread
+        if one.tags.get('environment') == 'whole'
     ]
 
 

@@ -129,8 +129,8 @@ class Views(_Views, Batch):
         return self.row >= 0
 
 
-def group_views(observations: Observations, default_sigma: float = 1.0) -> Views:
-    """Group a table into views, ordered by frame and camera; sigma where unknown is the default.
+def group_views(observations: Observations) -> Views:
+    """Group a table into views, ordered by frame and camera; sigma where unknown is 1 px.
 
     Raises ObservationError for an empty table.
     """
@@ -145,7 +145,7 @@ def group_views(observations: Observations, default_sigma: float = 1.0) -> Views
     shape = (len(groups), int(counts.max()))
     row = np.full(shape, -1, dtype=np.int64)
     row[view, slot] = np.arange(len(view))
-    return _views(observations, row, groups[:, 0], groups[:, 1], default_sigma)
+    return _views(observations, row, groups[:, 0], groups[:, 1], 1.0)
 
 
 def rig_cameras(cameras: tuple[str, ...]) -> tuple[str, str] | None:

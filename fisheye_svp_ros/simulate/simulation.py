@@ -54,19 +54,18 @@ def simulate_stereo(
     rng: np.random.Generator,
     *,
     t: Array | None = None,
-    board: Index | None = None,
 ) -> Observations:
     """Return the image points in both cameras of a rig, as `simulate` does, in one table.
 
     rig: left camera in the right one; poses (S,) of the right camera in the world.
     """
-    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
+    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t)
     seen = [
         recorded(model, predicted(model, place, views._replace(camera=views.camera + camera)),
                  sigma, rng)
         for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
     ]
-    return _table(np.stack(seen, axis=1), landmarks, sigma, t, board, STEREO)
+    return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, STEREO)
 
 
 class Predicted(NamedTuple):
