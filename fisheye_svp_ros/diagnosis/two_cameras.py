@@ -126,8 +126,6 @@ def agreed(
 def two_cameras(found: Found, free: Sequence[str]) -> list[TwoCameras]:
     """Return what each two cameras of a rig say of each other, if both saw enough."""
     data = found.evidence.linear.data
-    if data.cameras < 2:
-        return []
     known = KnownTarget.of(data.views)
     cameras = [_alone(found, free, camera, known) for camera in range(data.cameras)
                if (data.camera_of == camera).sum() >= _FEWEST]

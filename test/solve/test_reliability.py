@@ -143,6 +143,11 @@ class TestStereoDepth:
         text = self.doubt(models, left, uv)
         assert text.startswith('pairs that do not match: landmarks 7 (') and ', 20 (' in text
 
+    def test_pairs_that_all_misfit_a_little_are_no_gross_errors(self):
+        models, left, uv = self.pairs(4, 0.5 * SIGMA)
+        uv[0][:, 1] += 2.5 * SIGMA  # of 5 that one pair may be off
+        assert self.doubt(models, left, uv).startswith('the misfit is ')
+
     @pytest.mark.parametrize('spoil', ['swap', 'turn', 'half', 'noise', 'ids'])
     def test_what_is_wrong_with_all_of_them_is_said(self, spoil):
         models, left, uv = self.pairs(5)
