@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import linalg, optimize, special
+from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
@@ -119,8 +119,7 @@ def _against(
 
 def _posterior(f: Factored) -> Array:
     """Return the posterior covariances (L, 3, 3) of landmarks' offsets over the noise variance."""
-    eq, info = f.equations, f.information[:-1, :-1]
-    root = linalg.cholesky(info, lower=True, check_finite=False) if len(info) else info
+    eq = f.equations
     count = len(eq.landmarks)
     by_border = solve_lower(f.factor, f.border[:, :-1], trans=1)
     if eq.by_frame:
@@ -135,8 +134,8 @@ def _posterior(f: Factored) -> Array:
         own = back @ f.inverse
         fixed = (back @ (f.block_border[..., :-1] - f.coupled @ by_border)).reshape(3 * count, -1)
     found = own + _outer(through, count)
-    if len(root):
-        half = solve_lower(root, fixed.T)
+    if len(f.root):
+        half = solve_lower(f.root, fixed.T)
         found = found + _outer(half, count)
     return np.asarray(found)
 

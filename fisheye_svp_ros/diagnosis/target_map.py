@@ -33,7 +33,7 @@ class BoardMap(NamedTuple):
     def spread_out(self) -> bool:
         """Whether the landmarks are not all on one line."""
         across = np.linalg.svd(self.place - self.place.mean(axis=0), compute_uv=False)
-        return len(self.place) > 2 and bool(across[-1] > 1e-6 * across[0])
+        return bool(across[-1] > 1e-6 * across[0])
 
     @property
     def peak_to_valley(self) -> float:

@@ -310,8 +310,10 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     expected = 0.002 * x**2
     np.testing.assert_allclose(one.height, expected - expected.mean(), atol=1e-9)
     assert one.peak_to_valley == pytest.approx(0.002)
-    np.testing.assert_allclose(one.slide, 0, atol=1e-12)
-    assert one.spread_out and not one._replace(place=one.place * [1.0, 0.0]).spread_out
+    np.testing.assert_allclose(one.slide, np.zeros_like(one.place), atol=1e-12)
+    assert one.spread_out
+    for few in (one.place * [1.0, 0.0], one.place[:2], one.place[:1]):
+        assert not one._replace(place=few).spread_out
 
 
 def test_the_depth_of_a_rig_gains_too():

@@ -101,6 +101,14 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     assert solution.values[0] == pytest.approx(f.information[0, 1] / f.information[0, 0])
 
 
+def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():
+    linear = linearised(frames=1)
+    eq = equations(design(linear), linear.frame_columns, linear.residual[..., None])
+    f = factored(eq, some_variances(eq).lam, np.ones(len(eq.landmarks)))
+    root = replace(f, information=np.ones((3, 3))).root
+    np.testing.assert_allclose(root @ root.T, np.ones((2, 2)), atol=1e-4)
+
+
 def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     linear = linearised(frames=5)
     random = design(linear)

@@ -28,6 +28,7 @@ def test_cameras_bear_each_other_out():
     found = diagnose(seen.table, seen.lenses, wanted=Wanted(quick=True))
     (said,) = found.cameras
     assert said.verdict == 'agree' and said.withdrawn == ()
+    assert 'target_shape' in [cause.effect for cause in found.causes]
     assert said.maps.correlation > 0.95
     assert all(one.with_px < 0.8 * one.without_px for one in said.target)
     assert {one.source for one in said.target} == {'left', 'right'}

@@ -118,8 +118,9 @@ def test_a_direction_that_is_missing_ends_no_search():
 def test_landmarks_in_millimetres_are_said():
     lens = load_lens(lens_path('fish214'))
     _, views, _ = spoilt('millimetres', 'board', 1, np.random.default_rng(9))
-    checked = examine(ForwardModel(lens.svp()), views, localize(ForwardModel(lens.svp()), views))
-    assert 'are they in metres?' in checked.reasons[0]
+    for weight in (views.weight, 0.5 * np.ones_like(views.weight)):
+        views, model = views._replace(weight=weight), ForwardModel(lens.svp())
+        assert 'are they in metres?' in examine(model, views, localize(model, views)).reasons[0]
 
 
 class TestStereoDepth:
