@@ -9,6 +9,7 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.initial_pose import initial_poses
@@ -104,6 +105,22 @@ def test_another_lens_without_sigma_is_no_warning_of_numpy():
     some = np.sort(np.random.default_rng(0).permutation(len(table))[:-3])
     with pytest.raises(GeometryError, match='fix a pose'):
         localize_measured(model, table.take(some))
+
+
+@pytest.mark.parametrize('count', [4, 5])
+def test_few_points_start_from_evenly_spread_turns(count):
+    rng = np.random.default_rng(0)
+    true = Pose(rotation_from_vector(rng.normal(size=(60, 3))), 2 * rng.normal(size=(60, 3)))
+    points = rng.normal(size=(60, count, 3))
+    seen = true.into_body(points)
+    direction = seen / np.linalg.norm(seen, axis=-1, keepdims=True)
+
+    def off(spread):
+        local = initial_poses(points, direction, np.ones((60, count)), spread).into_body(points)
+        cosine = (local * direction).sum(axis=-1) / np.linalg.norm(local, axis=-1)
+        return np.degrees(np.arccos(np.clip(cosine, -1, 1)).max(axis=1))
+
+    assert off(spread=True).max() < 3 and np.mean(off(spread=False) > 3) > 0.3
 
 
 def test_a_direction_that_is_missing_ends_no_search():
