@@ -187,11 +187,11 @@ def test_tags_that_others_found(graph: Callable[..., Graph], tmp_path: Path) -> 
     g = graph(f'board:=aprilgrid:{grid}')
     node = g.start(Detector)
     corners = [SimpleNamespace(x=10.0 + i, y=20.0) for i in range(4)]
-    tags = [SimpleNamespace(id=number, corners=corners) for number in (2, 99)]
+    tags = [SimpleNamespace(id=number, corners=corners) for number in (0, 2, 99)]
     message = SimpleNamespace(detections=tags, header=SimpleNamespace(frame_id='camera'))
     frame, ids, uv = node._read_tags(message, 'detections')
-    assert frame == 'camera' and ids.tolist() == [8, 9, 10, 11]
-    assert uv.tolist() == [[9.5 + i, 19.5] for i in range(4)]
+    assert frame == 'camera' and ids.tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
+    assert uv.tolist() == [[9.5 + i, 19.5] for i in range(4)] * 2
     with pytest.raises(ObservationError, match='no tag of the board among 1'):
-        message.detections = tags[1:]
+        message.detections = tags[2:]
         node._read_tags(message, 'detections')

@@ -9,8 +9,10 @@ from helpers.graph import LATCHED, Graph
 from geometry_msgs.msg import TransformStamped  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.markers import camera_shape
+from fisheye_svp_ros.nodes.markers import camera_shape, rays_shape
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -58,5 +60,19 @@ def test_a_camera_opens_along_its_viewing_axis() -> None:
     np.testing.assert_allclose(edges[:, 0, 0], 0.0, atol=1e-12)  # the tip
     corners = edges[:, 0, 1]
     np.testing.assert_allclose(corners[:, 2], 0.1)  # ahead
-    np.testing.assert_allclose(np.abs(corners[:, :2]), 0.04)
+    np.testing.assert_allclose(corners[:, :2], 0.04 * np.array(
+        [[-1, -1], [1, -1], [1, 1], [-1, 1]]))
     np.testing.assert_allclose(edges[:, 1], np.stack([corners, np.roll(corners, -1, 0)], 1))
+
+
+def test_rays_lead_from_landmarks_to_their_viewpoints_on_the_axis() -> None:
+    lens = load_lens(lens_path('fish214'))
+    turned = Pose(rotation_from_vector(np.array([0.0, 0.5, 0.0])), np.array([1.0, 2.0, 3.0]))
+    theta = np.array([0.3, 1.0])
+    local = np.stack([2 * np.sin(theta), 0 * theta, 2 * np.cos(theta)], axis=-1)
+    shift, _ = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))
+    local[:, 2] += shift
+    rays = rays_shape(lens, turned, turned.transform(local), 'left')
+    start, end = turned.into_body(rays.points.reshape(2, 2, 3)).swapaxes(0, 1)
+    np.testing.assert_allclose(end, local, atol=1e-12)
+    np.testing.assert_allclose(start, shift[:, None] * [0, 0, 1], atol=1e-12)

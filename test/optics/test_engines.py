@@ -23,7 +23,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import calibration_poses, rig
-from fisheye_svp_ros.solve import least_squares, localization
+from fisheye_svp_ros.solve import least_squares, localization, stereo_calibration
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
@@ -101,12 +101,12 @@ def test_any_number_of_threads(compiled, monkeypatch, threads):
                compiled.linearise_views(FISH214, *views, True), scale=1e3)
 
 
-def views_and_poses(count, points=33):
+def views_and_poses(count, points=33, noise=0.3):
     rng = np.random.default_rng(94)
     landmarks = points_around(rng, points, 0.4, 2.0, 80.0)
     pose = identity(count).retract(0.05 * rng.normal(size=(count, 6)))
     uv = project(FISH214, pose.into_body(landmarks)).uv
-    uv += 0.3 * rng.normal(size=uv.shape)
+    uv += noise * rng.normal(size=uv.shape)
     uv[rng.uniform(size=uv.shape[:2]) < 0.1] = np.nan
     return views_of(landmarks, uv), pose
 
@@ -136,6 +136,26 @@ def test_poses_and_their_covariances(compiled, engine, count):
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-8)
     np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
     np.testing.assert_array_equal(found.iterations, expected.iterations)
+
+
+def test_exact_images_cost_nothing(compiled):
+    views, pose = views_and_poses(5, noise=0.0)
+    start = pose.retract(np.full((5, 6), 1e-3))
+    found, remaining, _ = compiled.localize(FISH214, views.seen, views.row, MIN_POINTS, start)
+    assert remaining == 0 and found.converged.all() and found.cost.max() < 1e-12
+    assert np.abs(found.pose.difference(pose)).max() < 1e-9
+
+
+def test_small_changes_of_poses_are_those_of_the_reference(compiled):
+    from fisheye_svp_ros.optics.engines.kernels import retract
+
+    rng = np.random.default_rng(97)
+    pose = identity(1).retract(rng.normal(size=(1, 6)))
+    for size in (1e-8, 1e-3, 1.0):
+        change, found = size * rng.normal(size=(1, 6)), identity(1)
+        retract(pose.rotation[0], pose.position[0], change[0], found.rotation[0],
+                found.position[0])
+        assert np.abs(found.difference(pose.retract(change))).max() < 1e-14
 
 
 def test_both_take_the_same_steps(compiled, monkeypatch):
@@ -178,7 +198,7 @@ def test_the_rules_of_damping_are_the_same_compiled(compiled):
         np.testing.assert_allclose(found, want, rtol=1e-12)
 
 
-def test_rigs_and_their_covariances(compiled, engine):
+def test_rigs_and_their_covariances(compiled, engine, monkeypatch):
     rng = np.random.default_rng(95)
     model, landmarks = ForwardModel(FISH214), points_around(rng, 33, 0.5, 2.0, 60.0) * [1, 1, -1]
     left, right = (
@@ -193,6 +213,9 @@ def test_rigs_and_their_covariances(compiled, engine):
         assert np.abs(found.pose.difference(expected.pose)).max() < 1e-10
         np.testing.assert_allclose(found.rig_covariance, expected.rig_covariance, rtol=1e-6)
         np.testing.assert_allclose(found.cost, expected.cost, rtol=1e-10)
+    engines.use('numba')  # and needs nothing of the reference
+    monkeypatch.setattr(stereo_calibration, 'levenberg_marquardt', None)
+    assert calibrate_stereo(model, model, left, right, 2).converged.all()
 
 
 def test_points_near_the_lens_and_singular_systems_go_to_the_reference(compiled, engine):

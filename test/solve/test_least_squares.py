@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.optics.engines.marquardt import STEP_TOLERANCE
+from fisheye_svp_ros.optics.engines.marquardt import FIRST_GROWTH, STEP_TOLERANCE, adjusted
 from fisheye_svp_ros.solve.least_squares import dense_step, levenberg_marquardt, solve_damped
 
 # NIST StRD, Misra1a (lower difficulty): y = b1 (1 - exp(-b2 x)), certified values.
@@ -133,3 +133,12 @@ def test_rounded_residuals_do_not_stop_the_iteration():
     solved = levenberg_marquardt(Curves(circle), ((angle + 0.2)[:, None],))
     assert solved.converged.all()
     np.testing.assert_allclose(solved.state[0][:, 0], angle, rtol=0, atol=STEP_TOLERANCE / 50)
+
+
+def test_damping_falls_with_a_good_step_and_grows_ever_faster_with_bad_ones():
+    """A step that gains what was predicted, half of it, and two that gain nothing."""
+    damping, growth = adjusted(
+        np.full(4, 1e-3), np.array([2.0, 8.0, 2.0, 8.0]), np.array([True, True, False, False]),
+        gained=np.array([1.0, 0.5, -1.0, -1.0]), moved=np.ones(4))
+    np.testing.assert_allclose(damping, [1e-4, 1e-3, 2e-3, 8e-3])
+    np.testing.assert_allclose(growth, [FIRST_GROWTH, FIRST_GROWTH, 4.0, 16.0])
