@@ -237,17 +237,20 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
     landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
     rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
-    within = np.sign(best.x) * _within(e2, z, rows)
+    within = np.sign(best.x) * _within(e2, z, rows, np.nonzero(used)[0])
     p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN else 1.0
     level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
     return NoiseCause(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
 
 
-def _within(e2: Array, z: Array, group: Index) -> float:
-    """Return how squares e2 (M,) grow with z within groups (M,), in standard errors."""
-    count = np.maximum(np.bincount(group), 1)
-    mean, middle = (np.bincount(group, weights=of)[group] / count[group] for of in (e2, z))
-    products = (e2 / np.maximum(mean, 1e-300) - 1) * (z - middle)
+def _within(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
+    """Return how squares e2 (M,) grow with z for the same landmarks (M,), in standard errors.
+
+    What one frame (M,) says counts as one observation: its points may err together.
+    """
+    count = np.maximum(np.bincount(landmark), 1)
+    mean, middle = ((np.bincount(landmark, weights=of) / count)[landmark] for of in (e2, z))
+    products = np.bincount(frame, weights=(e2 / np.maximum(mean, 1e-300) - 1) * (z - middle))
     return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
 
 
