@@ -33,6 +33,7 @@ paper-search: $(VENV)/ready
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind --trials 200
+	$(BIN)/python -m benchmark.local_errors --trials 200
 
 # The same through rendered photographs: only the pictures are handed over; takes long, too.
 blind-images: $(VENV)/ready
