@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from benchmark.blind_figures import Rate
+from benchmark.blind_motion import Swing, of_rows, swing
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.detection import detect
 from fisheye_svp_ros.detect.patterns import parse_pattern
@@ -46,6 +47,7 @@ KEPT = Path('docs/blind/images.jsonl')
 BOARD = 'chessboard:9x6:25mm'
 NOISE = 0.0053  # px, of a corner's u and v in these photographs
 PHOTOGRAPHS = 20
+RATE = 10.0  # photographs a second, of a video
 LENS = Lens('blind', 640, 600, 214.0, 214.3, 320.4, 298.8, KannalaBrandt(-0.01, 0.004, -0.0015),
             np.radians(94.0))
 PLAIN = Print(9, 6, 0.025)
@@ -58,7 +60,7 @@ class World(NamedTuple):
     """What really happens: the lens, the print, the light, and how image points move besides.
 
     later: the lens of the second half of the photographs, where it is another; bumped: the lens
-    was calibrated before.
+    was calibrated before; line_time, s: from row to row, of frames of a video.
     """
 
     lens: Lens = LENS
@@ -67,6 +69,7 @@ class World(NamedTuple):
     moved: Callable[[Array], Array] | None = None  # of image points (..., 2), px
     later: Lens | None = None
     bumped: bool = False
+    line_time: float = 0.0
 
     def of_frame(self, frame: int) -> Lens:
         """Return the lens of a photograph."""
@@ -83,6 +86,7 @@ class Trial:
     verdict: str
     named: list[list[str]]
     left: list[str]
+    odd: int = 0  # photographs that `detect` found something odd about
 
     @property
     def hit(self) -> bool:
@@ -172,6 +176,10 @@ def _step(amount: float, rng: Rng) -> World:
                                cx=LENS.cx + du, cy=LENS.cy + dv))
 
 
+def _shutter(amount: float, rng: Rng) -> World:
+    return World(line_time=1e-5 * amount)
+
+
 def _direction(rng: Rng) -> Array:
     turn = rng.uniform(0, 2 * np.pi)
     return np.array([np.cos(turn), np.sin(turn)])
@@ -181,6 +189,7 @@ HIDDEN: dict[str, Callable[[float, Rng], World]] = {
     'viewpoint_shift': _shift, 'target_shape': _bow, 'landmark_scale': _scale,
     'landmark_survey': _survey, 'decentering': _decentering, 'sensor_tilt': _tilt, 'skew': _skew,
     'radial_profile': _profile, 'principal_point': _centre, 'session_step': _step,
+    'rolling_shutter': _shutter,
 }
 # Nothing that moves corners: photographs under these are to be found adequate.
 CLEAN: dict[str, World] = {
@@ -190,17 +199,19 @@ CLEAN: dict[str, World] = {
 ASIDE: dict[str, World] = {'over-exposed': World(exposure=Exposure(gain=1.4))}
 
 
-def _seen(world: World, poses: Pose) -> Array:
+def _seen(world: World, swung: Swing) -> Array:
     """Return the corners' image points (P, N, 2), px, NaN for none."""
-    points = poses.into_body(world.printed.true_corners())
+    if world.line_time:
+        return of_rows(world.lens, swung, world.printed.true_corners(), world.line_time)
+    points = swung.poses.into_body(world.printed.true_corners())
     uv = np.stack([project(world.of_frame(i), one).uv for i, one in enumerate(points)])
     return np.asarray(uv if world.moved is None else uv + world.moved(uv))
 
 
-def _amount(make: Callable[[float], World], poses: Pose, size: float) -> float:
+def _amount(make: Callable[[float], World], swung: Swing, size: float) -> float:
     """Return the amount that a lens fit without the effect leaves `size` times the noise of."""
     world = make(1.0)
-    uv = _seen(world, poses)
+    uv = _seen(world, swung)
     frame, corner = np.nonzero(np.isfinite(uv).all(axis=-1))
     table = make_observations(frame, corner, uv[frame, corner], PLAIN.corners[corner])
     if world.bumped:
@@ -226,27 +237,48 @@ def _field(world: World, lens: Lens, pose: Pose) -> Field | None:
 def photographs(effect: str, size: float, seed: int, folder: str) -> World:
     """Render the photographs of a trial into a folder; return what was done in them."""
     rng = np.random.default_rng([seed, sum(map(ord, effect))])
-    poses = board_views(LENS, PLAIN, PHOTOGRAPHS, (0.1, 0.28), rng)
+    swung = _moving(rng) if effect == 'rolling_shutter' else Swing(
+        board_views(LENS, PLAIN, PHOTOGRAPHS, (0.1, 0.28), rng), np.zeros((PHOTOGRAPHS, 6)))
     world = (CLEAN | ASIDE).get(effect)
     if world is None:
         def make(amount: float) -> World:
             return HIDDEN[effect](amount, np.random.default_rng(seed))
 
-        world = make(_amount(make, poses, size))
+        world = make(_amount(make, swung, size))
+    images: list[Array] = []
     for i in range(PHOTOGRAPHS):
-        lens, pose = world.of_frame(i), poses.take(i)
-        image = render(lens, world.printed, pose, world.exposure, rng, _field(world, lens, pose))
-        cv2.imwrite(f'{folder}/{i:02d}.png', image)
+        lens, pose = world.of_frame(i), swung.poses.take(i)
+        exposure = replace(world.exposure, twist=tuple(swung.twist[i]), line_time=world.line_time)
+        images.append(render(lens, world.printed, pose, exposure, rng, _field(world, lens, pose)))
+    if world.line_time:
+        _write_video(f'{folder}/video.mkv', images)
+    else:
+        for i, image in enumerate(images):
+            cv2.imwrite(f'{folder}/{i:02d}.png', image)
     return world
+
+
+def _moving(rng: Rng) -> Swing:
+    return swing(LENS, PLAIN.corners, PLAIN.columns, np.arange(PHOTOGRAPHS) / RATE, rng)
+
+
+def _write_video(path: str, images: Sequence[Array]) -> None:
+    """Write a video without loss."""
+    video = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*'FFV1'), RATE, (640, 600))
+    for image in images:
+        video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    video.release()
 
 
 def run_trial(effect: str, size: float, seed: int) -> Trial:
     """Hide an effect in photographs, and ask what it is."""
     with tempfile.TemporaryDirectory() as folder:
         bumped = photographs(effect, size, seed, folder).bumped
+        videos = [str(path) for path in Path(folder).glob('*.mkv')]
         try:
-            seen = detect(find_photographs([folder]), parse_pattern(BOARD))
-            return _asked(effect, size, seed, seen.observations, LENS if bumped else None)
+            seen = detect(find_photographs(videos or [folder]), parse_pattern(BOARD))
+            trial = _asked(effect, size, seed, seen.observations, LENS if bumped else None)
+            return replace(trial, odd=sum(bool(one.notes) for one in seen.searched))
         except FisheyeSvpError as error:
             return Trial(effect, size, seed, f'refused: {error}', [], [])
 

@@ -8,31 +8,47 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import os
+import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from benchmark.prints import printed
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.detection import detect
-from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.finders import AS_FOUND, default_detector
+from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-PAGE = Path(__file__).parents[1] / 'docs' / 'detectors.md'
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'detectors.md'
 DETECTORS = ('saddle', 'sb', 'classic')
 ANGLES = (0, 25, 45, 60, 75, 85, 95)
 LENS = Lens('benchmark', 848, 800, 285.0, 285.0, 423.6, 399.3,
             KannalaBrandt(-0.01, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
 PRINTED, BOARD = Print(9, 6, 0.025), 'chessboard:9x6:25mm'
+TARGET = """target_type: aprilgrid
+tagCols: 6
+tagRows: 5
+tagSize: 0.03
+tagSpacing: 0.3
+"""
+# What else than chessboards, all of much the same size
+OTHERS = ('charuco:9x7:25mm:18mm:DICT_5X5_100', 'aprilgrid:target.yaml', 'circles:8x6:25mm',
+          'circles:4x9:18mm:asymmetric')
 CONDITIONS = {
     'as it should be': Exposure(),
     'defocus of 1.5 px': Exposure(blur=1.5),
@@ -51,32 +67,44 @@ class Corners:
     theta: list[np.ndarray] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
     found: int = 0
+    points: int = 0
 
 
-def rendered(count: int) -> dict[tuple[str, str], Corners]:
-    """Return what each detector finds under each condition."""
-    poses = board_views(LENS, PRINTED, count, (0.1, 0.3), np.random.default_rng(0))
-    pattern, results = parse_pattern(BOARD), {}
+def rendered(
+    board: Pattern, detectors: Sequence[str], count: int
+) -> dict[tuple[str, str], Corners]:
+    """Return what detectors find under each condition, of `count` photographs."""
+    print_ = printed(board)
+    middle = (print_.corners.min(axis=0) + print_.corners.max(axis=0)) / 2
+    views = board_views(LENS, PRINTED, count, (0.1, 0.3), np.random.default_rng(0))
+    results = {(condition, name): Corners() for condition in CONDITIONS for name in detectors}
     for condition, exposure in CONDITIONS.items():
-        for name in DETECTORS:
-            results[condition, name] = Corners()
         for i in range(count):
-            pose = poses.take(i)
-            image = render(LENS, PRINTED, pose, exposure, np.random.default_rng(i))
-            points = pose.into_body(PRINTED.corners)
-            true = project(LENS, points).uv
-            theta = np.degrees(np.arccos(points[:, 2] / np.linalg.norm(points, axis=-1)))
-            for name in DETECTORS:
-                into, start = results[condition, name], time.process_time()
-                seen = find_points(image, pattern, name)
-                into.seconds.append(time.process_time() - start)
-                if isinstance(seen, str):
-                    continue
-                into.found += 1
-                into.error.append(seen.uv - true[seen.ids])
-                into.sigma.append(seen.sigma)
-                into.theta.append(theta[seen.ids])
+            pose = views.take(i)
+            pose = Pose(pose.rotation, pose.position + middle - PRINTED.corners.mean(axis=0))
+            image = render(LENS, print_, pose, exposure, np.random.default_rng(i))
+            for name in detectors:
+                _add(results[condition, name], image, board, name, pose.into_body(print_.corners))
     return results
+
+
+def _add(into: Corners, image: Array, board: Pattern, detector: str, points: Array) -> None:
+    true = project(LENS, points).uv
+    theta = np.degrees(np.arccos(points[:, 2] / np.linalg.norm(points, axis=-1)))
+    start = time.process_time()
+    seen = find_points(image, board, detector)
+    into.seconds.append(time.process_time() - start)
+    into.points += len(points)
+    if isinstance(seen, str):
+        return
+    into.found += 1
+    # Of boards that look the same when turned any order is right.
+    orders = [np.argsort(turn.source) for turn in board.symmetries]
+    error = min((seen.uv - true[order][seen.ids] for order in orders),
+                key=lambda error: float(np.abs(error).max()))
+    into.error.append(error)
+    into.sigma.append(seen.sigma)
+    into.theta.append(theta[seen.ids])
 
 
 def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
@@ -84,11 +112,13 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
     lines = []
     for condition in CONDITIONS:
         lines += ['', f'### {condition[0].upper()}{condition[1:]}', '',
-                  '| detector | found | s | ' + ' | '.join(
+                  '| detector | found | points | s | ' + ' | '.join(
                       f'{a} to {b}°' for a, b in itertools.pairwise(ANGLES)) + ' |',
-                  '|---' * (len(ANGLES) + 2) + '|']
-        for name in DETECTORS:
-            seen = results[condition, name]
+                  '|---' * (len(ANGLES) + 3) + '|']
+        for (_, name), seen in ((key, one) for key, one in results.items() if key[0] == condition):
+            if not seen.found:
+                lines.append(f'| `{name}` | 0 of {count} |' + ' |' * (len(ANGLES) + 1))
+                continue
             error, theta = np.concatenate(seen.error), np.concatenate(seen.theta)
             sigma = np.concatenate(seen.sigma)
             cells = []
@@ -96,11 +126,13 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
                 own = (theta >= low) & (theta < high)
                 bias = np.linalg.norm(error[own].mean(axis=0))
                 scatter = np.sqrt((error[own] ** 2).mean())
-                stated = np.sqrt((sigma[own] ** 2).mean())
-                cells.append(f'{bias:.4f} / {scatter:.4f}'
-                             + (f' / {scatter / stated:.2f}' if name == 'saddle' else ''))
-            lines.append(f'| `{name}` | {seen.found} of {count} | {np.median(seen.seconds):.2f} | '
-                         + ' | '.join(cells) + ' |')
+                over = np.sqrt(((error[own] / sigma[own, None]) ** 2).mean())
+                cells.append((f'{bias:.4f} / {scatter:.4f}'
+                              + ('' if name in AS_FOUND else f' / {over:.2f}'))
+                             if own.any() else '')
+            share = 100 * len(error) / seen.points
+            lines.append(f'| `{name}` | {seen.found} of {count} | {share:.0f} % | '
+                         f'{np.median(seen.seconds):.2f} | ' + ' | '.join(cells) + ' |')
     return lines
 
 
@@ -131,9 +163,19 @@ def main() -> None:
     parser.add_argument('--board', default='chessboard:4x6:30mm')
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    lines = by_angle(rendered(args.count), args.count)
+    lines = by_angle(rendered(parse_pattern(BOARD), DETECTORS, args.count), args.count)
     if args.photographs:
         lines += real(args.photographs, args.board)
+    lines += ['', '## Other boards']
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        Path('target.yaml').write_text(TARGET, encoding='utf-8')
+        others = {}
+        for spec in OTHERS:
+            board = parse_pattern(spec)
+            found = rendered(board, [default_detector(board)], args.count)
+            others |= {(condition, spec): seen for (condition, _), seen in found.items()}
+    lines += by_angle(others, args.count)
     head = PAGE.read_text(encoding='utf-8').partition(_MARK)[0]
     PAGE.write_text(head + _MARK + '\n' + '\n'.join(lines) + '\n', encoding='utf-8')
 

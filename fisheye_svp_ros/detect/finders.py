@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.circle_grid import find_circles
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.detect.square_grid import find_squares
 from fisheye_svp_ros.errors import ParameterError
@@ -80,21 +81,13 @@ def chessboard(image: Grey, pattern: Pattern) -> Found | None:
 
 
 def circles(image: Grey, pattern: Pattern) -> Found | None:
-    """cv2.findCirclesGrid, bright on dark as well."""
-    asymmetric = pattern.kind == 'asymmetric_circles'
-    flags = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
-    for picture in (image, cv2.bitwise_not(image)):
-        ok, centres = cv2.findCirclesGrid(
-            picture, (pattern.columns, pattern.rows), flags=flags | cv2.CALIB_CB_CLUSTERING
-        )
-        if ok:
-            return _all(ok, centres)
-    return None
+    """Blobs, put into a grid from circle to circle."""
+    return find_circles(image, pattern)
 
 
 def charuco(image: Grey, pattern: Pattern) -> Found | None:
     """Chessboard corners between ArUco markers, by cv2.aruco; parts of a board as well."""
-    dictionary = _dictionary(pattern)
+    dictionary = dictionary_of(pattern)
     size = (pattern.columns, pattern.rows)
     if hasattr(_ARUCO, 'CharucoDetector'):
         board = _ARUCO.CharucoBoard(size, pattern.size, pattern.marker, dictionary)
@@ -112,7 +105,7 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
 
 def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
-    dictionary = _dictionary(pattern)
+    dictionary = dictionary_of(pattern)
     if hasattr(_ARUCO, 'ArucoDetector'):
         parameters = _ARUCO.DetectorParameters()
         parameters.markerBorderBits = 2
@@ -164,7 +157,8 @@ def _all(ok: bool, corners: Any) -> Found | None:
     return np.arange(len(uv)), uv
 
 
-def _dictionary(pattern: Pattern) -> Any:
+def dictionary_of(pattern: Pattern) -> Any:
+    """Return the ArUco dictionary of a pattern."""
     if _ARUCO is None:
         raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
                              'install 4.7 or newer, or opencv-contrib')

@@ -12,8 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.detect.patterns import Turn
-from fisheye_svp_ros.detect.points import local_axes
+from fisheye_svp_ros.detect.patterns import Turn, local_axes
 
 _ROUNDS = 30
 _SHUFFLES = 8

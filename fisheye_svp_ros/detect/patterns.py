@@ -20,6 +20,7 @@ _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
 _SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
 _LARGEST = 10_000  # points
 _TAGS = 587  # of the family 36h11
+_NEIGHBOURS = 6
 _FURTHEST = 10.0  # m; a larger spacing is a slip of the unit
 
 
@@ -95,6 +96,18 @@ def parse_pattern(spec: str) -> Pattern:
     return PATTERNS[kind](spec, rest.split(':') if rest else [])
 
 
+def local_axes(points: Array, uv: Array) -> Array:
+    """Return derivatives (M, 2, 2), px/m, of uv (M, 2) by points (M, 2): rows are the axes."""
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1:_NEIGHBOURS + 1]
+    here, there = points[nearest] - points[:, None], uv[nearest] - uv[:, None]
+    weight = 1 / (here**2).sum(axis=-1, keepdims=True)
+    transposed = np.swapaxes(here * weight, -1, -2)
+    # A little towards the isotropic: neighbours may lie on one line.
+    ridge = 1e-6 * np.eye(2)
+    return np.asarray(np.linalg.solve(transposed @ here + ridge, transposed @ there))
+
+
 def _chessboard(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (size,) = _numbers(spec, words, 1, least=3)
     points = _grid(columns, rows, size)
@@ -108,7 +121,8 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
     if marker >= size:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
     points = _grid(columns - 1, rows - 1, size)
-    return Pattern('charuco', spec, columns, rows, points, (size - marker) / 2, _none(points),
+    clearance = (size - marker) / np.sqrt(2)  # the corner of a marker is the nearest of it
+    return Pattern('charuco', spec, columns, rows, points, clearance, _none(points),
                    _checks(columns - 1, rows - 1), size, marker, dictionary)
 
 
@@ -151,7 +165,8 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
     tiles = _grid(columns, rows, tag * (1 + ratio))[:, None, :2] + tag * corner
     points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
-    clearance = tag * min(ratio, 0.2)  # the border of a tag is two of its ten cells
+    # The border of a tag is two of its ten cells: a corner of a cell is nearest.
+    clearance = tag * min(ratio, 0.2 * np.sqrt(2))
     return Pattern('aprilgrid', spec, columns, rows, points, clearance, _none(points),
                    np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, 'DICT_APRILTAG_36H11')
 

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.detect.circle_fit import fit_circles
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
 from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey
-from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 
-_NEIGHBOURS = 6
 _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _SHORTEST, _LONGEST = 24, 32_766  # px, of an image that OpenCV searches
@@ -26,8 +26,7 @@ _SOFT = 2.0  # px of blur; the window must reach well beyond it
 class Points(NamedTuple):
     """Points (M,) of a pattern: which; uv (M, 2) and sigma (M,), px; blur and reach, px.
 
-    sigma is NaN where the image does not tell it (circles); reach (M,): distance to the next edge
-    of the print in the image.
+    reach (M,): distance to the next edge of the print in the image.
     """
 
     ids: Index
@@ -69,9 +68,8 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     every = pattern.kind == 'chessboard' and len(index) == len(pattern.points)
     reach = _least_square(uv, pattern) if every else pattern.clearance * _height(axes)
     if detector == 'circles':
-        none = np.zeros(len(uv))
-        whole = Corners(uv, none + np.nan, none, none, np.ones(len(uv), dtype=bool))
-        return _checked(index, whole, pattern, reach)
+        circles = fit_circles(pixels, uv, pattern.points[index])
+        return _checked(index, circles, pattern, reach)
     square = bool(np.any(pattern.inward))
     towards = pattern.inward[index, :, None] if square else 1.0
     corners = _fitted(pixels, uv, axes * towards, reach, square)
@@ -107,18 +105,6 @@ def _fitted(pixels: Pixels, start: Array, axes: Array, reach: Array, square: boo
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
         whole[found] = size.get(name, part)[again.ok]
     return corners
-
-
-def local_axes(points: Array, uv: Array) -> Array:
-    """Return derivatives (M, 2, 2), px/m, of uv (M, 2) by points (M, 2): rows are the axes."""
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    nearest = np.argsort(distance, axis=1, kind='stable')[:, 1:_NEIGHBOURS + 1]
-    here, there = points[nearest] - points[:, None], uv[nearest] - uv[:, None]
-    weight = 1 / (here**2).sum(axis=-1, keepdims=True)
-    transposed = np.swapaxes(here * weight, -1, -2)
-    # A little towards the isotropic: neighbours may lie on one line.
-    ridge = 1e-6 * np.eye(2)
-    return np.asarray(np.linalg.solve(transposed @ here + ridge, transposed @ there))
 
 
 def _height(axes: Array) -> Array:

@@ -30,13 +30,25 @@ _CHUNK = 200_000  # pixels whose rays are computed at once
 Field = Callable[[Array], Array]  # of places (..., 2), m, on a board
 
 
+class Drawing(NamedTuple):
+    """What else than a chessboard is printed: points (N, 2) and the ends (2,) of it, squares.
+
+    ink: share (...) of ink in boxes about places (..., 2) and of a width (..., 2), squares.
+    """
+
+    points: Array
+    low: Array
+    high: Array
+    ink: Callable[[Array, Array], Array]
+
+
 @dataclass(frozen=True)
 class Print:
     """A chessboard: columns, rows of inner corners, size of a square, m; margin of white, squares.
 
-    bow: height (...), m, over the board's plane at places (..., 2), towards +z; shift: where the
-    print of a place really is, minus that place, (..., 2), m.  The first inner corner is the
-    origin, x right, y down, z into the board.
+    drawing: what is printed in its place; bow: height (...), m, over the board's plane at places
+    (..., 2), towards +z; shift: where the print of a place really is, minus that place, (..., 2),
+    m.  The first inner corner is the origin, x right, y down, z into the board.
     """
 
     columns: int
@@ -45,12 +57,22 @@ class Print:
     margin: float = 0.6
     bow: Field | None = None
     shift: Field | None = None
+    drawing: Drawing | None = None
 
     @property
     def corners(self) -> Array:
-        """Nominal inner corners (N, 3), m, row by row."""
+        """Nominal inner corners (N, 3), m, row by row, or the points of the drawing."""
+        if self.drawing is not None:
+            return np.pad(self.drawing.points, ((0, 0), (0, 1))) * self.size
         y, x = np.mgrid[:self.rows, :self.columns]
         return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * self.size
+
+    @property
+    def ends(self) -> tuple[Array, Array]:
+        """Least and largest x and y of what is printed, (2,), squares."""
+        if self.drawing is not None:
+            return self.drawing.low, self.drawing.high
+        return np.array([-1.0, -1.0]), np.array([self.columns, self.rows], dtype=float)
 
     def true_corners(self) -> Array:
         """Where the inner corners really are (N, 3), m, in the board's frame."""
@@ -133,8 +155,8 @@ def _window(lens: Lens, boards: Sequence[Placed], camera: Pose) -> tuple[slice, 
     """Return the rows and columns in which the sheets lie, and a little more."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for printed, place in boards:
-        first = np.array([-1.0, -1.0]) - printed.margin
-        last = printed.margin + np.array([printed.columns, printed.rows], dtype=float)
+        low_end, high_end = printed.ends
+        first, last = low_end - printed.margin, high_end + printed.margin
         steps = np.linspace(0.0, 1.0, 25)
         sheet = np.stack(np.meshgrid(*(first + steps[:, None] * (last - first)).T), axis=-1)
         sheet *= printed.size
@@ -209,9 +231,9 @@ def _seen_part(
 
 def _near(places: Array, printed: Print) -> Array:
     """Keep places (..., 2) where fields over the board are meant to be asked."""
-    around = 2 * printed.size
-    high = np.array([printed.columns - 1, printed.rows - 1]) * printed.size + around
-    return np.clip(np.nan_to_num(places, nan=-around, posinf=0, neginf=0), -around, high)
+    low, high = (np.array(end) * printed.size for end in printed.ends)
+    low, high = low - printed.size, high + printed.size
+    return np.clip(np.nan_to_num(places, nan=float(low[0]), posinf=0, neginf=0), low, high)
 
 
 def _light(printed: Print, places: Array) -> NDArray[np.float32]:
@@ -241,21 +263,26 @@ def _light(printed: Print, places: Array) -> NDArray[np.float32]:
 
 def _line_distance(printed: Print, places: Array) -> Array:
     """Return how far places (..., 2), squares, are from the nearest lines of x and of y."""
-    count = np.array([printed.columns, printed.rows])
-    squares = np.abs(places - np.clip(np.round(places), -1, count))
-    sheet = np.minimum(np.abs(places + 1 + printed.margin),
-                       np.abs(places - count - printed.margin))
+    low, high = printed.ends
+    squares = np.abs(places - np.clip(np.round(places), low, high))
+    if printed.drawing is not None:
+        squares = np.maximum(np.maximum(low - places, places - high), 0.0)
+    sheet = np.minimum(np.abs(places - low + printed.margin),
+                       np.abs(places - high - printed.margin))
     return np.asarray(np.minimum(squares, sheet))
 
 
 def _reflectance(printed: Print, places: Array, width: Array) -> Array:
     """Return the reflectance at places (..., 2), squares, averaged over a sample's width."""
-    count = np.array([printed.columns, printed.rows])
-    # Brightness changes across the lines through inner corners alone.
-    line = np.clip(np.round(places), 0, count - 1)
-    face = np.where(line % 2 == 0, 1.0, -1.0) * np.clip(2 * (places - line) / width, -1.0, 1.0)
-    ink = 0.5 + 0.5 * face[..., 0] * face[..., 1]
-    low, high = -1.0, count.astype(float)
+    low, high = printed.ends
+    if printed.drawing is not None:
+        near = np.clip(np.nan_to_num(places), low - 1, high + 1)
+        ink = printed.drawing.ink(near, np.nan_to_num(width, nan=1.0, posinf=1.0))
+    else:
+        # Brightness changes across the lines through inner corners alone.
+        line = np.clip(np.round(places), 0, high - 1)
+        face = np.where(line % 2 == 0, 1.0, -1.0) * np.clip(2 * (places - line) / width, -1, 1)
+        ink = 0.5 + 0.5 * face[..., 0] * face[..., 1]
     squares = _inside(places, low, high, width)
     sheet = _inside(places, low - printed.margin, high + printed.margin, width)
     board = _BRIGHT + (_DARK - _BRIGHT) * ink * squares

@@ -11,10 +11,13 @@ from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
 SIDE, COUNT, BLUR, NOISE = 41, 150, 0.6, 1.5
 
 
-def corners(angle: float, clearance: float, square: bool, band: int = 0) -> tuple[Corners, float]:
+def corners(
+    angle: float, clearance: float, square: bool, band: int = 0, gain: float = 0.0
+) -> tuple[Corners, float]:
     """Fit a corner seen COUNT times in noise; return it, and how far it scatters, px.
 
-    band: columns of the first image's right edge that something else covers.
+    band: columns of the first image's right edge that something else covers; gain: of a sensor
+    whose scale ends at 255.
     """
     rng = np.random.default_rng(0)
     axes = np.array([[1.0, 0.0], [np.cos(np.radians(angle)), np.sin(np.radians(angle))]])
@@ -28,6 +31,8 @@ def corners(angle: float, clearance: float, square: bool, band: int = 0) -> tupl
     image = 120 + 95 * np.tile(soft, (1, COUNT))
     image += NOISE * rng.standard_normal(image.shape)
     image[:, SIDE - band:SIDE] = 0.0
+    if gain:
+        image = np.clip(np.round(gain * image), 0, 255).astype(np.uint8)
     start = np.stack([place[0] + SIDE * np.arange(COUNT), np.full(COUNT, place[1])], axis=-1)
     found = fit_corners(image, start + rng.uniform(-0.3, 0.3, start.shape),
                         np.tile(axes, (COUNT, 1, 1)), np.full(COUNT, clearance), square)
@@ -43,6 +48,13 @@ def test_scatter_is_the_stated_sigma(angle: float, clearance: float, square: boo
     found, scatter = corners(angle, clearance, square)
     assert found.ok.mean() > 0.97
     assert scatter / np.sqrt((found.sigma[found.ok] ** 2).mean()) == pytest.approx(1.0, abs=0.2)
+
+
+def test_light_beyond_the_end_of_the_scale_is_none_that_was_measured() -> None:
+    """Brightness above it was taken for noiseless, and sigma came out a third too small."""
+    found, scatter = corners(90, 20, False, gain=1.5)
+    assert found.ok.mean() > 0.97
+    assert scatter / np.sqrt((found.sigma[found.ok] ** 2).mean()) == pytest.approx(1.0, abs=0.15)
 
 
 def test_sigma_is_that_of_the_photograph_where_a_window_tells_little() -> None:

@@ -1,0 +1,236 @@
+"""Where the centre of a printed circle is in the image, and how sure that is.
+
+The image of a circle is a blurred ellipse, bent as a fisheye bends it: its own centre is not the
+image of the circle's centre.  How the image bends around a circle follows from where its
+neighbours are; ellipse, centre, blur, brightness, contrast and the gradient of the light are
+fitted by least squares.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.special import erf
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.detect.corner_fit import CONTRAST, Corners
+from fisheye_svp_ros.detect.patterns import local_axes
+from fisheye_svp_ros.detect.photographs import Pixels
+from fisheye_svp_ros.detect.windows import PIXEL, WindowProblem, Windows, windows
+from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.solve.lens_calibration import calibrate
+
+_FREE = ('f', 'k1', 'k2')  # of the lens that fits one photograph
+_ROUNDS = 2  # the neighbours' centres are fitted, too
+_WITHIN = 0.7  # of the way from the circle's edge to the next circle's
+_LARGEST = 48.0  # px from the middle of one to the edge of the next; the image is halved then
+_SMALLEST = 3.0  # px, of a circle's lesser half axis
+_UNKNOWNS = 10  # u, v; ellipse (3); log blur; brightness, contrast, its gradient
+_ROOT = float(np.sqrt(2 / np.pi))
+
+
+def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
+    """Fit the circles at start (N, 2), px, in an image (H, W); points (N, 3), m: their centres.
+
+    Of what is found contrast is above 0 for dark circles; sigma is that of the centre, NaN where
+    nothing tells how the image bends.
+    """
+    apart = _apart(points)
+    axes = local_axes(points[:, :2], start)
+    longest = np.linalg.norm(axes, axis=(1, 2)).max()
+    if 0.5 * apart * longest > _LARGEST:
+        return _halved(pixels, start, points)
+    radius = _radius(pixels, start, axes, 0.5 * apart)
+    found = _none(start)
+    if not 0.05 < radius / apart < 0.49:
+        return found
+    for _ in range(_ROUNDS):
+        axes, bend = _bends(points, found.uv, pixels.shape, radius)
+        fitted = _fitted(pixels, found.uv, axes, bend, radius, apart)
+        found = fitted._replace(uv=np.where(fitted.ok[:, None], fitted.uv, found.uv))
+    return found
+
+
+def _none(uv: Array) -> Corners:
+    nothing = np.full(len(uv), np.nan)
+    return Corners(uv, nothing, nothing, nothing, np.zeros(len(uv), dtype=bool))
+
+
+def _halved(pixels: Pixels, start: Array, points: Array) -> Corners:
+    height, width = (side // 2 * 2 for side in pixels.shape)
+    half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
+                      interpolation=cv2.INTER_AREA)
+    found = fit_circles(half, (start + 0.5) / 2 - 0.5, points)
+    return found._replace(uv=2 * found.uv + 0.5, sigma=2 * found.sigma, blur=2 * found.blur)
+
+
+def _apart(points: Array) -> float:
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    return float(np.sort(distance, axis=1)[:, 1].min())
+
+
+def _bends(
+    points: Array, uv: Array, shape: tuple[int, ...], step: float
+) -> tuple[Array, Array]:
+    """Return derivatives of the image by places on the board: (N, 2, 2), px/m, rows are the axes.
+
+    And second ones (N, 3, 2), px/m^2, of x^2/2, x y and y^2/2: those of the lens that fits this
+    one photograph best, by differences over a step, m.
+    """
+    table = make_observations(np.zeros(len(uv), dtype=np.int64), np.arange(len(uv)), uv, points)
+    try:
+        fitted = calibrate(table, 'kannala_brandt', (shape[1], shape[0]), _FREE).adjusted
+    except FisheyeSvpError:
+        return local_axes(points[:, :2], uv), np.full((len(uv), 3, 2), np.nan)
+    around = step * np.array([[x, y, 0.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
+    image = project(fitted.lens, fitted.pose.take(0).into_body(
+        (points[:, None] + around).reshape(-1, 3)), limited=False).uv.reshape(-1, 3, 3, 2)
+    right, down = (image[:, 2, 1] - image[:, 0, 1]) / 2, (image[:, 1, 2] - image[:, 1, 0]) / 2
+    middle = 2 * image[:, 1, 1]
+    both = (image[:, 2, 2] - image[:, 2, 0] - image[:, 0, 2] + image[:, 0, 0]) / 4
+    second = [image[:, 2, 1] + image[:, 0, 1] - middle, both,
+              image[:, 1, 2] + image[:, 1, 0] - middle]
+    return np.stack([right, down], axis=1) / step, np.stack(second, axis=1) / step**2
+
+
+def _on_board(offset: Array, axes: Array) -> Array:
+    """Return places (N, P, 2), m, on the board of offsets (N, P, 2), px, from a circle."""
+    return np.asarray(offset @ np.linalg.inv(axes))
+
+
+def _radius(pixels: Pixels, start: Array, axes: Array, reach: float) -> float:
+    """Return the radius, m, of the circles, from how much of their windows is like the middle."""
+    cut = windows(pixels, start, float(reach * np.linalg.norm(axes, axis=(1, 2)).max()))
+    offset = cut.offset.T - (start - cut.place)[:, None]
+    far = np.linalg.norm(_on_board(offset, axes), axis=-1) / reach
+    mine, middle, rim = ((far < end) & (far >= begin) & cut.inside
+                         for begin, end in ((0.0, 1.0), (0.0, 0.2), (0.85, 1.0)))
+    radii = []
+    for data, inside, inner, outer in zip(cut.data, mine, middle, rim, strict=True):
+        if inner.any() and outer.any():
+            dark, bright = float(np.median(data[inner])), float(np.median(data[outer]))
+            alike = np.clip((data[inside] - bright) / (dark - bright or 1.0), 0.0, 1.0)
+            radii.append(np.sqrt(alike.mean()) * reach)
+    return float(np.median(radii or [0.0]))
+
+
+def _fitted(
+    pixels: Pixels, start: Array, axes: Array, bend: Array, radius: float, apart: float
+) -> Corners:
+    reach = radius + _WITHIN * (apart - 2 * radius)
+    longest = np.linalg.norm(axes, axis=(1, 2)).max()
+    known = np.isfinite(bend).all()
+    bend = np.nan_to_num(bend)
+    cut = windows(pixels, start, float(reach * longest))
+    problem = _Problem(cut, start, axes, bend, reach)
+    values = problem.solve(problem.start(radius))
+    judged = problem.judge(values, symmetric=True)
+    uv, contrast = values[:, :2] + cut.place, values[:, 7]
+    blur = np.sqrt(np.maximum(np.exp(2 * values[:, 5]) - PIXEL, 0.0))
+    least = 1 / np.linalg.norm(_matrix(values), ord=2, axis=(1, 2))
+    with np.errstate(invalid='ignore'):
+        ok = (
+            judged.settled & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
+            & (blur < 2 * least) & (least > _SMALLEST)
+            & (np.abs(contrast) > CONTRAST * judged.noise)
+            & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
+        )
+    sigma, ok = judged.common(ok)
+    return Corners(uv, sigma if known else sigma + np.nan, blur, -contrast, ok)
+
+
+def _matrix(values: Array) -> Array:
+    """Return symmetric matrices (N, 2, 2) that turn an ellipse into the unit circle."""
+    return np.asarray(values[:, [2, 3, 3, 4]].reshape(-1, 2, 2))
+
+
+class _Problem(WindowProblem):
+    """Circles; state (N, 10)."""
+
+    def __init__(
+        self, cut: Windows, start: Array, axes: Array, bend: Array, reach: float
+    ) -> None:
+        self._first, self._axes, self._bend = start - cut.place, axes, bend
+        offset = cut.offset.T - self._first[:, None]
+        far = np.linalg.norm(_on_board(offset, axes), axis=-1)
+        scale = np.sqrt(np.abs(np.linalg.det(axes)))[:, None]
+        super().__init__(cut, np.clip((reach - far) * scale + 0.5, 0.0, 1.0) * cut.inside)
+
+    def start(self, radius: float) -> Array:
+        """Return a start (N, 10): circles of a radius, m, as their neighbours have it."""
+        values = np.zeros((len(self._first), _UNKNOWNS))
+        values[:, :2] = self._first
+        # (A A^T)^(-1/2), A from the unit circle to the image
+        turn, size, _ = np.linalg.svd(radius * np.swapaxes(self._axes, -1, -2))
+        matrix = (turn / size[:, None]) @ np.swapaxes(turn, -1, -2)
+        values[:, 2:5] = matrix.reshape(-1, 4)[:, [0, 1, 3]]
+        values[:, 7] = 1.0
+        shape, _ = self.model(values, np.arange(len(values)))
+        total = np.maximum(self.weight.sum(axis=1), 1e-9)
+        mean = (self.weight * shape).sum(axis=1) / total
+        level = (self.weight * self.cut.data).sum(axis=1) / total
+        off = self.weight * (shape - mean[:, None])
+        values[:, 7] = (off * self.cut.data).sum(1) / np.maximum((off * shape).sum(1), 1e-9)
+        values[:, 6] = level - values[:, 7] * mean
+        return values
+
+    def lost(self, values: Array) -> Mask:
+        return np.asarray((np.abs(values[:, 5]) > 3)
+                          | (np.linalg.det(_matrix(values)) <= 0))
+
+    def model(self, values: Array, index: Index) -> tuple[Array, Array]:
+        offset = self.cut.offset.T - values[:, None, :2]
+        place, by_place = self._unbent(offset, index)
+        blur = np.exp(values[:, 5:6])
+        distance, by_distance = _distance(place, values[:, 2:5])
+        distance = distance / blur
+        shape = erf(distance / np.sqrt(2))
+        level, contrast = values[:, 6:7], values[:, 7:8]
+        light = 1 + (offset @ values[:, 8:, None])[..., 0]
+        face = level + contrast * shape
+        rise = contrast * light * _ROOT * np.exp(-0.5 * distance * distance)
+        slope = by_distance * (rise / blur)[..., None]
+        jacobian = np.empty((*shape.shape, _UNKNOWNS))
+        jacobian[..., :2] = (-(slope[..., None, :2] @ by_place)[..., 0, :]
+                             - face[..., None] * values[:, None, 8:])
+        jacobian[..., 2:5] = slope[..., 2:]
+        jacobian[..., 5] = -rise * distance
+        jacobian[..., 6], jacobian[..., 7] = light, shape * light
+        jacobian[..., 8:] = face[..., None] * offset
+        return face * light, jacobian
+
+    def _unbent(self, offset: Array, index: Index) -> tuple[Array, Array]:
+        """Return offsets (A, P, 2), px, as they were without the bend, and derivatives by them."""
+        bend, onto = self._bend[index], np.linalg.inv(self._axes[index])
+        x, y = np.moveaxis(offset @ onto, -1, 0)
+        bends = np.stack([x * x / 2, x * y, y * y / 2], axis=-1) @ bend
+        by_x = np.stack([x, y], axis=-1) @ bend[:, :2]
+        by_y = np.stack([x, y], axis=-1) @ bend[:, 1:]
+        # Rows are the place's coordinates, columns the offset's.
+        change = np.stack([by_x, by_y], axis=-1) @ np.swapaxes(onto, -1, -2)[:, None]
+        return offset - bends, np.eye(2) - change
+
+
+def _distance(place: Array, matrix: Array) -> tuple[Array, Array]:
+    """Return distances (A, P), px, to first order, of places (A, P, 2) from ellipses (A, 3).
+
+    And derivatives (A, P, 5) by the place and by the ellipse's matrix: xx, xy, yy.
+    """
+    turn = matrix[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    x = place @ turn  # on the unit circle at the edge
+    y = x @ turn
+    far = np.sqrt((x * x).sum(axis=-1) + 1e-12)
+    steep = np.sqrt((y * y).sum(axis=-1) + 1e-12)  # far over the slope of far
+    by_far, by_steep = (2 * far - 1) / (steep * far), far * (1 - far) / steep**3
+    z = y @ turn
+    derivatives = np.empty((*far.shape, 5))
+    derivatives[..., :2] = by_far[..., None] * y + by_steep[..., None] * (z @ turn)
+    for k, (i, j) in enumerate(((0, 0), (0, 1), (1, 1))):
+        both = 0.5 if i == j else 1.0
+        by_x = x[..., i] * place[..., j] + x[..., j] * place[..., i]
+        by_y = (y[..., i] * x[..., j] + y[..., j] * x[..., i]
+                + z[..., i] * place[..., j] + z[..., j] * place[..., i])
+        derivatives[..., 2 + k] = both * (by_far * by_x + by_steep * by_y)
+    return far * (far - 1) / steep, derivatives

@@ -1,0 +1,153 @@
+"""A grid of circles: ellipses, joined from one to the next.
+
+How far apart neighbours are, over the ellipse that each of them is, a fisheye hardly changes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.detect.patterns import Pattern
+
+_BLOCKS = (31, 91, 271)  # px, of the local threshold
+_BELOW = 8  # grey levels from the mean there
+_SOFTENED = 1.0  # px; noise has no contours
+_LEAST, _LARGEST = 12.0, 0.02  # px^2; of the image: area of a circle
+_FILLED = 0.1  # how far its area may be from its ellipse's
+_NEIGHBOUR = 1.22  # times the usual distance; diagonal neighbours are at 1.41
+_ALONG = 0.8  # least cosine between a step and the one before
+_SEEDS = 8
+
+Grid = dict[tuple[int, int], int]
+
+
+class Ellipses(NamedTuple):
+    """Centres (B, 2), px, and matrices (B, 2, 2) that turn an ellipse into the unit circle."""
+
+    centre: Array
+    matrix: Array
+
+
+def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
+    """Return the circles of a grid in a grey image, dark or bright; None without a whole one."""
+    wanted = _lattice(pattern)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SOFTENED), dtype=np.uint8)
+    for bright in (False, True):
+        seen = _ellipses(image, bright)
+        if len(seen.centre) < len(wanted):
+            continue
+        near = _neighbours(seen)
+        off = np.linalg.norm(seen.centre - np.median(seen.centre, axis=0), axis=1)
+        inner = np.lexsort((off, -near.sum(axis=1)))
+        for seed in inner[:_SEEDS].tolist():
+            grid = _grown(seen, near, seed)
+            found = _placed(grid, wanted) if len(grid) >= len(wanted) else None
+            if found is not None:
+                return np.arange(len(found)), seen.centre[found]
+    return None
+
+
+def _lattice(pattern: Pattern) -> Index:
+    """Return integer places (N, 2) of the points, neighbours one apart."""
+    xy = np.round(pattern.points[:, :2] / pattern.size).astype(np.int64)
+    if pattern.kind == 'asymmetric_circles':
+        xy = np.stack([xy.sum(axis=1), xy[:, 1] - xy[:, 0]], axis=-1) // 2
+    return xy
+
+
+def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
+    kind = cv2.THRESH_BINARY if bright else cv2.THRESH_BINARY_INV
+    parts = []
+    for block in _BLOCKS:
+        mask = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, block,
+                                     -_BELOW if bright else _BELOW)
+        contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+        parts += [cv2.moments(contour) for contour in contours]
+    parts = [part for part in parts if _LEAST <= part['m00'] <= _LARGEST * image.size]
+    # The largest first: a circle larger than the block has a hole.
+    parts.sort(key=lambda part: -float(part['m00']))
+    centres, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
+    for part in parts:
+        area = part['m00']
+        spread = np.array([[part['mu20'], part['mu11']], [part['mu11'], part['mu02']]]) / area
+        inner = np.linalg.det(spread)
+        if inner <= 0 or abs(4 * np.pi * np.sqrt(inner) / area - 1) > _FILLED:
+            continue
+        centre = np.array([part['m10'], part['m01']]) / area
+        off = np.linalg.norm(np.einsum('iab,ib->ia', matrices, centre - centres), axis=1)
+        if off.min(initial=np.inf) > 1:
+            size, turn = np.linalg.eigh(spread)
+            centres = np.vstack([centres, centre])
+            matrices = np.concatenate([matrices, [(turn / (2 * np.sqrt(size))) @ turn.T]])
+    return Ellipses(centres, matrices)
+
+
+def _neighbours(found: Ellipses) -> Mask:
+    """Return which ellipses (B, B) are as far apart as most are from their nearest ones."""
+    move = found.centre[None] - found.centre[:, None]
+    far = np.linalg.norm(np.einsum('iab,ijb->ija', found.matrix, move), axis=-1)
+    far = (far + far.T) / 2
+    np.fill_diagonal(far, np.inf)
+    usual = np.median(np.sort(far, axis=1)[:, 1])
+    return np.asarray((far < _NEIGHBOUR * usual) & (far > usual / _NEIGHBOUR))
+
+
+def _grown(found: Ellipses, near: Mask, seed: int) -> Grid:
+    """Return ellipses by column and row that can be reached from a first one, step by step."""
+    move = found.centre[near[seed]] - found.centre[seed]
+    if len(move) < 2:
+        return {}
+    unit = _units(move, found.matrix[seed])
+    second = move[np.argmin(np.abs(unit @ unit[0]))]
+    clockwise = move[0][0] * second[1] - move[0][1] * second[0] > 0
+    steps = np.array([move[0], second if clockwise else -second])
+    grid, own, used, waiting = {(0, 0): seed}, {(0, 0): steps}, {seed}, [(0, 0)]
+    while waiting:
+        place = waiting.pop(0)
+        here = grid[place]
+        others = np.flatnonzero(near[here])
+        units = _units(found.centre[others] - found.centre[here], found.matrix[here])
+        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            other = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
+            along = units @ _units(sign * own[place][axis], found.matrix[here])
+            if other in grid or not len(along) or along.max() < _ALONG:
+                continue
+            next_one = int(others[np.argmax(along)])
+            if next_one in used:
+                continue
+            steps = own[place].copy()
+            steps[axis] = sign * (found.centre[next_one] - found.centre[here])
+            grid[other], own[other] = next_one, steps
+            used.add(next_one)
+            waiting.append(other)
+    return grid
+
+
+def _units(move: Array, matrix: Array) -> Array:
+    """Return directions (..., 2) as they are where an ellipse is the unit circle."""
+    turned = move @ matrix
+    return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True))
+
+
+def _placed(grid: Grid, wanted: Index) -> list[int] | None:
+    """Return the blobs (N,) of the wanted places, turned and moved to where all are; once."""
+    found = []
+    turned = wanted
+    low = np.array(list(grid)).min(axis=0)
+    size = np.ptp(np.array(list(grid)), axis=0)
+    for _ in range(4):
+        turned = np.stack([-turned[:, 1], turned[:, 0]], axis=-1)
+        places = turned - turned.min(axis=0)
+        spare = size - places.max(axis=0)
+        for right in range(spare[0] + 1):
+            for down in range(spare[1] + 1):
+                keys = [(int(a), int(b)) for a, b in places + low + (right, down)]
+                if all(key in grid for key in keys):
+                    found.append([grid[key] for key in keys])
+    same = {tuple(sorted(one)) for one in found}
+    return found[0] if len(same) == 1 else None

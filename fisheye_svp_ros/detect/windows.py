@@ -1,0 +1,237 @@
+"""Windows of an image around points, models fitted to them, and how sure that makes the points.
+
+Every window is a system of its own.  What noise moves a point by follows from the residuals of its
+window and of the whole photograph, as far as its windows have it in common.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from scipy.ndimage import gaussian_filter
+from scipy.special import digamma, fdtrc, polygamma
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.detect.photographs import Pixels
+from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_marquardt
+
+SMOOTHING = 0.8  # px; sharpened photographs have edges that would fall between pixels
+PIXEL = 1 / 12 + SMOOTHING**2  # px^2: what pixels and smoothing add to the blur
+_ITERATIONS = 25
+_FEW = 8  # points of one photograph, whose noise tells little of each other's
+_MUCH, _CHANCE = 4.0, 1e-6  # so much noisier a window is not by chance
+_KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after smoothing
+_PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
+_INDEPENDENT = 1 / (2 * np.pi * SMOOTHING**2)  # of smoothed pixels: one over their rho^2 summed
+_TOUCHED = 0.02  # of a smoothed pixel
+
+
+class Windows(NamedTuple):
+    """Round windows (N, P) of a smoothed image: data; offset (2, P), px, from place (N, 2).
+
+    inside (N, P): the image; clipped (N, P): light at the end of the scale is in it; side, px, of
+    the square around, and which of its pixels are in a window, (P,).
+    """
+
+    data: Array
+    offset: Array
+    place: Index
+    inside: Mask
+    clipped: Mask
+    side: int
+    round: Index
+
+
+class Judged(NamedTuple):
+    """How sure fits (N,) are: sigma of u and of v, px; noise, of a smoothed pixel; settled.
+
+    noise2, gain2, freedom (N,): variance of a pixel, what it is multiplied by, of how many.
+    """
+
+    sigma: Array
+    noise: Array
+    settled: Mask
+    noise2: Array
+    gain2: Array
+    freedom: Array
+
+    def common(self, ok: Mask) -> tuple[Array, Mask]:
+        """Return sigma (N,) drawn towards the noise of all that are ok (N,), and which still are.
+
+        Something else is in the windows of the others.
+        """
+        if ok.sum() < _FEW:
+            return self.sigma, ok
+        sigma, ok = self.sigma.copy(), ok.copy()
+        alike, foreign = _moderated(self.noise2[ok], self.freedom[ok])
+        sigma[ok] = np.sqrt(alike * self.gain2[ok])
+        ok[ok] = ~foreign
+        return sigma, ok
+
+
+def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
+    """Cut windows of a radius, px, around start (N, 2), px, out of an image (H, W)."""
+    half = int(np.ceil(reach)) + 1
+    height, width = pixels.shape
+    place = np.round(start).astype(np.int64)
+    v, u = np.mgrid[-half:half + 1, -half:half + 1].reshape(2, -1)
+    round_ = np.flatnonzero(np.hypot(u, v) <= half + 0.5)  # no corners of the square
+    u, v = u[round_], v[round_]
+    columns, rows = place[:, :1] + u, place[:, 1:] + v
+    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), SMOOTHING)
+    at = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,
+                   inside & _clipped(pixels)[at], 2 * half + 1, round_)
+
+
+class WindowProblem(ABC):
+    """N windows as N independent systems, see least_squares.Problem; state (N, U).
+
+    A subclass has the model; u, v of the point are the first unknowns.
+    """
+
+    def __init__(self, cut: Windows, weight: Array) -> None:
+        """Take the windows, and weights (N, P) of their pixels."""
+        self.cut, self.weight = cut, weight
+        # The scale of whitened residuals only says when to stop: at steps that change the window
+        # by less than a thousandth of its contrast in all.
+        self._noise = np.maximum(5e5 * cut.data.std(axis=1), 1e-6)
+
+    @abstractmethod
+    def model(self, values: Array, index: Index) -> tuple[Array, Array]:
+        """Return what windows (A, P) look like, and derivatives (A, P, U)."""
+
+    @abstractmethod
+    def lost(self, values: Array) -> Mask:
+        """Return which states (A, U) are outside the domain."""
+
+    def solve(self, values: Array) -> Array:
+        """Return the states (N, U) of least squares, from a start."""
+        return levenberg_marquardt(self, (values,), _ITERATIONS).state[0]
+
+    def parts(self, values: Array, index: Index) -> tuple[Array, Array, Array]:
+        """Return residuals (A, P), derivatives of the model (A, P, U) and weights (A, P)."""
+        image, jacobian = self.model(values, index)
+        residual = self.cut.data[index] - image
+        # Of light beyond the end of the scale no more is known than that it is there.
+        known = ~(self.cut.clipped[index] & (residual < 0))
+        return residual * known, jacobian * known[..., None], self.weight[index] * known
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        residual, jacobian, weight = self.parts(state[0], index)
+        weight = weight / self._noise[index, None] ** 2
+        transposed = np.swapaxes(jacobian * weight[..., None], -1, -2)
+        hessian = transposed @ jacobian
+        gradient = -(transposed @ residual[..., None])[..., 0]
+        cost = (weight * residual**2).sum(axis=1)
+        return np.where(self.lost(state[0]) | ~np.isfinite(cost), np.inf, cost), (
+            hessian, gradient)
+
+    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
+        return dense_step(normal, damping)
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        return (state[0] + step[0],)
+
+    def judge(self, values: Array, symmetric: bool) -> Judged:
+        """Return how sure solutions (N, U) are.
+
+        symmetric: of a window that looks the same from both sides of its point, only what differs
+        from one to the other counts; halos of sharpening are the same on both, and move nothing.
+        """
+        cut = self.cut
+        residual, jacobian, weight = self.parts(values, np.arange(len(values)))
+        weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
+        hessian, pull = weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
+        scale = np.sqrt(np.maximum(np.einsum('nii->ni', hessian), 1e-30))
+        scale = scale[:, :, None] * scale[:, None, :]
+        covariance = np.linalg.inv(hessian / scale + 1e-12 * np.eye(values.shape[1])) / scale
+        gain = covariance @ weighted
+        # What is left of the residuals over what is left of noise of unit size, fitted likewise.
+        probes = _unit_noise(cut.side)
+        chosen = (np.arange(len(values))[:, None] * _EACH + np.arange(_EACH)) % len(probes)
+        noise = probes[chosen][..., cut.round]
+        noise -= (noise @ np.swapaxes(gain, -1, -2)) @ np.swapaxes(jacobian, -1, -2)
+        whole = np.zeros((len(values), 2 + _EACH, cut.side**2))
+        whole[..., cut.round] = np.concatenate([weight[:, None], residual[:, None], noise], axis=1)
+        if symmetric:
+            squares = _odd_squares(whole, values[:, :2], cut.side)
+        else:
+            squares = np.asarray((whole[:, :1] * whole[:, 1:] ** 2).sum(axis=-1))
+        usual = squares[:, 1:].mean(axis=1)
+        noise2 = squares[:, 0] / np.maximum(usual, 1e-9)
+        freedom = np.maximum(usual / _KEPT * _INDEPENDENT, 1.0)
+        # Smoothed noise is correlated: what each raw pixel moves the point by, squared and summed.
+        moved = np.zeros((len(values), 2, cut.side**2))
+        moved[..., cut.round] = gain[:, :2]
+        moved = gaussian_filter(
+            moved.reshape(-1, 2, cut.side, cut.side), (0, 0, SMOOTHING, SMOOTHING))
+        gain2 = (moved**2).sum(axis=(1, 2, 3)) / 2
+        sigma = np.sqrt(noise2 * gain2)
+        # What the fit would still move the point by; a blur may take longer to settle.
+        left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
+        settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + 5e-4)
+        return Judged(sigma, np.sqrt(_KEPT * noise2), settled, noise2, gain2, freedom)
+
+
+def _clipped(pixels: Pixels) -> Mask:
+    """Return which smoothed pixels (H, W) hold some of those at the end of the scale."""
+    if pixels.dtype.kind != 'u':
+        return np.zeros(pixels.shape, dtype=bool)
+    full = np.asarray(pixels == np.iinfo(pixels.dtype).max, dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(full, (0, 0), SMOOTHING) > _TOUCHED)
+
+
+def _moderated(noise2: Array, freedom: Array) -> tuple[Array, Mask]:
+    """Return variances (N,), each from so few degrees of freedom, drawn towards their common one.
+
+    By as much as they scatter no more than variances of one noise do (empirical Bayes).  Also
+    which (N,) are beyond all others: something else is in their windows, the edge of the field.
+    Source: Smyth, Linear models and empirical Bayes methods, Statistical Applications in Genetics
+    and Molecular Biology 3 (2004), section 6.2.
+    """
+    half = freedom / 2
+    level = np.log(np.maximum(noise2, 1e-30)) - digamma(half) + np.log(half)
+    centre = float(np.median(level))
+    spread = (1.4826 * np.median(np.abs(level - centre))) ** 2 - polygamma(1, half).mean()
+    # 1 / (x - 0.5) is near the trigamma of x, from above one on.
+    prior = 2 * min(1 / max(float(spread), 1e-6) + 0.5, 1e6)
+    common = np.exp(centre + digamma(prior / 2) - np.log(prior / 2))
+    foreign = fdtrc(freedom, prior, noise2 / (_MUCH * common)) < _CHANCE
+    return (prior * common + freedom * noise2) / (prior + freedom), np.asarray(foreign)
+
+
+@lru_cache(maxsize=8)
+def _unit_noise(side: int) -> Array:
+    """Return windows (K, side * side) of white noise of unit variance, smoothed as images are."""
+    noise = np.random.default_rng(0).standard_normal((_PROBES, side + 8, side + 8))
+    smooth = gaussian_filter(noise, (0, SMOOTHING, SMOOTHING))[:, 4:-4, 4:-4]
+    return np.asarray(smooth.reshape(_PROBES, -1))
+
+
+def _odd_squares(windows: Array, corner: Array, side: int) -> Array:
+    """Return sums (N, K) of squares of residuals, windows[:, 1:] (N, 1 + K, P); first are weights.
+
+    Of each residual the part that is odd about the corner (N, 2), px.
+    """
+    # The mirror image of each pixel lies between four others.
+    opposite = 2 * corner[:, ::-1, None] + side - 1 - np.arange(side)
+    first = np.floor(opposite).astype(np.int64)
+    part = opposite[..., 0] - first[..., 0]
+    inside = (first >= 0) & (first < side - 1)
+    first = np.clip(first, 0, side - 2)
+    grid = windows.reshape(*windows.shape[:2], side, side)
+    system = np.arange(len(corner))[:, None, None]
+    mirrored = np.zeros_like(grid)
+    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        share = np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1])
+        mirrored += share[:, None, None, None] * np.moveaxis(
+            grid[system, :, first[:, 0, :, None] + down, first[:, 1, None] + right], -1, 1)
+    pairs = grid[:, 0] * mirrored[:, 0] * (inside[:, 0, :, None] & inside[:, 1, None])
+    odd2 = (grid[:, 1:] - mirrored[:, 1:]) ** 2 / 4
+    return np.asarray((pairs[:, None] * odd2).sum(axis=(-2, -1)))

@@ -1,0 +1,54 @@
+"""Centres of circles: unbiased by the bend of a fisheye, and as sure as is stated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmark.detectors import LENS, PRINTED
+from benchmark.prints import printed
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
+from fisheye_svp_ros.detect.points import find_points
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.simulate.board_views import board_views
+from fisheye_svp_ros.simulate.render import Exposure, render
+
+
+def photograph(pattern: Pattern, number: int) -> tuple[Array, Array]:
+    """Return a photograph of a pattern, and where its points really are in it."""
+    board = printed(pattern)
+    middle = (board.corners.min(axis=0) + board.corners.max(axis=0)) / 2
+    view = board_views(LENS, PRINTED, 4, (0.1, 0.3), np.random.default_rng(0)).take(number)
+    pose = Pose(view.rotation, view.position + middle - PRINTED.corners.mean(axis=0))
+    image = render(LENS, board, pose, Exposure(), np.random.default_rng(number))
+    return image, project(LENS, pose.into_body(board.corners)).uv
+
+
+@pytest.mark.parametrize(('spec', 'number'), [
+    ('circles:8x6:25mm', 2), ('circles:4x9:18mm:asymmetric', 1),
+    ('circles:4x9:18mm:asymmetric', 3),
+])
+def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> None:
+    pattern = parse_pattern(spec)
+    image, true = photograph(pattern, number)
+    found = find_points(image, pattern, 'circles')
+    assert not isinstance(found, str), found
+    assert len(found.ids) > 0.95 * len(true)
+    orders = [np.argsort(turn.source) for turn in pattern.symmetries]
+    error = min((found.uv - true[order][found.ids] for order in orders),
+                key=lambda error: float(np.abs(error).max()))
+    # The middle of the ellipse is up to a tenth of a pixel beside the image of the centre.
+    assert np.abs(error.mean(axis=0)).max() < 0.003
+    # Centres of one photograph share what is wrong with the lens that fits it.
+    assert 0.6 < np.sqrt(((error / found.sigma[:, None]) ** 2).mean()) < 1.6
+
+
+def test_bright_circles_are_found_as_well() -> None:
+    pattern = parse_pattern('circles:8x6:25mm')
+    image, _ = photograph(pattern, 2)
+    found = [find_points(one, pattern, 'circles') for one in (image, 255 - image)]
+    assert not isinstance(found[0], str)
+    assert not isinstance(found[1], str)
+    np.testing.assert_allclose(found[0].uv, found[1].uv, atol=0.05)
