@@ -12,6 +12,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.commands.lenses import Lenses
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
     from fisheye_svp_ros.diagnosis.known_truth import Compared
     from fisheye_svp_ros.diagnosis.next_question import Next
@@ -117,7 +118,7 @@ def _wanted(args: argparse.Namespace, diagnosis: Diagnosis) -> Next:
 
 
 def _read(
-    path: str, args: argparse.Namespace, given: dict[str, Lens]
+    path: str, args: argparse.Namespace, given: Lenses
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.commands.lenses import lenses_of
@@ -126,7 +127,8 @@ def _read(
     from fisheye_svp_ros.diagnosis.inputs import posable
 
     table, _ = measured(path, args)
-    lens = given[''] if set(given) == {''} else lenses_of(table.cameras, given)
+    one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
+    lens = given[''] if one else lenses_of(table.cameras, given)
     observations, left_out = posable(table, lens)
     note_left_out(left_out)
     return observations, lens

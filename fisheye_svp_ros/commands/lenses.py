@@ -16,32 +16,50 @@ def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> Non
     """Declare --lens, which may be given once a camera."""
     parser.add_argument('--lens', required=True, action='append', metavar='[CAMERA=]LENS',
                         help=f'{purpose}a lens file, also of other tools, or the name of one that '
-                        'comes with the package; left=LENS and right=LENS for a rig')
+                        'comes with the package; left=LENS and right=LENS for a rig, or a file '
+                        'that holds both')
 
 
-def load_lenses(given: Sequence[str]) -> dict[str, Lens]:
-    """Return the lenses of --lens by camera; '' is the lens of every camera without its own.
+class Lenses(dict[str, 'Lens']):
+    """Lenses by camera; '' is that of every camera without its own.
+
+    in_file: cameras of a file that holds several, in its order; '' is the first of them.
+    """
+
+    in_file: tuple[Lens, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+def load_lenses(given: Sequence[str]) -> Lenses:
+    """Return the lenses of --lens.
 
     Raises LensError for a lens that cannot be read, and for two of one camera.
     """
-    from fisheye_svp_ros.io.lens_files import load_lens
+    from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
     from fisheye_svp_ros.io.share import lens_path
 
-    lenses: dict[str, Lens] = {}
+    lenses = Lenses()
     for text in given:
         camera, equals, path = text.partition('=')
         camera, path = (camera, path) if equals else ('', text)
         if camera in lenses:
             raise LensError(f'--lens {text}: there is one {camera or "without a camera"} already')
-        lenses[camera] = load_lens(lens_path(path))
+        file = lens_path(path)
+        lenses[camera] = load_lens(file)
+        if not camera:
+            lenses.names = cameras_in(file)
+            lenses.in_file = tuple(load_lens(f'{file}#{name}') for name in lenses.names)
     return lenses
 
 
-def lenses_of(cameras: Sequence[str], lenses: dict[str, Lens]) -> dict[str, Lens]:
+def lenses_of(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     """Return the lens of each camera of the observations.
 
+    Those of a file go by their names, or else by their order: the first is that of `left`.
     Raises LensError for a camera without a lens, and for a name that is no camera of theirs.
     """
+    if len(lenses) == 1 and len(lenses.in_file) > 1 and len(cameras) > 1:
+        return _in_order(cameras, lenses)
     unknown = [camera for camera in lenses if camera and camera not in cameras]
     if unknown:
         held = ', '.join(filter(None, cameras)) or 'one camera without a name'
@@ -51,3 +69,14 @@ def lenses_of(cameras: Sequence[str], lenses: dict[str, Lens]) -> dict[str, Lens
             raise LensError(f'camera {camera or "without a name"} has no lens; add '
                             f'--lens {camera + "=" if camera else ""}LENS')
     return {camera: lenses.get(camera) or lenses[''] for camera in cameras}
+
+
+def _in_order(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
+    named = dict(zip(lenses.names, lenses.in_file, strict=True))
+    if set(cameras) <= set(named):
+        return {camera: named[camera] for camera in cameras}
+    if len(cameras) != len(named):
+        raise LensError(f'the lens file holds {", ".join(named)}, the observations '
+                        f'{", ".join(cameras)}; say which is whose: --lens {cameras[0]}='
+                        f'FILE#{lenses.names[0]} ...')
+    return dict(zip(sorted(cameras), lenses.in_file, strict=True))

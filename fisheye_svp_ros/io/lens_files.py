@@ -59,6 +59,16 @@ def read_lens_file(path: str | Path) -> Foreign | None:
     return read_foreign(path, _read(path)[0])
 
 
+def cameras_in(path: str | Path) -> tuple[str, ...]:
+    """Return the cameras of a file that holds several, in its order, none where it holds one.
+
+    FILE#cam1 is one.  Raises LensError for a file that cannot be read.
+    """
+    text, camera = _read(path)
+    foreign = None if camera else read_foreign(path, text)
+    return tuple(foreign.lenses) if foreign and len(foreign.lenses) > 1 else ()
+
+
 def save_lens(lens: Lens, path: str | Path) -> None:
     """Write a lens YAML that `load_lens` reads back to the same lens."""
     document = lens_to_dict(lens)

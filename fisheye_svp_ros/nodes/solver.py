@@ -28,7 +28,9 @@ from fisheye_svp_ros.io.decoding import (
     read_landmarks,
     read_pose,
 )
+from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.parameters import rows
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT
@@ -121,7 +123,7 @@ class SolverNode(ManagedNode):
         self._arrivals = _Arrivals()
         self._standing: LandmarkSet | None = None
         self._in_series = False
-        self._lens: Lens | None = None  # that of the parameter lens
+        self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
         self._wake = self.create_guard_condition(self.guarded(self._work))
@@ -150,13 +152,13 @@ class SolverNode(ManagedNode):
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
         if settings.lens not in ('', CAMERA_INFO):
-            lens_of(settings.lens, 1.0, settings)
+            self._load(settings)
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
         """Load the lens and say which; do not wait for a scenario that nobody needs."""
         told = settings.lens in ('', CAMERA_INFO)
-        self._lens = None if told else lens_of(settings.lens, 1.0, settings)
+        self._lenses = {} if told else self._load(settings)
         if settings.lens == CAMERA_INFO:
             self._listen_to_camera_info()
         if settings.lens and not self.BY_SCENARIO:
@@ -165,6 +167,15 @@ class SolverNode(ManagedNode):
                 f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
         how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
         self.get_logger().info(f'solving with the {lens} {how} (svp: {settings.svp})')
+
+    def _load(self, settings: SolverSettings) -> dict[str, Lens]:
+        """Return the lens of the parameter by camera; raise LensError for a bad one."""
+        names = cameras_in(lens_path(settings.lens))
+        if len(self.cameras) < 2 or not names:
+            lens = lens_of(settings.lens, 1.0, settings)
+            return dict.fromkeys(('', *self.cameras), lens)
+        return {camera: lens_of(f'{settings.lens}#{name}', 1.0, settings)
+                for camera, name in zip(self.cameras, names, strict=False)}
 
     @abstractmethod
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
@@ -187,8 +198,11 @@ class SolverNode(ManagedNode):
 
         camera: its namespace, with its slash.  Raises FisheyeSvpError where nobody names a lens.
         """
-        if self._lens is not None:
-            return self._lens
+        if self._lenses:
+            if camera not in self._lenses:
+                raise ParameterError(f'lens {self.settings.lens}: it holds several cameras, and '
+                                     'one lens is needed; add # and the name of one')
+            return self._lenses[camera]
         if self.settings.lens == CAMERA_INFO:
             return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp)
         scenario = items.get('scenario', {})

@@ -11,6 +11,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
+from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
 from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
@@ -25,7 +26,7 @@ from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
-from fisheye_svp_ros.study.settings import StereoDepthSettings
+from fisheye_svp_ros.study.settings import SolverSettings, StereoDepthSettings
 from fisheye_svp_ros.study.solutions import Pair, measured
 
 
@@ -45,6 +46,16 @@ class StereoDepth(SolverNode):
         self._latest: Pose | None = None
         self.listen(TransformStamped, 'rig', decoding.read_transform, self._hear, LATCHED_INPUT)
         self.start()
+
+    def prepare(self, settings: SolverSettings) -> SolverSettings:
+        """Refuse a lens or a rig that cannot be loaded."""
+        _rig_file(settings)
+        return super().prepare(settings)
+
+    def configure(self, settings: SolverSettings) -> None:
+        """Load the lens and the rig."""
+        self._given = _rig_file(settings)
+        super().configure(settings)
 
     def _hear(self, _: int, rig: Pose) -> None:
         self._latest = rig
@@ -74,12 +85,18 @@ class StereoDepth(SolverNode):
             self._markers.publish(messages.markers_message(shapes, stamp, frame))
 
     def _rig(self, items: Items) -> Pose:
-        known = true_rig(items) if self.settings.rig == 'true' else self._latest
+        known = true_rig(items) if self.settings.rig == 'true' else self._given or self._latest
         if known is None:
-            raise ObservationError(
-                'no rig: true poses of both cameras are needed, or rig:=topic and a calibrated one'
-            )
+            raise ObservationError('no rig: true poses of both cameras are needed, or rig:=topic '
+                                   'and a calibrated one, or rig:=FILE')
         return known
+
+
+def _rig_file(settings: SolverSettings) -> Pose | None:
+    """Return the rig of a file, None where none is named; raise LensError for a bad one."""
+    assert isinstance(settings, StereoDepthSettings)
+    rig = settings.rig
+    return None if rig in ('true', 'topic') else load_rig(rig)
 
 
 def _true_points(points: Array, items: Items) -> Array | None:

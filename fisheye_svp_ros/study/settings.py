@@ -54,8 +54,9 @@ class SolverSettings(Settings):
     """Parameters of every node that solves."""
 
     lens: str = parameter(
-        '', 'Lens to solve with: a file, or a name in config/lenses; `camera_info`: what that '
-        'topic says; empty: the one that `scenario` names', file=True
+        '', 'Lens to solve with: a file, or a name in config/lenses; of a file with several '
+        'cameras a rig takes the first two; `camera_info`: what that topic says; empty: the one '
+        'that `scenario` names', file=True
     )
     svp: str = parameter(
         'auto', 'Solve with the single-viewpoint approximation of the lens; auto: of one that '
@@ -122,8 +123,9 @@ class StereoDepthSettings(SolverSettings):
     """Parameters of stereo depth."""
 
     rig: str = parameter(
-        'true', 'The rig to measure with: the true one, or the latest on the topic `rig`, as the '
-        'stereo calibrator publishes it', choices=('true', 'topic')
+        'true', 'The rig to measure with: `true`: the true one; `topic`: the latest on the topic '
+        '`rig`, as the stereo calibrator publishes it; or a file: of `calibrate`, Kalibr, Basalt, '
+        'OpenCV, a URDF', file=True
     )
     optimal: bool = parameter(
         False, 'Find the point of least reprojection error rather than the one halfway between '

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from helpers.kalibr import write_camchain
 from helpers.nodes import SHARED
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
+from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations
 from fisheye_svp_ros.optics.camera import project
@@ -98,6 +102,30 @@ def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert 'camera right has no lens' in refused(capsys, 'localize', table, lenses[0])
     assert 'the observations hold left, right' in refused(
         capsys, 'localize', table, f'--lens=up={out}/left.yaml')
+    # Both lenses in one file: Kalibr's camchain, whose cameras are the table's in its order.
+    chain = write_camchain(tmp_path / 'camchain.yaml', LENS, replace(LENS, fx=LENS.fx + 40),
+                           left_in_right)
+    assert cli.main(['localize', str(table), f'--lens={chain}',
+                     '-o', str(tmp_path / 'chain')]) == 0
+    left, right = (json.loads((tmp_path / 'chain' / name / 'localize.json').read_text())['rms_px']
+                   for name in ('left', 'right'))
+    assert left < 1 < right
+
+
+def test_lenses_of_one_file_go_by_name_or_by_order(tmp_path: Path) -> None:
+    other = replace(LENS, fx=LENS.fx + 1)
+    given = load_lenses([str(write_camchain(tmp_path / 'two.yaml', LENS, other,
+                                            rig('parallel', 0.1)))])
+
+    def focal(*cameras: str) -> list[float]:
+        return [round(lens.fx - LENS.fx, 6) for lens in lenses_of(cameras, given).values()]
+
+    assert focal('left', 'right') == [0, 1]
+    assert focal('cam1', 'cam0') == [1, 0]
+    assert focal('') == [0]
+    with pytest.raises(LensError, match=r'holds cam0, cam1, the observations a, b, c'):
+        focal('a', 'b', 'c')
+    assert not load_lenses([f'{tmp_path}/two.yaml#cam1']).in_file
 
 
 def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

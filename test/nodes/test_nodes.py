@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph, set_parameter
+from helpers.kalibr import write_camchain
 from helpers.uncertain import NOISE, uncertain
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
@@ -40,7 +41,7 @@ from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import group_views
-from fisheye_svp_ros.scene.rigs import paper_pose
+from fisheye_svp_ros.scene.rigs import paper_pose, rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.localization import localize
@@ -539,6 +540,23 @@ def test_depth_with_a_rig_from_a_topic(graph: Callable[..., Graph]) -> None:
     rig.publish(messages.transform_message(off, 1, 'right', 'left'))
     g.until(lambda: values(results[-1]))
     assert float(values(results[-1])['error3_m']) > 1e-3
+
+
+def test_depth_with_lenses_and_rig_of_a_camchain(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    lens = load_lens(lens_path('fish180'))
+    path = write_camchain(tmp_path / 'camchain.yaml', lens, lens, rig('vergent', 0.15))
+    g = graph('synthetic_camera:lens:=fish180', 'style:=vergent', 'rate:=20.0', 'patience:=0.5',
+              'radius:=0.5', 'shift_scale:=0.0', f'stereo_depth:lens:={path}', f'rig:={path}')
+    results = g.hear(DiagnosticArray, 'stereo_depth/result')
+    node = g.start(StereoDepth)
+    g.start(SyntheticCamera)
+    g.until(lambda: results and values(results[-1]))
+    assert float(values(results[-1])['error3_m']) < 1e-6
+    assert node._lenses['left/'] is not node._lenses['right/']
+    refused = set_parameter(node, 'rig', str(lens_path('fish180')))
+    assert not refused.successful
 
 
 def test_optimal_depth_has_the_smaller_error_under_noise(graph: Callable[..., Graph]) -> None:
