@@ -183,7 +183,10 @@ def _clipped(pixels: Pixels) -> Mask:
     """Return which smoothed pixels (H, W) hold some of those at the end of the scale."""
     if pixels.dtype.kind != 'u':
         return np.zeros(pixels.shape, dtype=bool)
-    full = np.asarray(pixels == np.iinfo(pixels.dtype).max, dtype=np.float32)
+    full = np.asarray(pixels == np.iinfo(pixels.dtype).max)
+    if not full.any():
+        return full
+    full = full.astype(np.float32)
     return np.asarray(cv2.GaussianBlur(full, (0, 0), SMOOTHING) > _TOUCHED)
 
 
