@@ -164,7 +164,8 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
         first = not guide.session.taken and 0.4 < guide.score < ENOUGH
         if picture and pixels is not None and first:
             with replacing(picture) as path:
-                cv2.imwrite(str(path), draw_guide(pixels, guide, seen))
+                cv2.imwrite(str(path), draw_guide(pixels, guide, seen),
+                            [cv2.IMWRITE_JPEG_QUALITY, 75])
         moved = hand.move(guide, seen)
     return {**judged(guide, lens), 'half_field_deg': float(np.degrees(lens.max_incidence)),
             'images': images, 'seconds': t, 'given_up': refused,

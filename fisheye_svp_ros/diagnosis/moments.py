@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.inputs import free_names
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit, start
 from fisheye_svp_ros.diagnosis.noise import between_cameras
 from fisheye_svp_ros.diagnosis.residuals import rms_px
@@ -51,9 +52,19 @@ def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) 
     if data.cameras < 2 or data.poses is not None or not shared:
         return False
     alone = each_alone(data)
-    posed = fit(alone, start(alone, lenses[0], lenses[1:]), free)
-    own = rms_px(Linearised(alone, posed, ()))
-    if rms_px(Linearised(data, base, ())) < _LOOSE * own:
+
+    def misfits(free: Sequence[str], together: State) -> tuple[float, float]:
+        posed = fit(alone, start(alone, lenses[0], lenses[1:]), free)
+        return rms_px(Linearised(data, together, ())), rms_px(Linearised(alone, posed, ()))
+
+    whole, own = misfits(free, base)
+    if whole < _LOOSE * own:
+        return False
+    # Lenses that are wrong look like a rig that moves: they get what they want first.
+    every = free_names(dict(zip(base.labels, lenses, strict=True)), True)
+    base = fit(data, base, every)
+    whole, own = misfits(every, base)
+    if whole < _LOOSE * own:
         return False
     scene = Linearised(data, base, ()).scene
     for kind in (RigFlexEffect, StereoTimeOffsetEffect):
@@ -62,4 +73,4 @@ def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) 
         except Untestable:
             continue
         base = with_effect(base, effect, np.zeros(len(effect.parameters)))
-    return rms_px(Linearised(data, fit(data, base, free), ())) > _EXPLAINED * own
+    return rms_px(Linearised(data, fit(data, base, every), ())) > _EXPLAINED * own

@@ -11,7 +11,8 @@ from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.known_truth import known_errors
-from fisheye_svp_ros.diagnosis.model import Linearised, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.diagnosis.moments import loose
 from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
@@ -121,3 +122,12 @@ def test_cameras_without_a_common_frame():
     with warnings.catch_warnings():
         warnings.simplefilter('error')
         assert known_errors(found.before, found.after, ()) == {}
+
+
+def test_a_wrong_lens_is_no_rig_that_moves():
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    left, right = (replace(lens, calibration=None) for lens in seen.lenses.values())
+    right = replace(right, fx=1.03 * right.fx, fy=1.03 * right.fy)
+    data = prepare(seen.table)
+    base = fit(data, start(data, left, [right]), ())
+    assert not loose(data, (left, right), base, ())
