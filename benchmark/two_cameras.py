@@ -270,7 +270,7 @@ def reachable(seen: Pair, hidden: Hidden) -> dict[str, float]:
         pose = localize(model, views).pose
         for _ in range(_ROUNDS):
             off = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
-            limit = _FAR * np.median(off[views.used])
+            limit = _FAR * np.nanmedian(np.where(views.used, off, np.nan), axis=1, keepdims=True)
             pose = localize(model, views._replace(
                 weight=np.where(views.used & (off < limit), views.weight, 0.0)), pose).pose
         poses.append((views.frame, pose))
