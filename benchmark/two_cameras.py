@@ -324,7 +324,8 @@ def _bound(found: Sequence[dict[str, Any]], kind: str) -> str:
     less = [[100 * (1 - one['reachable'][name] / one['external']['rig'][name]['base'])
              for one in found if one['kind'] == kind and one['external']['rig']]
             for name in ('translation_m', 'rotation_rad')]
-    return ', '.join(f'{np.median(one):.0f} %' for one in less) if less[0] else '-'
+    told = less[0] and not (KINDS[kind].apart or KINDS[kind].late)
+    return ', '.join(f'{np.median(one):.0f} %' for one in less) if told else '-'
 
 
 def spread(values: Sequence[float], form: str) -> str:
