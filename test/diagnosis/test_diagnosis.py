@@ -347,6 +347,8 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
     table, lenses = rig_table(26, [(skew, np.array([0.002]))])
     found = diagnose(table, lenses, free_intrinsics=True)
+    models = [found.after.state.cameras.model(camera) for camera in (0, 1)]
+    assert [model.lens.name for model in models] == ['fish214', 'right']
     assert [cause.effect for cause in found.causes] == ['skew']
     assert list(found.causes[0].parameters) == ['right.shear']
     assert found.causes[0].parameters['right.shear']['value'] == pytest.approx(0.002, abs=5e-4)

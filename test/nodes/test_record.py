@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import signal
@@ -90,6 +91,18 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
     assert columns['stereo_depth.rms_px'] == [2.0, None, None]
     assert columns['stereo_depth.note'] == [None, 'too few points', None]
     assert columns['localizer.rms_px'] == [None, None, 1.0]
+
+
+def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    message = cdr(messages.key_values_message('n', {'rms_px': 1.0}, 5))
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/x/result', DIAGNOSTICS, message)
+        monkeypatch.setattr(bag._writer, 'write', full)
+        with pytest.raises(BagError, match=r'bag: cannot be written \(No space left'):
+            bag.write('/x/result', DIAGNOSTICS, message)
 
 
 def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_len
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.curves import FlatPort, Gennery
+from fisheye_svp_ros.optics.engines import ported
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
@@ -47,6 +48,12 @@ def faces(port, a, b):
         height = np.sqrt(max(radius**2 - place @ place, 0.0))
         found.append(centre + np.append(place, height))
     return found
+
+
+def test_the_start_is_exact_where_all_rays_leave_one_viewpoint():
+    lens = replace(AIR, viewpoint_shift=None, port=PORTS['flat'])
+    at, way = ported.traced(lens, lens.port.start(points()))
+    assert np.abs(np.cross(points() - at.value, way.value)).max() < 1e-6
 
 
 @each_port

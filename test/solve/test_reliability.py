@@ -57,6 +57,19 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     assert np.linalg.norm(found.solution.residual[0, 3]) > 30
 
 
+@pytest.mark.parametrize(('off', 'gross'), [(4.5, False), (6.0, True)])
+def test_a_point_is_a_gross_error_beyond_five_standard_deviations(off, gross):
+    model, views, true = spoilt('clean', 'room', 1, np.random.default_rng(5))
+    exact = model.predict(true, views).uv
+    views.uv[:] = exact + 0.1 * (views.uv - exact)
+    views.uv[0, 3] = exact[0, 3] + [off * SIGMA, 0.0]
+    found = localize(model, views)
+    off_now = np.linalg.norm(found.residual[0, 3]) / SIGMA
+    assert (off_now > 4) and (off_now > 5) == gross
+    assert examine(model, views, found).gross[0].tolist() == [
+        gross and i == 3 for i in range(views.uv.shape[1])]
+
+
 def test_a_misfit_that_no_point_is_to_blame_for_scales_the_covariance():
     model, views, _ = spoilt('half size', 'room', 1, np.random.default_rng(6))
     found = localize(model, views)
