@@ -9,13 +9,16 @@ from helpers.graph import LATCHED, Graph
 from geometry_msgs.msg import TransformStamped  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.markers import camera_shape, rays_shape
-from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.nodes.stereo_depth import StereoDepth, _shapes
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.optics.curves import Equidistant
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.rigs import rig
 
 _PIXEL = 0.08 / 1536  # m, on the base of a camera
@@ -76,3 +79,18 @@ def test_rays_lead_from_landmarks_to_their_viewpoints_on_the_axis() -> None:
     start, end = turned.into_body(rays.points.reshape(2, 2, 3)).swapaxes(0, 1)
     np.testing.assert_allclose(end, local, atol=1e-12)
     np.testing.assert_allclose(start, shift[:, None] * [0, 0, 1], atol=1e-12)
+
+
+def test_the_left_image_is_drawn_by_the_left_lens() -> None:
+    left, right = (
+        ForwardModel(Lens(name, width, width * 3 // 4, width / 3, width / 3, width / 2,
+                          width * 3 / 8, Equidistant(), 1.5))
+        for name, width in (('left', 1024), ('right', 640)))
+    points, place = np.array([[0.4, 0.2, 1.0], [-0.5, 0.1, 1.2]]), rig('parallel')
+    uv = [model.project(seen[None]).uv[0] for model, seen in (
+        (left, place.into_body(points)), (right, points))]
+    shown = {one.name: one.points for one in _shapes(
+        (left, right), place, identity(), *uv, points)}['image points']
+    np.testing.assert_allclose(shown[:, 2], 0.1)
+    base = (uv[0] - np.array([511.5, 383.5])) * 0.08 / 1024
+    np.testing.assert_allclose(shown[:, :2], base, atol=1e-9)

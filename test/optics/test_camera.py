@@ -217,3 +217,14 @@ def test_of_two_rays_the_one_that_continues_to_far_points_is_taken():
     along = origin + np.linspace(0.03, 2.0, 200)[:, None] * direction
     theta = incidence(lens, along).theta
     np.testing.assert_allclose(theta, np.radians(60.0), rtol=0, atol=1e-9)
+
+
+def test_two_rays_close_to_each_other_are_not_overlooked():
+    lens, rng = KITA[1], np.random.default_rng(3)
+    theta = rng.uniform(0.6, 1.75, (1, 400)) + [[0.0], [1.0]] * rng.uniform(1e-3, 1e-2, 400)
+    # Where the rays of both angles cross.
+    shift, slope = np.asarray(high_precision.shift(lens, theta, np)), np.tan(theta)
+    z = (shift[0] * slope[0] - shift[1] * slope[1]) / (slope[0] - slope[1])
+    r = (z - shift[0]) * slope[0]
+    found = incidence(lens, np.stack([r, 0 * r, z], axis=-1)).theta
+    np.testing.assert_allclose(found, theta[0], rtol=0, atol=1e-9)
