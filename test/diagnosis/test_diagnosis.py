@@ -11,7 +11,13 @@ from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import thinned
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
-from fisheye_svp_ros.diagnosis.noise import VIEW, Gross, find_gross_errors, quantisation_step
+from fisheye_svp_ros.diagnosis.noise import (
+    FRAME,
+    VIEW,
+    Gross,
+    find_gross_errors,
+    quantisation_step,
+)
 from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -166,6 +172,17 @@ def test_a_view_is_off_as_a_whole_where_most_are_not(bad, named):
     frames = {int(clean.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
               if why == VIEW}
     assert frames == (set(bad) if named else set())
+
+
+def test_one_camera_of_three_that_the_others_contradict_is_to_blame():
+    rng = np.random.default_rng(3)
+    pose, views = scene(rng, 3, 12)
+    table = replace(observe(lens(), (), pose, views, SIGMA, rng), cameras=('a', 'b', 'c'))
+    bad = np.flatnonzero((table.frame == 5) & (table.camera == 2))
+    table.uv[bad] = table.uv[bad[::-1]]
+    data = prepare(table)
+    gross = find_gross_errors(data, start(data, lens()))[1]
+    assert set(gross.why) == {FRAME} and sorted(gross.rows.tolist()) == bad.tolist()
 
 
 def test_quantisation_is_read_off_the_numbers():

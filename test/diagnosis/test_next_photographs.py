@@ -79,6 +79,12 @@ def test_the_side_said_to_be_away_is_away(board, shots):
     assert np.linalg.norm(bottom) > np.linalg.norm(top)
 
 
+def test_before_any_photograph_the_lens_is_known_to_a_tenth(linear, board, shots):
+    design = Design(linear, (), board, shots, NOISE, known=False)
+    wide = dict(zip(design.names, 1 / np.sqrt(np.diag(design.known)), strict=True))
+    assert wide['fx'] == wide['cy'] == pytest.approx(0.1 * linear.state.lens.focal)
+
+
 def test_the_board_is_turned_as_said(board, shots):
     square = np.flatnonzero(shots.tilt == 0)
     assert len(set(shots.roll[square].round(6))) == 8

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -94,3 +95,18 @@ def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
     assert executables.run(name, []) == 0
     assert capfd.readouterr().err == ''
+
+
+@pytest.mark.parametrize('ended', [True, False])
+def test_what_fails_once_a_signal_has_ended_the_context_is_no_failure(
+    ended: bool, ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        if ended:
+            base.rclpy.shutdown()
+        raise RuntimeError('the context is not valid')
+
+    monkeypatch.setattr(base.BaseNode, 'announce', fail)
+    monkeypatch.setattr(signal, 'signal', lambda *_: None)
+    with nullcontext() if ended else pytest.raises(RuntimeError):
+        assert executables.run('localizer', []) == 0

@@ -12,7 +12,13 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
-from fisheye_svp_ros.solve.initial_pose import initial_poses
+from fisheye_svp_ros.solve.initial_pose import (
+    _best,
+    _cube_turns,
+    _misfit,
+    _problem,
+    initial_poses,
+)
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured import localize_measured
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
@@ -134,6 +140,18 @@ def test_few_points_start_from_evenly_spread_turns(count):
         return np.degrees(np.arccos(np.clip(cosine, -1, 1)).max(axis=1))
 
     assert off(spread=True).max() < 3 and np.mean(off(spread=False) > 3) > 0.3
+
+
+def test_a_landmark_behind_its_ray_is_as_far_off_as_it_can_be():
+    """A flat target fits as well mirrored behind the camera, from however near it is seen."""
+    points = np.array([[[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0], [0, 0.3, 0]]])
+    ahead = points + np.array([0, 0, 0.2])
+    direction = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
+    local, d = _problem(points, direction, np.ones((1, 5)))[:2]
+    misfit = _misfit(local, d, np.ones((1, 5), dtype=bool))
+    true, _, least = _best(_cube_turns()[None], misfit, local, d, 10)
+    _, _, error = _best((true @ np.diag([-1.0, -1, 1]))[:, None], misfit, local, d, 0)
+    assert least < 1e-9 and error == 1
 
 
 def test_a_direction_that_is_missing_ends_no_search():
