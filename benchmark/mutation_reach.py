@@ -94,7 +94,7 @@ def trace(tree: Path, folder: Path) -> None:
         log = folder / f'{group}.log'
         if log.exists():
             continue
-        settings = folder / f'{group}.ini'
+        settings = folder / f'settings_{group}.ini'  # no name that coverage takes for data
         settings.write_text(_SETTINGS.format(tree=tree, folder=folder.resolve(), group=group))
         paths = [f'test/{word}' if (tree / 'test' / word).exists() else word
                  for word in arguments]
