@@ -313,6 +313,7 @@ def report(trials: Sequence[Trial], size: float) -> str:
     mine = [trial for trial in trials if trial.size == size]
     hidden = [t for t in mine if t.effect in HIDDEN]
     clean = [t for t in mine if t.effect in CLEAN]
+    aside = [t for t in mine if t.effect in ASIDE]
     counts = {e: Counter(_shown(t, names) for t in mine if t.effect == e
                          for names in t.named or [[NOTHING]]) for e in (*HIDDEN, *CLEAN, *ASIDE)}
     others = {name for c in counts.values() for name in c} - {*HIDDEN, NOTHING}
@@ -324,7 +325,8 @@ def report(trials: Sequence[Trial], size: float) -> str:
         'through a lens of 94°. Of them',
         '`detect`, `calibrate` and `diagnose` say what is wrong. An effect is as large as what a',
         f'lens fitted without it leaves {size:g} times the noise of (corners scatter by {NOISE}',
-        'px here). Of `principal_point` the lens was calibrated before it was bumped. Defocus and',
+        'px here). Of `principal_point` the lens was calibrated before it was bumped; of',
+        '`rolling_shutter` the photographs are those of a video, the camera swings. Defocus and',
         'uneven light are no error of the lens and count as clean; of over-exposed photographs,',
         'which `detect` names itself, only the row tells. Intervals are 95 %.', '', '```bash',
         f'python -m benchmark.blind_images --trials {len(hidden)}', '```', '',
@@ -332,7 +334,10 @@ def report(trials: Sequence[Trial], size: float) -> str:
         '- and nothing else: '
         + _rate([t.hit and len(t.named) == 1 for t in hidden]),
         f'- clean photographs found adequate: {_rate([t.verdict == "adequate" for t in clean])}',
-        f'- no effect named in them: {_rate([not t.named for t in clean])}', '',
+        f'- no effect named in them: {_rate([not t.named for t in clean])}',
+        '- over-exposed: `detect` says so of all photographs in '
+        f'{_rate([t.odd == PHOTOGRAPHS for t in aside])}; found adequate nevertheless: '
+        f'{_rate([t.verdict == "adequate" for t in aside])}', '',
         'How often what was hidden (rows) was named (columns):', '',
         '| hidden | trials | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 2) + '|',
     ]

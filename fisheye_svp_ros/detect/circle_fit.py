@@ -149,6 +149,8 @@ def _matrix(values: Array) -> Array:
 class _Problem(WindowProblem):
     """Circles; state (N, 10)."""
 
+    slack = 5e-4
+
     def __init__(
         self, cut: Windows, start: Array, axes: Array, bend: Array, reach: float
     ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -118,7 +119,9 @@ def decoded(data: bytes, name: str) -> Pixels:
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as cause:
-        raise ObservationError(f'{name}: too large, or broken ({cause.err})') from cause
+        most = int(os.environ.get('OPENCV_IO_MAX_IMAGE_PIXELS', 1 << 30)) / 1e6
+        raise ObservationError(
+            f'{name}: larger than {most:.0f} megapixels, or broken; make it smaller') from cause
     if pixels is None:
         raise ObservationError(f'{name}: not an image that can be read; check the file')
     if pixels.dtype not in (np.uint8, np.uint16):

@@ -92,8 +92,11 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
 class WindowProblem(ABC):
     """N windows as N independent systems, see least_squares.Problem; state (N, U).
 
-    A subclass has the model; u, v of the point are the first unknowns.
+    A subclass has the model; u, v of the point are the first unknowns.  slack: px that a point may
+    be from where it settles.
     """
+
+    slack = 1e-4
 
     def __init__(self, cut: Windows, weight: Array) -> None:
         """Take the windows, and weights (N, P) of their pixels."""
@@ -175,7 +178,7 @@ class WindowProblem(ABC):
         sigma = np.sqrt(noise2 * gain2)
         # What the fit would still move the point by; a blur may take longer to settle.
         left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
-        settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + 5e-4)
+        settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + self.slack)
         return Judged(sigma, np.sqrt(_KEPT * noise2), settled, noise2, gain2, freedom)
 
 

@@ -464,7 +464,7 @@ def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
         [sys.executable, '-m', 'fisheye_svp_ros.cli', 'detect', path, '--board',
          'chessboard:9x6:24mm', '-o', tmp_path / 'a.csv'], capture_output=True, text=True)
     assert done.returncode == 2
-    assert 'too large, or broken' in done.stderr and 'Traceback' not in done.stderr
+    assert 'larger than 67 megapixels, or broken' in done.stderr and 'Traceback' not in done.stderr
 
 
 class TestOrder:
