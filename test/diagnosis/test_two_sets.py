@@ -8,7 +8,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.diagnosis.carried import Carried
-from fisheye_svp_ros.diagnosis.prediction import Less
+from fisheye_svp_ros.diagnosis.prediction import HeldOut, Less, gain_between, less_between
 from fisheye_svp_ros.diagnosis.two_sets import Shared, TwoSets, diagnose_against
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -73,6 +73,19 @@ def test_parameters_that_do_not_agree_are_named():
 def test_better_and_worse_are_beyond_chance(low, high, better, worse):
     tried = Carried('a', 'b', 0.2, 0.18, Less((low + high) / 2, low, high))
     assert (tried.better, tried.worse) == (better, worse)
+
+
+def test_the_intervals_of_predictions_hold_95_percent():
+    """Against the scatter of means: 1.96 standard errors to each side."""
+    rng, count = np.random.default_rng(5), np.full(400, 20)
+    before, after = rng.gamma(8.0, 5.0, 400), rng.gamma(8.0, 2.5, 400)
+    spread = [np.std(squares) / np.mean(squares) / 20 for squares in (before, after)]
+    less = less_between(HeldOut(before, count), HeldOut(before / 4, count))
+    assert (less.high - less.low) / 2 == pytest.approx(1.96 * less.value * spread[0] / 2, rel=0.15)
+    found = gain_between(HeldOut(before, count), HeldOut(after, count), 0.0)
+    ratio = after.mean() / before.mean()
+    assert (found.high - found.low) / 2 == pytest.approx(
+        1.96 * ratio * np.hypot(*spread), rel=0.15)
 
 
 def test_command(tmp_path, capsys):
