@@ -259,8 +259,15 @@ def calibrate(
     observations: AnyObservations, model: str, image_size: tuple[int, int],
     free: Sequence[str] | None = None, name: str = 'lens',
 ) -> Calibrated:
-    """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`."""
-    found = lens_calibration.calibrate(_table(observations), model, image_size, free, name)
+    """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
+
+    Gross errors are set aside, as the command does.
+    """
+    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
+
+    found, _, _ = calibrated_without_gross_errors(
+        _table(observations),
+        lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
     adjusted = found.adjusted
     return Calibrated(adjusted.lens, tuple(adjusted.names), adjusted.covariance, found.sigma,
                       found.left_out, bool(adjusted.converged))

@@ -83,32 +83,34 @@ def run(args: argparse.Namespace) -> None:
                              f'--image-size {head}1280x800')
     results: dict[str, Calibration] = {}
     trusts: dict[str, Trust] = {}
+    tables: dict[str, Observations] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
         size = sizes.get(camera) or sizes['']
-        results[camera] = _calibrated(table, args, size, name)
-        trusts[camera] = _trusted(table, results[camera])
+        results[camera], tables[camera] = _calibrated(table, args, size, name)
+        trusts[camera] = _trusted(tables[camera], results[camera])
     # Written before a word is printed: nobody may be reading.
     if args.output:
         with together():
             for camera, result in results.items():
                 path = args.output / f'{camera}.yaml' if camera else args.output
                 _write(result, trusts[camera], path)
-    for number, (camera, result) in enumerate(results.items()):
-        sigmas = observations.sigma[observations.camera == number]
-        _report(result, trusts[camera], args.model, sigmas)
+    for camera, result in results.items():
+        _report(result, trusts[camera], args.model, tables[camera].sigma)
     if pair := rig_cameras(observations.cameras):
         _rig(observations, results, pair, args.output)
 
 
 def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
-) -> Calibration:
+) -> tuple[Calibration, Observations]:
+    """Return the lens and the rows that it is of: those that are no gross errors."""
     import numpy as np
 
-    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.notes import note_gross_errors, say
     from fisheye_svp_ros.commands.ports import port_of
+    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
@@ -117,22 +119,25 @@ def _calibrated(
     across = float(np.ptp(table.xyz, axis=0).max())
     if across > _HUGE:
         say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
-    with progress('calibrating'):
+
+    def fitted(rows: Observations) -> Calibration:
         if args.lens and port:
-            return calibrate_port(table, load_lens(args.lens), port, args.free)
-        return calibrate(table, args.model, size, args.free, name, port)
+            return calibrate_port(rows, load_lens(args.lens), port, args.free)
+        return calibrate(rows, args.model, size, args.free, name, port)
+
+    with progress('calibrating'):
+        result, kept, gross = calibrated_without_gross_errors(table, fitted)
+    note_gross_errors(table, gross)
+    return result, kept
 
 
 def _trusted(table: Observations, result: Calibration) -> Trust:
     """Return what may be trusted, beside local errors of target and frames."""
-    import numpy as np
-
     from fisheye_svp_ros.diagnosis.calibration import trust
     from fisheye_svp_ros.reporting.progress import stages
 
     with stages('how far it may be trusted'):
-        posed = table.take(~np.isin(table.frame, result.left_out))
-        return trust(posed, result.adjusted.lens, result.adjusted.names)
+        return trust(table, result.adjusted.lens, result.adjusted.names)
 
 
 def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.noise import Gross
+    from fisheye_svp_ros.scene.observations import Observations
 
 _SHOWN = 10
 
@@ -28,6 +33,16 @@ def note_left_out(frames: Sequence[int]) -> None:
         names = ', '.join(map(str, frames[:_SHOWN]))
         more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
         say(f'left out, since their points do not fix a pose: frames {names}{more}')
+
+
+def note_gross_errors(table: Observations, gross: Gross) -> None:
+    """Say how many rows of a table are set aside, and which are furthest off."""
+    if len(gross.rows):
+        worst = ', '.join(
+            f'frame {table.frame[gross.rows[i]]} landmark {table.landmark[gross.rows[i]]} '
+            f'({gross.px[i]:.1f} px)' for i in (-gross.px).argsort()[:3])
+        say(f'{len(gross.rows)} of {len(table)} points lie too far off and are left out, '
+            f'furthest {worst}')
 
 
 def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:

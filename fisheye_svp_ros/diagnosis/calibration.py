@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,12 +11,15 @@ from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import fit, prepare, start
+from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _WIDE = 2.0  # standard errors of an interval
+_ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,31 @@ class Trust:
         """The coefficients of a viewpoint shift that a target of another shape can explain."""
         return {name: range_ for name, range_ in self.admissible.items()
                 if name in _SHIFT_NAMES and not range_.settled}
+
+
+def calibrated_without_gross_errors(
+    observations: Observations, calibrate: Callable[[Observations], Calibration]
+) -> tuple[Calibration, Observations, Gross]:
+    """Calibrate a lens of one camera anew for as long as gross errors are found.
+
+    calibrate: fits a lens to some of the rows.  Returns the last lens, the rows that it is of, and
+    those that are set aside.
+    """
+    rows = np.arange(len(observations))
+    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
+    rounds = 0
+    while True:
+        result = calibrate(observations.take(rows))
+        rows = rows[~np.isin(observations.frame[rows], result.left_out)]
+        table = observations.take(rows)
+        data = prepare(table)
+        found = find_gross_errors(data, start(data, result.adjusted.lens))[1]
+        rounds += 1
+        if not len(found.rows) or rounds == _ROUNDS:
+            return result, table, gross
+        gross = Gross(np.concatenate([gross.rows, rows[found.rows]]),
+                      np.concatenate([gross.px, found.px]), (*gross.why, *found.why))
+        rows = np.delete(rows, found.rows)
 
 
 def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis.calibration import trust
+from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
 from fisheye_svp_ros.diagnosis.model import fit, prepare, start
@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SIGMA, SHIFT = 0.1, 0.004
 DRAWS = 14
@@ -65,3 +66,21 @@ def test_ranges_over_targets_hold_the_one_that_was_believed():
         assert range_.low <= value - 1.9 * found.stderr[name]
         assert range_.high >= value + 1.9 * found.stderr[name]
     assert found.doubtful_shift == {}
+
+
+def test_a_calibration_does_without_gross_errors():
+    rng = np.random.default_rng(8)
+    pose, views = scene(rng, frames=16)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    far = np.flatnonzero(rng.random(len(table)) < 0.03)
+    uv = table.uv.copy()
+    uv[far] += rng.choice([-1.0, 1.0], (len(far), 2)) * rng.uniform(5.0, 30.0, (len(far), 2))
+
+    def fitted(rows):
+        return calibrate(rows, 'kannala_brandt', (1536, 1536))
+
+    clean = fitted(table.take(~np.isin(np.arange(len(table)), far)))
+    found, kept, gross = calibrated_without_gross_errors(replace(table, uv=uv), fitted)
+    assert sorted(gross.rows.tolist()) == far.tolist()
+    assert len(kept) == len(table) - len(far)
+    assert found.adjusted.lens.parameters == clean.adjusted.lens.parameters

@@ -242,6 +242,34 @@ def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
     assert found.statistic == pytest.approx(small - large, rel=1e-5)
 
 
+def test_doubt_about_variances_has_its_degrees_of_freedom():
+    linear = linearised(seed=31, offsets=3e-4)
+    evidence = gather_evidence(linear.data, linear.state, ())
+    own = np.arange(evidence.own)
+    form = next(i for i, e in enumerate(evidence.forms.effects) if e.name == 'target_shape')
+    columns = evidence.columns_of(form)
+    score = evidence.score(swept(evidence.information, own), columns)
+    sure = evidence.confident(score, own, columns)
+    assert sure.p_value == pytest.approx(
+        stats.f.sf(score.statistic / score.rank, score.rank, sure.freedom))
+    assert sure.p_value > 1.5 * score.p_value
+
+    # Satterthwaite: two over the variance of the logarithm of what the columns tell.
+    now, way = evidence.variances, score.estimate * evidence.scale[columns]
+
+    def told(change):
+        """Return the logarithm of it for changes of log tau^2 and, last, of log sigma^2."""
+        lam = np.where(now.alive, now.lam * np.exp(change[-1] - change[:-1]), GONE)
+        sigma = now.sigma * np.exp(change[-1] / 2)
+        other = replace(evidence, variances=replace(now, lam=lam, sigma=sigma))
+        block = swept(other.information, own)[np.ix_(columns, columns)]
+        return np.log(way @ block @ way)
+
+    steps = 1e-4 * np.eye(len(NAMES) + 1)
+    slope = np.array([(told(step) - told(-step)) / 2e-4 for step in steps])
+    assert sure.freedom == pytest.approx(2 / (slope @ now.covariance @ slope), rel=1e-3)
+
+
 def test_p_values_are_uniform_without_an_effect():
     p_values = []
     for seed in range(10):
