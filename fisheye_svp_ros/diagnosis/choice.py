@@ -180,7 +180,9 @@ def choose(
 
 
 def _likelier(best: Candidate, others: Iterator[Candidate]) -> Candidate:
-    """Return what stands for the best candidate: the same of a look-alike that is more common."""
+    """Return what stands for the best candidate: a part of it, or a look-alike, more common."""
+    if best.effect.asked_after:
+        return next((c for c in others if c.effect.name in best.effect.asked_after), best)
     near = takewhile(lambda c: c.merit > best.merit - _ODDS, others)
     if not best.effect.rarer_than:
         return best

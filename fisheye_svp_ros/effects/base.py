@@ -113,6 +113,7 @@ class Effect(ABC):
     stage: ClassVar[str]
     of_target: ClassVar[bool] = False  # whether another target would not have it
     rarer_than: ClassVar[str] = ''  # an effect that does nearly the same and is more common
+    asked_after: ClassVar[tuple[str, ...]] = ()  # more common ones that it does, too, and more
     signature: ClassVar[str]
     to_separate: ClassVar[str]
 

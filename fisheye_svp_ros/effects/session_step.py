@@ -26,6 +26,8 @@ class SessionStepEffect(Effect):
 
     name = 'session_step'
     stage = 'image'
+    # A step after the first few frames is hardly more than intrinsics that are wrong throughout.
+    asked_after = ('focal_length', 'principal_point')
     signature = 'residuals that change at one frame and keep their new pattern'
     to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 

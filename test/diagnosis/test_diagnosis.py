@@ -208,6 +208,15 @@ def test_noise_that_grows_with_the_angle_is_a_cause():
     assert [cause.effect for cause in found.causes] == ['noise_vs_angle']
 
 
+def test_intrinsics_that_are_wrong_throughout_are_no_step_after_the_first_frames():
+    rng = np.random.default_rng(40)
+    pose, views = scene(rng)
+    true = lens().with_parameters(('fx', 'fy', 'cx'), [1.002 * lens().fx, 1.002 * lens().fy,
+                                                       lens().cx + 0.6])
+    found = diagnose(observe(true, (), pose, views, SIGMA, rng), lens(), free_intrinsics=False)
+    assert {cause.effect for cause in found.causes} == {'focal_length', 'principal_point'}
+
+
 def test_landmarks_that_scatter_more_are_no_noise_that_grows_with_the_angle():
     rng = np.random.default_rng(51)
     pose, views = scene(rng)
