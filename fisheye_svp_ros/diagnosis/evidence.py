@@ -27,7 +27,7 @@ from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them fields are tried
-_FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance of what is seen of it, over noise
+_FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
 
