@@ -599,12 +599,14 @@ def test_a_recorder_survives_what_strangers_publish(
     one = graph()
     with BagWriter(tmp_path / 'bag') as bag:
         recorder = one.start(lambda: Recorder(bag, re.compile('.*')))
+        publishers = recorder.get_publishers_info_by_topic
+        one.until(lambda: any(
+            publishers(topic) for topic, _ in one.probe.get_topic_names_and_types()))
         # As a stranger's types look to this machine: unknown, or not even of three parts.
         told = dict(one.probe.get_topic_names_and_types())
         types = {**told, '/a': ['nobody_msgs/msg/Thing'], '/b': ['odd'],
                  '/c': ['std_msgs/msg/Nothing']}
         recorder.get_topic_names_and_types = lambda: list(types.items())
-        publishers = recorder.get_publishers_info_by_topic
         profile = next(p for topic in told for p in publishers(topic)).qos_profile
         recorder.get_publishers_info_by_topic = lambda topic: [
             Endpoint(types[topic][0], profile)] if topic in '/a/b/c' else publishers(topic)
