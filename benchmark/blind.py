@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +19,8 @@ from benchmark.blind_effects import HIDDEN
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_report import write_report
 from benchmark.blind_trial import MODES, Outcome, Task, run_trial
+from benchmark.workers import in_processes
 from fisheye_svp_ros.io.files import write_text
-from fisheye_svp_ros.reporting.progress import progress
 
 SIZES = (1.0, 0.5, 0.2, 0.1, 0.05)
 OUTSIDE_SIZES = (1.0, 0.5)
@@ -53,21 +51,8 @@ def tasks(mode: str, trials: int, seed: int) -> Iterator[Task]:
 
 
 def run(todo: Sequence[Task], workers: int) -> list[Outcome]:
-    """Run trials in processes of their own, one thread each; Ctrl-C keeps those that are done."""
-    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
-    context = multiprocessing.get_context('spawn')  # the number of threads is read at the start
-    outcomes = []
-    with (
-        progress('blind trials', len(todo)) as advance,
-        ProcessPoolExecutor(workers, mp_context=context) as pool,
-    ):
-        try:
-            for outcome in pool.map(run_trial, todo):
-                outcomes.append(outcome)
-                advance()
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-    return outcomes
+    """Run trials in processes of their own; Ctrl-C keeps those that are done."""
+    return in_processes('blind trials', run_trial, todo, workers)
 
 
 def save(mode: str, outcomes: Sequence[Outcome], seed: int, directory: Path) -> None:

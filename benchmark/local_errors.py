@@ -14,17 +14,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.wanted import Wanted
@@ -32,7 +31,6 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.board_views import board_views
@@ -152,14 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
     parser.add_argument('-o', '--output', type=Path, default=Path('docs'), help='directory')
     asked = parser.parse_args(arguments)
-    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
-    context = multiprocessing.get_context('spawn')  # the number of threads is read at the start
-    trials = []
-    with (progress('sets', asked.trials) as advance,
-          ProcessPoolExecutor(asked.workers, mp_context=context) as pool):
-        for found in pool.map(trial, range(asked.trials)):
-            trials.append(found)
-            advance()
+    trials = in_processes('sets', trial, range(asked.trials), asked.workers)
     lines = ',\n'.join(json.dumps(one) for one in trials)
     write_text(asked.output / 'local_errors.json', f'[\n{lines}\n]\n')
     page = report(trials)

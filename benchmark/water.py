@@ -12,17 +12,16 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
@@ -30,7 +29,6 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
@@ -67,16 +65,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--workers', type=int, default=os.cpu_count())
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/water/trials.json'))
     asked = parser.parse_args(arguments)
-    os.environ['OMP_NUM_THREADS'] = os.environ['OPENBLAS_NUM_THREADS'] = '1'
-    outcomes = []
-    with (
-        progress('trials', asked.trials) as advance,
-        ProcessPoolExecutor(asked.workers, multiprocessing.get_context('spawn')) as pool,
-    ):
-        run = partial(run_trial, rough=asked.rough, air=asked.air)
-        for outcome in pool.map(run, range(asked.trials)):
-            outcomes.append(outcome)
-            advance()
+    run = partial(run_trial, rough=asked.rough, air=asked.air)
+    outcomes = in_processes('trials', run, range(asked.trials), asked.workers)
     lines = ',\n'.join(json.dumps(asdict(one)) for one in outcomes)
     command = f'python -m benchmark.water --trials {asked.trials}' + ' --rough' * asked.rough
     command += ' --air' * asked.air

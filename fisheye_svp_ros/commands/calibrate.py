@@ -119,10 +119,11 @@ def _calibrated(
     across = float(np.ptp(table.xyz, axis=0).max())
     if across > _HUGE:
         say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
+    air = load_lens(args.lens) if args.lens else None
 
     def fitted(rows: Observations) -> Calibration:
-        if args.lens and port:
-            return calibrate_port(rows, load_lens(args.lens), port, args.free)
+        if air and port:
+            return calibrate_port(rows, air, port, args.free)
         return calibrate(rows, args.model, size, args.free, name, port)
 
     with progress('calibrating'):

@@ -11,7 +11,7 @@ from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import fit, prepare, start
-from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
+from fisheye_svp_ros.diagnosis.noise import NO_GROSS, Gross, find_gross_errors
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
@@ -58,8 +58,7 @@ def calibrated_without_gross_errors(
     those that are set aside.
     """
     rows = np.arange(len(observations))
-    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
-    rounds = 0
+    gross, rounds = NO_GROSS, 0
     while True:
         result = calibrate(observations.take(rows))
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
@@ -69,8 +68,7 @@ def calibrated_without_gross_errors(
         rounds += 1
         if not len(found.rows) or rounds == _ROUNDS:
             return result, table, gross
-        gross = Gross(np.concatenate([gross.rows, rows[found.rows]]),
-                      np.concatenate([gross.px, found.px]), (*gross.why, *found.why))
+        gross = gross.joined(found._replace(rows=rows[found.rows]))
         rows = np.delete(rows, found.rows)
 
 

@@ -173,7 +173,7 @@ class Evidence:
             rest = swept(self.restored(information, included), included)
             remaining = rest[-1, -1]
             without = min(without, logs + count * np.log(remaining))
-            inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], 1e-8, 1e-8)
+            inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], least=IDENTIFIABLE)
             remaining -= rest[columns, -1] @ inverse @ rest[columns, -1]
             beside = min(beside, logs + count * np.log(remaining))
         return max(float(without - beside), 0.0)

@@ -42,15 +42,22 @@ class Gross(NamedTuple):
     px: Array
     why: tuple[str, ...]
 
-    def with_more(self, rows: Index, px: Array, why: str) -> Gross:
+    def joined(self, other: Gross) -> Gross:
         """Return these and other rows."""
-        return Gross(np.concatenate([self.rows, rows]), np.concatenate([self.px, px]),
-                     (*self.why, *[why] * len(rows)))
+        return Gross(np.concatenate([self.rows, other.rows]),
+                     np.concatenate([self.px, other.px]), (*self.why, *other.why))
+
+    def with_more(self, rows: Index, px: Array, why: str) -> Gross:
+        """Return these and other rows, of one reason."""
+        return self.joined(Gross(rows, px, (why,) * len(rows)))
 
     @property
     def swapped(self) -> int:
         """How many lie where another landmark is predicted."""
         return self.why.count(SWAPPED)
+
+
+NO_GROSS = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
 
 
 class NoiseCause(NamedTuple):
@@ -91,7 +98,7 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     whole = np.asarray(whole & (whole.mean() < 0.2))
     far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
     swapped = _fits_another(model, pose, views, far, _GATE * typical)
-    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
+    gross = NO_GROSS
     torn, apart = _torn_frames(data, state, alone, typical)
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]

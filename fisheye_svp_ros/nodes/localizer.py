@@ -15,8 +15,9 @@ from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, run
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
+from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.markers import camera_shape
-from fisheye_svp_ros.nodes.solver import Items, SolverNode, lens_of
+from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens

@@ -28,21 +28,18 @@ from fisheye_svp_ros.io.decoding import (
     read_landmarks,
     read_pose,
 )
-from fisheye_svp_ros.io.lens_files import cameras_in
-from fisheye_svp_ros.io.parameters import rows
-from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.join import LIMIT, Pending, StampJoin
+from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.lifecycle import ManagedNode
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import STEREO, Views
-from fisheye_svp_ros.simulate.scenario import Scenario, true_lens
 from fisheye_svp_ros.study.settings import SolverSettings
 from fisheye_svp_ros.study.solutions import Pair
 
@@ -54,7 +51,6 @@ _LONGEST_DRAIN = 0.05  # s of taking in before a set is solved, come what may
 _NONE = 'no landmarks; publish them on `landmarks`'
 _NONE_OF_STAMP = ('no landmarks of its stamp in time: they were late, lost because too much comes '
                   'at once, or never sent')
-_SHIFT_SCALE = next(row for row in rows(Scenario) if row.name == 'shift_scale')
 
 
 @dataclass
@@ -152,13 +148,13 @@ class SolverNode(ManagedNode):
     def prepare(self, settings: SolverSettings) -> SolverSettings:
         """Refuse a lens that cannot be loaded."""
         if settings.lens not in ('', CAMERA_INFO):
-            self._load(settings)
+            lenses_of(settings, self.cameras)
         return settings
 
     def configure(self, settings: SolverSettings) -> None:
         """Load the lens and say which; do not wait for a scenario that nobody needs."""
         told = settings.lens in ('', CAMERA_INFO)
-        self._lenses = {} if told else self._load(settings)
+        self._lenses = {} if told else lenses_of(settings, self.cameras)
         if settings.lens == CAMERA_INFO:
             self._listen_to_camera_info()
         if settings.lens and not self.BY_SCENARIO:
@@ -167,15 +163,6 @@ class SolverNode(ManagedNode):
                 f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
         how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
         self.get_logger().info(f'solving with the {lens} {how} (svp: {settings.svp})')
-
-    def _load(self, settings: SolverSettings) -> dict[str, Lens]:
-        """Return the lens of the parameter by camera; raise LensError for a bad one."""
-        names = cameras_in(lens_path(settings.lens))
-        if len(self.cameras) < 2 or not names:
-            lens = lens_of(settings.lens, 1.0, settings)
-            return dict.fromkeys(('', *self.cameras), lens)
-        return {camera: lens_of(f'{settings.lens}#{name}', 1.0, settings)
-                for camera, name in zip(self.cameras, names, strict=False)}
 
     @abstractmethod
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
@@ -372,22 +359,6 @@ class SolverNode(ManagedNode):
         for topic in present:
             self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
         self._counts.incomplete += bool(present)
-
-
-def lens_of(name: str, scale: float, settings: SolverSettings) -> Lens:
-    """Return a lens as it is to be solved with; raise FisheyeSvpError where it cannot be."""
-    lens = true_lens(name, scale)
-    return lens.svp() if settings.solves_svp else lens
-
-
-def shift_scale(text: str) -> float:
-    """Return the factor that a scenario names; raise FisheyeSvpError where it cannot be used."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise ObservationError(
-            f'scenario: shift_scale is {text[:40]!r}; a number is needed') from None
-    return float(_SHIFT_SCALE.check(value))
 
 
 def known_points(landmarks: LandmarkSet, seen: ImagePoints) -> Array:
