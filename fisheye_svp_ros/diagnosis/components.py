@@ -21,6 +21,7 @@ from fisheye_svp_ros.diagnosis.reml import (
     Variances,
     estimate,
     nothing_random,
+    one_step,
     start_variances,
     without,
 )
@@ -59,7 +60,7 @@ def find_variances(eq: Equations, before: Variances | None = None) -> Variances:
             lam[NAMES.index(name)] = first.lam[NAMES.index(name)]
     if (lam < GONE).sum() > now.alive.sum():
         now, _ = estimate(eq, Variances(now.sigma, lam, now.weight))
-    return _without_chance(eq, now)
+    return _without_chance(eq.trimmed(now.alive), now)
 
 
 def called(eq: Equations, now: Variances, name: str) -> bool:
@@ -79,7 +80,7 @@ def _without_chance(eq: Equations, now: Variances) -> Variances:
         name = min(ratios, key=ratios.__getitem__)
         if _chance(ratios[name]) <= _CHANCE:
             break
-        now, _ = estimate(eq, without(now, name), _WARM)
+        now, eq = estimate(eq, without(now, name), _WARM)
     return now
 
 
@@ -207,8 +208,8 @@ def _followed(
     found = dict(ratios)
     for name, ratio in ratios.items():
         if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
-            rest, _ = estimate(eq, without(now, name), steps=1)
-            found[name] = _deviance(eq, rest) - full
+            rest, left = one_step(eq, without(now, name))
+            found[name] = _deviance(left, rest) - full
     return found
 
 

@@ -186,12 +186,17 @@ class Evidence:
         own = start_variances(self.full, 1.0).lam[kind]
         if own >= GONE:
             return found
-        count = float((self.full.blocks.r_label == kind).sum())
+        with_it = self.variances.alive | (np.arange(len(NAMES)) == kind)
+        eq = self.full.trimmed(with_it).at_the_border(kind)
+        f = factored(eq, self.variances.lam, self.variances.weight)
+        count = len(f.information) - len(self.border[0, 0])
+        field, across = f.information[:count, :count], f.information[:count, count:]
         for more in _FIELDS:
-            lam = self.variances.lam.copy()
-            lam[kind] = own * self.full.rows / count / more
-            f = factored(self.full.trimmed(lam < GONE), lam, self.variances.weight)
-            found.append((f.log_determinant, f.information))
+            prior = own * self.full.rows / count / more
+            inner = field + prior * np.eye(count)
+            logs = f.log_determinant + np.linalg.slogdet(inner)[1] - count * np.log(prior)
+            rest = f.information[count:, count:] - across.T @ np.linalg.solve(inner, across)
+            found.append((float(logs), rest))
         return found
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
@@ -225,8 +230,10 @@ def finest_called(
     data: Data, state: State, free: Sequence[str], variances: Variances, left_out: Sequence[str]
 ) -> bool:
     """Return whether the data call for the finest image field beside all that has a variance."""
-    return called(_all_free(_multiplied(data, state, free, left_out, True)), variances,
-                  'image_finest')
+    name = 'image_finest'
+    there = variances.alive | (np.array(NAMES) == name)
+    bare = _multiplied(data, state, free, left_out, True, there)
+    return called(_all_free(bare), variances, name)
 
 
 def _all_free(bare: Evidence) -> Equations:

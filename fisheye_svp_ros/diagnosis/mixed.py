@@ -76,6 +76,8 @@ class Equations:
         """Return the equations without the coefficients of some components."""
         b, known = self.blocks, np.concatenate([alive, [False, True]])
         blocks, e, r = self.kept(alive)
+        if all(part.all() for part in (known[b.e_label], known[b.r_label])):
+            return self
         if self.by_frame:
             width = int(e.sum())
             left = r[len(r) - 3 * len(self.landmarks) :].reshape(-1, 3).any(axis=1)
@@ -83,12 +85,24 @@ class Equations:
             width = int(r[: len(self.pose_scale) * self.width].sum()) // len(self.pose_scale)
             left = blocks
         parts = Blocks(
-            b.ee[blocks][:, e][..., e], b.er[blocks][:, e][..., r], b.rr[np.ix_(r, r)],
-            b.ex[blocks][:, e], b.rx[r], b.xx,
-            np.where(known[b.e_label], b.e_label, ABSENT)[blocks][:, e],
+            b.ee[np.ix_(blocks, e, e)], b.er[np.ix_(blocks, e, r)], b.rr[np.ix_(r, r)],
+            b.ex[np.ix_(blocks, e)], b.rx[r], b.xx,
+            np.where(known[b.e_label], b.e_label, ABSENT)[np.ix_(blocks, e)],
             np.where(known[b.r_label], b.r_label, ABSENT)[r],
         )
         return replace(self, blocks=parts, width=width, landmarks=self.landmarks[left])
+
+    def at_the_border(self, kind: int) -> Equations:
+        """Return the equations with a component of the rest in front of the border, no prior."""
+        b, mine = self.blocks, self.blocks.r_label == kind
+        parts = Blocks(
+            b.ee, b.er[..., ~mine], b.rr[np.ix_(~mine, ~mine)],
+            np.concatenate([b.er[..., mine], b.ex], axis=-1),
+            np.concatenate([b.rr[np.ix_(~mine, mine)], b.rx[~mine]], axis=-1),
+            np.block([[b.rr[np.ix_(mine, mine)], b.rx[mine]], [b.rx[mine].T, b.xx]]),
+            b.e_label, b.r_label[~mine],
+        )
+        return replace(self, blocks=parts)
 
     def times(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
         """Multiply coefficients (E, k, C), (R, C): products with blocks, rest and border."""
@@ -114,7 +128,7 @@ class Equations:
         """Sort coefficients (E, k, ...), (R, ...): by frame (F, b, ...), by landmark, shared."""
         if self.by_frame:
             count = len(r) - 3 * len(self.landmarks)
-            return e, r[count:].reshape(-1, 3, *r.shape[1:]), r[:count]
+            return e, r[count:].reshape(len(self.landmarks), 3, *r.shape[1:]), r[:count]
         count = len(self.pose_scale) * self.width
         return r[:count].reshape(len(self.pose_scale), self.width, *r.shape[1:]), e, r[count:]
 
@@ -124,7 +138,8 @@ def equations(design: Design, pose: Array, border: Array) -> Equations:
     scale = np.sqrt((pose**2).sum(axis=1))
     scale = np.where(scale < 1e-9, np.inf, scale)
     products = multiplied(design, pose / scale[:, None], border)
-    width = products.ff.shape[-1]
+    width, six = products.ff.shape[-1], np.arange(6)
+    products.ff[:, six, six] += np.where(np.isfinite(scale), _RIDGE, 1.0)
     l_label = np.where(design.landmark_label < 0, ABSENT, design.landmark_label)
     # Bumps of single frames are many, and seldom there.
     seldom = int((design.frame_label == NAMES.index('frame_bumps')).sum())
@@ -136,21 +151,7 @@ def equations(design: Design, pose: Array, border: Array) -> Equations:
     )
     rows = int((np.abs(pose).sum(axis=-1) + np.abs(border).sum(axis=-1) > 0).sum())
     poses = int(np.isfinite(scale).sum())
-    found = Equations(blocks, by_frame, rows, poses, scale, width, np.arange(len(l_label)))
-    return _held(found, np.where(np.isfinite(scale), _RIDGE, 1.0))
-
-
-def _held(eq: Equations, ridge: Array) -> Equations:
-    """Add a ridge (F, 6) to the poses."""
-    b, six = eq.blocks, np.arange(6)
-    if eq.by_frame:
-        ee = b.ee.copy()
-        ee[:, six, six] += ridge
-        return replace(eq, blocks=b._replace(ee=ee))
-    rr = b.rr.copy()
-    at = (np.arange(len(ridge))[:, None] * eq.width + six).ravel()
-    rr[at, at] += ridge.ravel()
-    return replace(eq, blocks=b._replace(rr=rr))
+    return Equations(blocks, by_frame, rows, poses, scale, width, np.arange(len(l_label)))
 
 
 @dataclass(frozen=True)

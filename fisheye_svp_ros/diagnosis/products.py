@@ -53,14 +53,15 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
     sf = np.zeros((count, frames, own.shape[-1]))
     ss, sx = np.zeros((count, count)), np.zeros((count, edge))
     for f in range(frames):
-        rows = slice(f * height, (f + 1) * height)
-        lf[:, f] = offsets[rows].T @ own[f]
-        part = shared[rows]
-        seen = np.unique(part.indices)  # a frame fills a part of the image
-        dense = part[:, seen].toarray().T
-        sf[seen, f] = dense @ own[f]
-        sx[seen] += dense @ border[f]
-        ss[np.ix_(seen, seen)] += dense @ dense.T
+        lf[:, f] = offsets[f * height : (f + 1) * height].T @ own[f]
+        for axis in (0, 1):
+            # A frame fills a part of the image, and a bump moves u or v.
+            part = shared[f * height + axis : (f + 1) * height : 2]
+            seen = np.unique(part.indices)
+            dense = part[:, seen].toarray().T
+            sf[seen, f] += dense @ own[f, axis::2]
+            sx[seen] += dense @ border[f, axis::2]
+            ss[np.ix_(seen, seen)] += dense @ dense.T
     place = design.place * (design.slot >= 0)[..., None, None]
     ll = np.zeros((landmarks, 3, 3))
     np.add.at(ll, design.slot, np.swapaxes(place, -1, -2) @ place)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse.linalg import eigsh
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.evidence import Evidence
@@ -17,6 +18,7 @@ from fisheye_svp_ros.diagnosis.mixed import (
     Solution,
     equations,
     factored,
+    posterior,
     solve,
 )
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
@@ -124,19 +126,12 @@ def _solved(
 def local_offsets(fitted: Fitted) -> Local:
     """Return what the random parts of target and lens are predicted to be."""
     eq, random = fitted.factored.equations, fitted.design
-    _, landmark, shared = eq.sorted(fitted.solution.e, fitted.solution.r)
-    offset = np.zeros((len(random.landmark), 3))
-    if len(eq.landmarks):
-        offset[eq.landmarks] = np.where(random.landmark_label[eq.landmarks] >= 0, landmark, 0.0)
-    grids = []
+    e, r = fitted.solution.e[..., None], fitted.solution.r[:, None]
+    in_target = np.einsum('la,lab->lb', _offsets(fitted, e, r)[..., 0], random.axes) * MILLIMETRE
+    shared, grids = eq.sorted(e, r)[2][:, 0], []
     for grid in random.grids:
         values, shared = np.split(shared, [2 * len(grid.centres)])
         grids.append((grid, values.reshape(-1, 2)))
-    for field in random.fields:
-        for axis in field.axes:
-            values, shared = np.split(shared, [field.values.shape[1]])
-            offset[:, axis] += field.values @ values
-    in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
     return Local(random.landmark, in_target, tuple(grids))
 
 
@@ -147,35 +142,39 @@ def target_modes(fitted: Fitted, sigma: float) -> tuple[Array, Array]:
     offsets: of a sum of the modes, each with a factor of variance 1, and of what each landmark has
     alone.  sigma: of the whitened noise.
     """
-    e, r = _columns_of_landmarks(fitted)
-    count = e.shape[-1]
-    none = np.zeros((len(fitted.scale), count))
-    ways = (e.reshape(-1, count), r)
-    mean = ways[0].T @ fitted.solution.e.ravel() + r.T @ fitted.solution.r
-    spread = fitted.factored.solved(e, r, none)
-    covariance = ways[0].T @ spread[0].reshape(-1, count) + r.T @ spread[1]
-    square = sigma**2 * (covariance + covariance.T) / 2 + np.outer(mean, mean)
-    values, vectors = np.linalg.eigh(square)
-    kept = np.flatnonzero(values > _MODE * values.sum())[-_MOST_MODES:]
+    known, eq = posterior(fitted.factored), fitted.factored.equations
+    mean = _offsets(fitted, fitted.solution.e[..., None], fitted.solution.r[:, None])
+    root = _offsets(fitted, known.e.reshape(*fitted.solution.e.shape, len(known.r.T)), known.r)
+    root = np.concatenate([sigma * root, mean], axis=-1).reshape(mean.size, len(known.r.T) + 1)
+    square = root @ root.T
+    if not eq.by_frame:  # what a landmark's own block leaves open
+        there = (fitted.design.landmark_label >= 0)[eq.landmarks]
+        own = 3 * eq.landmarks[:, None] + np.arange(3)
+        square[own[:, :, None], own[:, None]] += np.where(
+            there[:, :, None] & there[:, None], sigma**2 * known.block, 0.0)
+    count = len(square)
+    if not square.any():
+        return np.zeros((count // 3, 3, 0)), np.zeros((count // 3, 3))
+    start = np.random.default_rng(0).standard_normal(count)  # the same modes every time
+    values, vectors = eigsh(square, min(_MOST_MODES, count - 1), v0=start)
+    kept = values > _MODE * np.trace(square)
     modes = vectors[:, kept] * np.sqrt(values[kept])
     alone = np.sqrt(np.maximum(np.diag(square) - (modes**2).sum(axis=1), 0.0))
     return (MILLIMETRE * modes.reshape(count // 3, 3, -1), MILLIMETRE * alone.reshape(-1, 3))
 
 
-def _columns_of_landmarks(fitted: Fitted) -> tuple[Array, Array]:
-    """Return the coefficients (E, k, 3 L), (R, 3 L) whose sums the landmarks' offsets are."""
+def _offsets(fitted: Fitted, e: Array, r: Array) -> Array:
+    """Return what coefficients (E, k, C), (R, C) displace each landmark by: (L, 3, C)."""
     eq, random = fitted.factored.equations, fitted.design
-    landmarks = len(random.landmark)
-    own = np.eye(3 * landmarks).reshape(landmarks, 3, -1)
-    own = own * (random.landmark_label >= 0)[..., None]
-    shared = [np.zeros((2 * len(grid.centres), 3 * landmarks)) for grid in random.grids]
+    _, landmark, shared = eq.sorted(e, r)
+    offset = np.zeros((len(random.landmark), 3, r.shape[-1]))
+    if len(eq.landmarks):
+        there = random.landmark_label[eq.landmarks] >= 0
+        offset[eq.landmarks] = np.where(there[..., None], landmark, 0.0)
+    at = sum(2 * len(grid.centres) for grid in random.grids)
     for field in random.fields:
         for axis in field.axes:
-            moved = np.zeros((field.values.shape[1], landmarks, 3))
-            moved[..., axis] = field.values.T
-            shared.append(moved.reshape(-1, 3 * landmarks))
-    both = np.concatenate([np.zeros((0, 3 * landmarks)), *shared])
-    alive, frame = own[eq.landmarks], np.zeros((len(eq.pose_scale), eq.width, 3 * landmarks))
-    if eq.by_frame:
-        return frame, np.concatenate([both, alive.reshape(-1, 3 * landmarks)])
-    return alive, np.concatenate([frame.reshape(-1, 3 * landmarks), both])
+            count = field.values.shape[1]
+            offset[:, axis] += field.values @ shared[at : at + count]
+            at += count
+    return offset

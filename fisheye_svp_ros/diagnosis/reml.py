@@ -73,8 +73,27 @@ def estimate(eq: Equations, start: Variances, steps: int = _STEPS) -> tuple[Vari
     """Find the variances; the border must be of full rank.
 
     A component whose variance runs to zero is switched off and stays so.  Returns the variances
-    and the equations without what has vanished.
+    with their covariance, and the equations without what has vanished.
     """
+    now, eq, f, solution = _stepped(eq, start, steps)
+    information = average_information(f, solution)
+    free = np.append(now.alive, True)
+    covariance = np.zeros(information.shape)
+    # A component on its way to nothing must not lend its uncertainty to all others.
+    part = information[np.ix_(free, free)] + 0.01 * np.eye(int(free.sum()))
+    covariance[np.ix_(free, free)] = np.linalg.inv(part)
+    return replace(now, covariance=covariance), eq
+
+
+def one_step(eq: Equations, start: Variances) -> tuple[Variances, Equations]:
+    """Return what `estimate` has after its first step, without a covariance."""
+    return _stepped(eq, start, 1)[:2]
+
+
+def _stepped(
+    eq: Equations, start: Variances, steps: int
+) -> tuple[Variances, Equations, Factored, Solution]:
+    """Return the variances after some steps, the equations, and what the last step solved."""
     now, eq = start, eq.trimmed(start.alive)
     ceiling = start_variances(eq, _NOTHING).lam
     last = np.inf
@@ -101,13 +120,7 @@ def estimate(eq: Equations, start: Variances, steps: int = _STEPS) -> tuple[Vari
             continue
         if moved < _TOLERANCE and shifted < _TOLERANCE / 2:
             break
-    information = average_information(f, solution)
-    free = np.append(now.alive, True)
-    covariance = np.zeros(information.shape)
-    # A component on its way to nothing must not lend its uncertainty to all others.
-    part = information[np.ix_(free, free)] + 0.01 * np.eye(int(free.sum()))
-    covariance[np.ix_(free, free)] = np.linalg.inv(part)
-    return replace(now, covariance=covariance), eq
+    return now, eq, f, solution
 
 
 def _newton(
