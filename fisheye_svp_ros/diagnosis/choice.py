@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterator
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import chain, takewhile
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from fisheye_svp_ros.effects.base import Effect
 
 # False alarms: this much for all effects together, the same again for the random components.
 SIGNIFICANCE = 0.01
+# What is named is surer than that: a local error now and then has the form of an effect.
+NAMED = 0.002
 # An effect is in the class of another unless, with it in the model, the other is still needed.
 CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
@@ -162,10 +164,9 @@ def choose(
     while len(choice.forms) < most:
         remaining = (c for c in eligible(evidence, included)
                      if c.form not in failed and c.effect.name not in refused)
-        best = next(remaining, None)
+        best = _best(remaining)
         if best is None:
             break
-        best = _likelier(best, remaining)
         columns = evidence.columns_of(best.form)
         gain = HeldOutGain(np.inf, 0.0)
         if not (best.effect.per_frame or quick):
@@ -177,6 +178,16 @@ def choose(
         else:
             failed.add(best.form)
     return choice
+
+
+def _best(remaining: Iterator[Candidate]) -> Candidate | None:
+    """Return the first that is sure enough to be named, or what is likelier than it."""
+    weaker: list[Candidate] = []
+    for candidate in remaining:
+        if candidate.corrected < NAMED:
+            return _likelier(candidate, chain(weaker, remaining))
+        weaker.append(candidate)
+    return None
 
 
 def _likelier(best: Candidate, others: Iterator[Candidate]) -> Candidate:

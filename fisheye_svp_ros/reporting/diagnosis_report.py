@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jinja2
 
 from fisheye_svp_ros.diagnosis.budget import stage_shares
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
+from fisheye_svp_ros.diagnosis.choice import NAMED, TraceStep
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.next_question import Next
@@ -84,7 +84,7 @@ def write_report(
         undefined=jinja2.StrictUndefined, trim_blocks=True,
     )
     page = environment.get_template('diagnosis.html').render(
-        d=diagnosis, inputs=inputs, percent=text.percent, significance=SIGNIFICANCE,
+        d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED,
         headline=text.VERDICTS[diagnosis.verdict],
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
