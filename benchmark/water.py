@@ -23,7 +23,11 @@ import numpy as np
 
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
+from fisheye_svp_ros.diagnosis.calibration import (
+    calibrated_without_gross_errors,
+    trust,
+    with_stderr,
+)
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
@@ -131,8 +135,7 @@ def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
     given = _calibrated(lens, rng, free, rough)
     if air:
         table = _photographs(lens, lambda points: _central(lens, points), noise, rough, rng)
-        found = calibrate(table, 'kannala_brandt', (lens.width, lens.height)).adjusted
-        given = with_stderr(found.lens, trust(table, found.lens, found.names))
+        given = _calibrated_in_air(table, (lens.width, lens.height))
     found = diagnose(seen, given, free_intrinsics=free)
     port = next((c for c in found.causes if c.form == 'flat_port(medium)'), None)
     values = {} if port is None else {
@@ -161,6 +164,14 @@ def _calibrated(lens: Lens, rng: np.random.Generator, free: bool, rough: bool) -
     return replace(lens, fx=lens.fx * off, fy=lens.fy * off, calibration=block,
                    cx=lens.cx + worse * rng.normal(scale=0.1),
                    cy=lens.cy + worse * rng.normal(scale=0.1))
+
+
+def _calibrated_in_air(table: Observations, size: tuple[int, int]) -> Lens:
+    """Return the lens file that `calibrate` writes of photographs in air."""
+    result, kept, _ = calibrated_without_gross_errors(
+        table, lambda rows: calibrate(rows, 'kannala_brandt', size))
+    found = result.adjusted
+    return with_stderr(found.lens, trust(kept, found.lens, found.names))
 
 
 def _central(lens: Lens, points: Array) -> Array:

@@ -132,20 +132,22 @@ def diagnose_against(
                                    'choose the rows of one camera')
     wanted = wanted or Wanted()
 
-    def this(wanted: Wanted) -> Diagnosis:
-        return diagnose(observations, lens, free_intrinsics=free_intrinsics, poses=poses,
-                        held_out=held_out, wanted=wanted,
-                        progress=lambda stage, done: progress(stage, done / 2))
+    def part(begin: float, end: float, of: str = '') -> Callable[[str, float], None]:
+        return lambda stage, done: progress(of + stage, begin + done * (end - begin))
 
-    found = this(wanted)
+    def this(wanted: Wanted, part: Callable[[str, float], None]) -> Diagnosis:
+        return diagnose(observations, lens, free_intrinsics=free_intrinsics, poses=poses,
+                        held_out=held_out, wanted=wanted, progress=part)
+
+    found = this(wanted, part(0.0, 0.35))
     second = diagnose(other, lens, free_intrinsics=free_intrinsics, wanted=wanted,
-                      progress=lambda stage, done: progress(
-                          f'the other set: {stage}', 0.4 + done / 2))
-    progress('asking each set what it says of the other', 0.84)
+                      progress=part(0.35, 0.7, 'the other set: '))
+    progress('asking each set what it says of the other', 0.7)
     said = two_sets(found, second, observations.source, other.source)
     gone = tuple(name for name in said.refuted if name not in wanted.included)
     if gone:
-        found = this(replace(wanted, left_out=(*wanted.left_out, *gone)))
+        found = this(replace(wanted, left_out=(*wanted.left_out, *gone)),
+                     part(0.7, 0.85, 'without what the other set refutes: '))
         said = replace(said, withdrawn=gone)
     return replace(found, against=said)
 

@@ -52,7 +52,10 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
 
 def test_what_the_other_set_refutes_is_withdrawn():
     one, other = table(33, (SKEW, np.array([0.003]))), table(34)
-    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
+    shares = []
+    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK,
+                             progress=lambda _, share: shares.append(share))
+    assert shares == sorted(shares) and shares[-1] < 0.88
     assert found.against.withdrawn == ('skew',) and found.against.verdict == 'contradict'
     assert 'skew' not in [cause.effect for cause in found.causes]
     shear, = (said for name, said in found.against.parameters.items() if 'skew' in name)
