@@ -54,6 +54,10 @@ def advise(
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
         if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
     ]
+    if measured.medium is not None and measured.medium.moved:
+        advice.append(Advice(
+            'the lens was moved within what its calibration in air leaves open: take photographs '
+            'in air that fill the image, or of a target that is better known'))
     # Advice without a figure keeps its order, after all that has one.
     return sorted(advice, key=lambda one: -one.gain)
 

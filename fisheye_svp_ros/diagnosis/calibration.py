@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
@@ -37,10 +38,14 @@ class Admissible:
 
 @dataclass(frozen=True)
 class Trust:
-    """Standard errors of parameters, the target as it is said to be, and their ranges, by name."""
+    """Standard errors of parameters, the target as it is said to be, and their ranges, by name.
+
+    covariance (K, K): of all of them, over all targets that the data admit.
+    """
 
     stderr: dict[str, float]
     admissible: dict[str, Admissible]
+    covariance: Array
 
     @property
     def doubtful_shift(self) -> dict[str, Admissible]:
@@ -81,26 +86,35 @@ def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust
     evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
     errors = standard_errors(evidence)
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    return Trust(stderr, {
-        name: _over_targets(evidence, i, name, float(value), stderr[name])
-        for i, (name, value) in enumerate(zip(names, parameter_values(lens, names), strict=True))
-    })
+    moved, covariance = _any_target(evidence)
+    values = parameter_values(lens, names)
+    admissible = {
+        name: _admissible(name, (value, error), (value + step, spread)) for name, value, error,
+        step, spread in zip(names, values, errors, moved, np.sqrt(np.diag(covariance)),
+                            strict=True)}
+    # The values stand for a target as it is said to be: what another would move them by is
+    # doubt, too.
+    covariance = covariance + np.outer(moved, moved)
+    known = np.sqrt(np.diag(covariance))
+    larger = np.maximum(np.nan_to_num(errors), known) / np.maximum(known, 1e-300)
+    return Trust(stderr, admissible, covariance * np.outer(larger, larger))
 
 
 def with_stderr(lens: Lens, trusted: Trust) -> Lens:
-    """Return a calibrated lens whose `calibration` says how sure its numbers are, with any target.
+    """Return a calibrated lens whose `calibration` says how sure its numbers are, any target.
 
-    A standard error each: a quarter of the 95 % range.
+    stderr: one each, by name; covariance: of all, in the same order.
     """
-    known = {name: (one.high - one.low) / (2 * _WIDE) for name, one in trusted.admissible.items()}
-    return replace(lens, calibration={**(lens.calibration or {}), 'stderr': known})
+    errors = np.sqrt(np.diag(trusted.covariance)).tolist()
+    return replace(lens, calibration={
+        **(lens.calibration or {}), 'stderr': dict(zip(trusted.stderr, errors, strict=True)),
+        'covariance': trusted.covariance.tolist()})
 
 
-def _over_targets(
-    evidence: Evidence, column: int, name: str, value: float, stderr: float
-) -> Admissible:
-    """Return the range of a parameter with the target as it is said to be, and free."""
-    columns, prior = [np.arange(evidence.own)], [np.zeros(evidence.own)]
+def _any_target(evidence: Evidence) -> tuple[Array, Array]:
+    """Return how far parameters (K,) move once the target is free, and their covariance (K, K)."""
+    own = np.arange(evidence.own)
+    columns, prior = [own], [np.zeros(evidence.own)]
     for form, effect in enumerate(evidence.forms.effects):
         if stage_of(effect.name) == 'target':
             columns.append(evidence.columns_of(form))
@@ -111,11 +125,15 @@ def _over_targets(
     inverse, _ = pseudo_inverse(
         information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
     )
-    scale = evidence.scale[column]
-    moved = value + float((inverse @ information[every, -1])[column] / scale)
-    spread = float(np.sqrt(max(inverse[column, column], 0.0)) / scale)
-    pairs = ((value, stderr), (moved, spread))
-    ends = [middle + sign * _WIDE * error for middle, error in pairs for sign in (-1, 1)]
+    scale = evidence.scale[own]
+    return (inverse @ information[every, -1])[own] / scale, (
+        inverse[np.ix_(own, own)] / np.outer(scale, scale))
+
+
+def _admissible(name: str, *found: tuple[float, float]) -> Admissible:
+    """Return the range of a parameter from values and standard errors, by target said and free."""
+    (value, stderr), (moved, spread) = found
+    ends = [middle + sign * _WIDE * error for middle, error in found for sign in (-1, 1)]
     sure = name not in _SHIFT_NAMES or min(ends) > 0 or max(ends) < 0
     near = abs(moved - value) < _WIDE * np.hypot(stderr, spread)
     return Admissible(min(ends), max(ends), bool(sure and near))

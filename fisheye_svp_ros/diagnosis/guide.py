@@ -194,7 +194,7 @@ def _prior(lens: Lens, free: Sequence[str]) -> Prior:
     loose = {'fx': 0.1 * lens.fx, 'fy': 0.1 * lens.fy, 'cx': 0.05 * lens.fx, 'cy': 0.05 * lens.fy}
     loose |= {f'k{i}': 0.2 / edge**(2 * i) for i in range(1, 5)}
     return Prior(np.array([*(lens.parameters[name] for name in free), 0.0]),
-                 np.array([*(loose[name] for name in free), _EFFECT.parameters[0].large]))
+                 np.diag([*(1 / loose[name] for name in free), 1 / _EFFECT.parameters[0].large]))
 
 
 def _noise(linear: Linearised) -> float:

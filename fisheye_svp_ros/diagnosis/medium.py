@@ -17,6 +17,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
+from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.model import (
     Data,
@@ -60,7 +61,9 @@ class Medium:
     state, names: the fit, and what of the port was fitted; gross: errors set aside beside it; air:
     the simulation as it was, fitted to the same data;
     magnified: relative standard error of the focal length in air, as far as the lens tells;
-    p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well.
+    p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well;
+    merit: by how much less likely than one (BIC); moved: whether the intrinsics are no longer as
+    they were in air, within what the calibration there left open.
     """
 
     state: State
@@ -71,6 +74,8 @@ class Medium:
     p_value: float
     share: float
     alike: bool
+    merit: float
+    moved: bool
     magnified: float = 0.0
 
     def held_out(self) -> HeldOut:
@@ -145,19 +150,45 @@ def find_medium(
     curve = _free_curve(data, base)
     if not (_magnified(air, lens, curve) or rms_px(Linearised(data, curve, ())) > _SUSPECT):
         return None
-    found = _behind_port(everything, data, lens)
+    known, found = InAir.of(lens), [_told(everything, lens, _started(data, lens), free, 0.0)]
+    if known is not None:
+        progress('asking what photographs in air left open of the lens', 0.03)
+        wet = _corrected(everything, lens, known)
+        moved = 0.0 if wet is None else known.unlikely(wet)
+        found.append(_told(everything, lens, wet, free, moved))
+    return min(filter(None, found), key=lambda one: one.merit, default=None)
+
+
+def _corrected(everything: Data, lens: Lens, known: InAir) -> Lens | None:
+    """Return a lens behind its port, moved within what photographs in air had left open of it."""
+    near = known.within(everything, known.reach)
+    wet = None if near is None else _started(near, lens)
+    try:
+        return None if wet is None else known.behind(everything, wet, PLACE, INDEX)
+    except GeometryError:
+        return None
+
+
+def _told(
+    everything: Data, lens: Lens, wet: Lens | None, free: Sequence[str], moved: float
+) -> Medium | None:
+    """Return the medium if a port explains as well as a free lens curve would.
+
+    wet: the lens with its port about where it is and the intrinsics that it is held to; moved: how
+    unlikely these are by the calibration in air, as `InAir.unlikely` says.
+    """
+    found = None if wet is None else _behind_port(everything, wet)
     if found is None:
         return None
     data, gross, state, names = found
     base = fit(data, start(data, lens), free)
     air, curve = Linearised(data, base, free), _free_curve(data, base)
-    plain = Linearised(data, replace(base, lens=_held(lens, base.lens)), ())
-    before, after, least = (_cost(fitted) for fitted in (
-        Linearised(data, fit(data, plain.state, ()), ()), Linearised(data, state, ()),
-        Linearised(data, curve, ())))
+    plain = replace(base, lens=replace(state.lens, port=None))
+    before, after, least = (_cost(Linearised(data, fitted, ())) for fitted in (
+        fit(data, plain, ()), state, curve))
     rows = int(air.used.sum())
     square = min(after, least) / rows
-    merits = (after / square + len(names) * np.log(rows),
+    merits = (after / square + len(names) * np.log(rows) + moved,
               least / square + (len(INTRINSICS) + _TERMS) * np.log(rows))
     near = before - after > _EXPLAINED * (before - least) and after < _WORSE * least
     if not (merits[0] < merits[1] or near):
@@ -165,7 +196,7 @@ def find_medium(
     mine = _cost(air)
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(state, names, gross, air, tuple(free), p_value, max(0.0, 1 - after / mine),
-                  bool(merits[1] < merits[0]), _of_focal(lens))
+                  bool(merits[1] < merits[0]), merits[0] - merits[1], moved > 0, _of_focal(lens))
 
 
 def _of_focal(lens: Lens) -> float:
@@ -180,33 +211,31 @@ def _of_focal(lens: Lens) -> float:
     return float(errors.get('fx', 0.0)) / lens.fx
 
 
-def _held(lens: Lens, fitted: Lens) -> Lens:
-    """Return the lens of a state with the intrinsics that it had in air."""
-    return replace(fitted, fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy,
-                   image_height=lens.image_height)
-
-
-def _behind_port(
-    everything: Data, data: Data, lens: Lens
-) -> tuple[Data, Gross, State, tuple[str, ...]] | None:
-    """Fit the place of a port from several starts; free the index where the data tell it.
-
-    Returns also the data without the gross errors that stand out behind the port: in air other
-    points may have seemed to be some.
-    """
+def _started(data: Data, lens: Lens) -> Lens | None:
+    """Return the lens with a port about where it is, fitted to a few frames."""
     chosen = np.linspace(0, data.frames - 1, min(_FEW, data.frames)).astype(int)
     few = chosen_views(data, np.isin(data.frame_of, chosen))
-    tried: list[tuple[float, State]] = []
+    tried: list[tuple[float, Lens]] = []
     for port in FlatGlass(0.0, MEDIA['water']).starts():
         try:
             state = fit(few, start(few, replace(lens, port=port)), PLACE)
         except GeometryError:
             continue  # nothing of a view is seen through a port there
-        tried.append((_cost(Linearised(few, state, PLACE)), state))
+        tried.append((_cost(Linearised(few, state, PLACE)), state.lens))
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
-    best = min(tried, key=lambda one: one[0])[1]
-    wet = replace(lens, port=best.lens.port)
+    found = min(tried, key=lambda one: one[0])[1]
+    return replace(lens, port=found.port)
+
+
+def _behind_port(
+    everything: Data, wet: Lens
+) -> tuple[Data, Gross, State, tuple[str, ...]] | None:
+    """Fit the place of a port; free the index where the data tell it.
+
+    Returns also the data without the gross errors that stand out behind the port: in air other
+    points may have seemed to be some.
+    """
     data, gross = find_gross_errors(everything, start(everything, wet))
     if data.views.used.sum() < _KEPT * everything.views.used.sum():
         return None

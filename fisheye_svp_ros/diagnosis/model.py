@@ -274,10 +274,13 @@ def is_shared(effect: Effect) -> bool:
 
 
 class Prior(NamedTuple):
-    """What is known before of free intrinsics and effect values: mean (K,), stderr (K,)."""
+    """What is known before of free intrinsics and effect values: mean (K,), root (R, K).
+
+    root: times what is off the mean it is of unit covariance.
+    """
 
     mean: Array
-    stderr: Array
+    root: Array
 
 
 def fit(
@@ -355,10 +358,11 @@ class _Adjustment:
             shared = np.zeros((*linear.residual.shape, len(self._moving)))
         cost, normal = _equations(linear.residual, linear.frame_columns, shared)
         if self._prior is not None:
-            off = (state[-1][0] - self._prior.mean) / self._prior.stderr
+            mean, root = self._prior
+            off = root @ (state[-1][0, -len(mean):] - mean)
             cost = cost + off @ off
-            normal[2][0, -len(off):, -len(off):] += np.diag(self._prior.stderr**-2)
-            normal[4][0, -len(off):] += off / self._prior.stderr
+            normal[2][0, -len(mean):, -len(mean):] += root.T @ root
+            normal[4][0, -len(mean):] += root.T @ off
         return cost, normal
 
     def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:

@@ -25,6 +25,7 @@ _STEPS = 25
 _TOLERANCE = 0.1  # of log lambda
 _PACE = 1.4
 _NOTHING = 3e-4  # of the noise variance: a component that adds less has vanished
+_EVERYTHING = 1e8  # times the noise variance: no component adds more, whatever a fit says
 
 
 @dataclass(frozen=True)
@@ -95,9 +96,10 @@ def _stepped(
 ) -> tuple[Variances, Equations, Factored, Solution]:
     """Return the variances after some steps, the equations, and what the last step solved."""
     now, eq = start, eq.trimmed(start.alive)
-    ceiling = start_variances(eq, _NOTHING).lam
+    ceiling, floor = (start_variances(eq, share).lam for share in (_NOTHING, _EVERYTHING))
     last = np.inf
     for step in range(steps):
+        now = replace(now, lam=np.maximum(now.lam, floor))
         f = factored(eq, now.lam, now.weight)
         solution = solve(f)
         size = f.shares(solution.e, solution.r) / solution.variance

@@ -119,10 +119,10 @@ def test_one_photograph_moves_the_data_sheet_no_further_than_it_must(first):
     free = intrinsic_names(SHEET)
     sheet = np.array([SHEET.parameters[name] for name in free])
     loose = np.array([30.0, 30.0, 15.0, 15.0, 0.05, 0.02, 0.01, 0.005])
-    state = fit(data, start(data, SHEET), free, Prior(sheet, loose))
+    state = fit(data, start(data, SHEET), free, Prior(sheet, np.diag(1 / loose)))
     moved = np.array([state.lens.parameters[name] for name in free]) - sheet
     assert (np.abs(moved) < 2.5 * loose).all()
-    held = fit(data, start(data, SHEET), free, Prior(sheet, 1e-9 * loose))
+    held = fit(data, start(data, SHEET), free, Prior(sheet, np.diag(1e9 / loose)))
     assert [held.lens.parameters[name] for name in free] == pytest.approx(sheet, abs=1e-6)
 
 

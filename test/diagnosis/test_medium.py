@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
+from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
 CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})
@@ -37,6 +39,24 @@ def test_water_is_named_and_measured(lens, others):
     assert found.lens.port.medium_index == cause.parameters['medium_index']['value']
     assert found.lens.fx == AIR.fx and found.gain.value > 0.9
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
+
+
+def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
+    """The curve turns back at 62 degrees where no point in air was."""
+    table = photographs(AIR, None, 8, noise=0.3, seed=2, reach=0.15)
+    result = calibrate(table, 'kannala_brandt', (AIR.width, AIR.height)).adjusted
+    given = with_stderr(result.lens, trust(table, result.lens, result.names))
+    assert given.max_incidence < 1.1
+    found = diagnose(photographs(AIR, PORT, 8, seed=12, reach=0.9), given,
+                     wanted=Wanted(quick=True))
+    assert [c.form for c in found.causes] == ['flat_port(medium)']
+    index = medium_of(found).parameters['medium_index']
+    assert abs(index['value'] - 1.34) < 3 * index['stderr'] < 0.03
+    theta = np.radians([20.0, 40.0, 60.0])
+    heights = [one.fx * one.image_height.value_and_slope(theta)[0] for one in (found.lens, AIR)]
+    assert heights[0] == pytest.approx(heights[1], rel=0.01)
+    assert found.extended.heldout_rms_px < 0.2
+    assert any('leaves open' in advice.what for advice in found.advice)
 
 
 def test_an_index_is_no_surer_than_the_focal_length_in_air():

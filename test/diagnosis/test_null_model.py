@@ -217,6 +217,9 @@ def test_estimates_lower_the_deviance():
     found, rest = estimate(eq, first)
     after = solve(factored(rest, found.lam, found.weight)).deviance
     assert after < before
+    # Where a fit has run away, so have the variances that the next one begins with.
+    found, rest = estimate(eq, replace(first, lam=np.full(len(NAMES), 1e-18)))
+    assert solve(factored(rest, found.lam, found.weight)).deviance < before
 
 
 def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():

@@ -20,14 +20,17 @@ AIR = Lens('air', 1280, 960, 420.0, 421.0, 640.0, 478.0, KannalaBrandt(-0.02, 0.
 
 
 def photographs(lens: Lens, port: Port | None, frames: int = 8, noise: float = 0.1,
-                seed: int = 0) -> Observations:
-    """Return photographs of a board of 7 x 5 corners at 0.3 to 1.2 m."""
+                seed: int = 0, reach: float = 0.7) -> Observations:
+    """Return photographs of a board of 7 x 5 corners at 0.3 to 1.2 m.
+
+    reach: largest angle, rad, of its middle from the axis.
+    """
     rng, wet = np.random.default_rng(seed), replace(lens, port=port)
     x, y = np.meshgrid(np.arange(7), np.arange(5))
     board = 0.07 * np.stack([x.ravel() - 3.0, y.ravel() - 2.0, 0.0 * x.ravel()], axis=-1)
     poses: list[Pose] = []
     while len(poses) < frames:
-        angle, azimuth = rng.uniform(0, 0.7), rng.uniform(0, 2 * np.pi)
+        angle, azimuth = rng.uniform(0, reach), rng.uniform(0, 2 * np.pi)
         away = np.exp(rng.uniform(np.log(0.3), np.log(1.2)))
         place = away * np.array([np.sin(angle) * np.cos(azimuth),
                                  np.sin(angle) * np.sin(azimuth), np.cos(angle)])
