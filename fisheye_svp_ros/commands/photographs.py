@@ -41,7 +41,8 @@ def measured(
     from fisheye_svp_ros.detect.photographs import is_photographs
     from fisheye_svp_ros.io.readers import read_observations
 
-    if args.board:
+    # Beside photographs other observations (held out, of another day) may be a table already.
+    if args.board and Path(path).suffix.lower() != '.csv':
         detection = search([path], args)
         return detection.observations, detection.image_sizes
     if is_photographs(Path(path)):

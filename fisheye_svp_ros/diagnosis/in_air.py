@@ -6,7 +6,9 @@ lens may be anything.  Its file says how sure it is; within that it may move.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +25,9 @@ from fisheye_svp_ros.diagnosis.model import (
     start,
 )
 from fisheye_svp_ros.diagnosis.noise import find_gross_errors, set_aside
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
 _KNOWN = 0.01  # of an image height, beside what the focal length is off by
 _SAMPLES = 200
@@ -46,24 +50,24 @@ class InAir:
     def of(cls, lens: Lens) -> InAir | None:
         """Return what a lens file from `calibrate` or `diagnose` tells; None if it is nothing.
 
-        Raises LensError where it holds half of what a diagnosis writes.
+        Raises LensError for half of it, or what cannot be.
         """
-        names, said = intrinsic_names(lens), lens.calibration or {}
-        known, covariance = tuple(said.get('stderr', ())), said.get('covariance')
         if lens.uncertainty is not None:
             errors = LensErrors.of(lens)
-            known, covariance = errors.names, errors.covariance
-        whole = np.zeros(0) if covariance is None else np.array(covariance, dtype=float)
-        square = whole.shape == (len(known), len(known)) and bool(np.isfinite(whole).all())
-        if not (square and set(names) <= set(known)):
+            known, whole = errors.names, errors.covariance
+        elif (said := lens.calibration or {}).get('covariance') is None:
             return None
-        at = [known.index(name) for name in names]
-        return cls(lens, names, whole[np.ix_(at, at)])
+        else:
+            known, whole = _said(lens, said)
+        at = [i for i, name in enumerate(known) if name in ('f', *intrinsic_names(lens))]
+        names = tuple(known[i] for i in at)
+        return cls(lens, names, whole[np.ix_(at, at)]) if {'f', 'fx'} & set(names) else None
 
     @property
     def focal(self) -> float:
         """Relative standard error of the focal length."""
-        return float(np.sqrt(self.covariance[0, 0])) / self.lens.fx
+        at = next(i for i, name in enumerate(self.names) if name in ('f', 'fx'))
+        return float(np.sqrt(self.covariance[at, at])) / self.lens.fx
 
     @property
     def reach(self) -> float:
@@ -71,8 +75,10 @@ class InAir:
         lens = self.lens
         theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)[1:]
         height = lens.image_height.value_and_slope(theta)[0]
-        columns = np.column_stack([height, np.zeros((len(theta), len(INTRINSICS) - 1)),
-                                   lens.fx * lens.image_height.columns(theta)])
+        by = {'f': height, 'fx': height, **dict(zip(
+            lens.image_height.coefficient_names, lens.fx * lens.image_height.columns(theta).T,
+            strict=True))}
+        columns = np.stack([by.get(name, np.zeros_like(theta)) for name in self.names], axis=-1)
         spread = np.sqrt(np.einsum('tk,kl,tl->t', columns, self.covariance, columns))
         open_ = spread > (self.focal + _KNOWN) * lens.fx * height
         return float(lens.fx * height[np.argmax(open_)]) if open_.any() else np.inf
@@ -105,10 +111,8 @@ class InAir:
 
     def unlikely(self, lens: Lens) -> float:
         """Return how unlikely the intrinsics of a lens are: squares of standard deviations."""
-        return float(((self._root @ (self._values(lens) - self._values(self.lens)))**2).sum())
-
-    def _values(self, lens: Lens) -> Array:
-        return np.array([lens.parameters[name] for name in self.names])
+        found, own = (np.array(parameter_values(one, self.names)) for one in (lens, self.lens))
+        return float(((self._root @ (found - own)) ** 2).sum())
 
     @property
     def _root(self) -> Array:
@@ -122,9 +126,24 @@ class InAir:
         linear = Linearised(data, state, ())
         noise = float(np.median(np.abs(linear.residual[linear.used]))) / _MEDIAN
         others = sum(len(values) for effect, values in state.terms if is_shared(effect))
-        mean = np.concatenate([[state.lens.parameters[index]], self._values(self.lens),
+        mean = np.concatenate([[state.lens.parameters[index]],
+                               parameter_values(self.lens, self.names),
                                np.zeros(others)])
         root = np.zeros((1 + len(self.names), len(mean)))
         root[0, 0] = 1 / _INDEX
         root[1:, 1:1 + len(self.names)] = self._root
         return Prior(mean, noise * root)
+
+
+def _said(lens: Lens, said: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
+    """Return names and covariance (K, K) from the `calibration` block of a lens file."""
+    try:
+        names, whole = tuple(said['stderr']), np.array(said['covariance'], dtype=float)
+        right = whole.shape == (len(names), len(names)) and np.isfinite(whole).all()
+        if not (right and (np.diag(whole) >= 0).all()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError) as cause:
+        raise LensError(f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
+                        'numbers, a row and a column for each name in stderr; calibrate anew, or '
+                        'leave it out') from cause
+    return names, whole

@@ -163,10 +163,14 @@ def _corrected(everything: Data, lens: Lens, known: InAir) -> Lens | None:
     """Return a lens behind its port, moved within what photographs in air had left open of it."""
     near = known.within(everything, known.reach)
     wet = None if near is None else _started(near, lens)
+    if wet is None:
+        return None
     try:
-        return None if wet is None else known.behind(everything, wet, PLACE, INDEX)
+        found = known.behind(everything, wet, PLACE, INDEX)
     except GeometryError:
         return None
+    # What index the lens is found beside need not be that of a liquid: it is asked for anew.
+    return found.with_parameters([INDEX], [MEDIA['water']])
 
 
 def _told(

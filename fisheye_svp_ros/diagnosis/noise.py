@@ -90,7 +90,9 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
             weight = np.where(views.used, views.weight * fading, 0.0)
             alone = pose = model.localize(views._replace(weight=weight), pose)
             scale, offset = _scale(views, _offset(model, pose, views) / unsure)
-            if np.nanmax(np.abs(offset - before) / scale) < _SETTLED:
+            with np.errstate(invalid='ignore'):  # what is out of sight stays so
+                change = np.nanmax(np.abs(offset - before) / scale)
+            if change < _SETTLED:
                 break
     of_landmark = _scale_of_landmark(views, offset)
     typical = float(np.median(scale))

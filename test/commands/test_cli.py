@@ -194,6 +194,8 @@ class TestCalibrate:
         assert lens.name == 'mine'
         stderr = lens.calibration.pop('stderr')
         assert set(stderr) == {'f', 'cx', 'cy'} and all(0 < error < 2 for error in stderr.values())
+        covariance = np.array(lens.calibration.pop('covariance'))
+        assert np.sqrt(np.diag(covariance)) == pytest.approx([*stderr.values()])
         assert lens.calibration == {
             'rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1), 'observations': len(table),
             'frames': 6, 'source': observations,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
+from fisheye_svp_ros.commands.photographs import measured
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations
@@ -42,6 +44,14 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1
     return said[0]
+
+
+def test_beside_photographs_a_table_is_a_table(tmp_path: Path) -> None:
+    table = make_observations(np.zeros(4, dtype=int), np.arange(4), np.ones((4, 2)),
+                              np.ones((4, 3)))
+    write_observations(tmp_path / 'test.csv', table)
+    read, sizes = measured(str(tmp_path / 'test.csv'), Namespace(board=BOARD))
+    assert len(read) == 4 and not sizes
 
 
 def test_detect_then_calibrate(

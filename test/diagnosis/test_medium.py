@@ -8,7 +8,9 @@ from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
@@ -43,11 +45,11 @@ def test_water_is_named_and_measured(lens, others):
 
 def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     """The curve turns back at 62 degrees where no point in air was."""
-    table = photographs(AIR, None, 8, noise=0.3, seed=2, reach=0.15)
+    table = photographs(AIR, None, 6, noise=0.3, seed=2, reach=0.15)
     result = calibrate(table, 'kannala_brandt', (AIR.width, AIR.height)).adjusted
     given = with_stderr(result.lens, trust(table, result.lens, result.names))
     assert given.max_incidence < 1.1
-    found = diagnose(photographs(AIR, PORT, 8, seed=12, reach=0.9), given,
+    found = diagnose(photographs(AIR, PORT, 4, seed=12, reach=0.9), given,
                      wanted=Wanted(quick=True))
     assert [c.form for c in found.causes] == ['flat_port(medium)']
     index = medium_of(found).parameters['medium_index']
@@ -57,6 +59,23 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     assert found.extended.heldout_rms_px < 0.2
     assert any('leaves open' in advice.what for advice in found.advice)
+
+
+@pytest.mark.parametrize('block', [
+    {'covariance': [[1.0]]}, {'stderr': {'fx': 1.0}, 'covariance': [[1.0, 2.0]]},
+    {'stderr': {'fx': 1.0}, 'covariance': 'x'}, {'stderr': {'fx': 1.0}, 'covariance': [[np.nan]]},
+])
+def test_a_covariance_that_cannot_be_is_refused(block):
+    with pytest.raises(LensError, match="'air': calibration: covariance"):
+        InAir.of(replace(AIR, calibration=block))
+
+
+def test_what_a_lens_file_tells_of_its_focal_length():
+    assert InAir.of(replace(AIR, calibration={'stderr': {'fx': 1.0}})) is None
+    known = InAir.of(replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]}))
+    assert known.focal == pytest.approx(0.005) and known.reach == np.inf
+    off = replace(AIR, fx=AIR.fx + 4.2, fy=AIR.fx + 4.2)
+    assert known.unlikely(off) == pytest.approx(4.0)
 
 
 def test_an_index_is_no_surer_than_the_focal_length_in_air():
@@ -88,9 +107,9 @@ def test_a_medium_can_be_ruled_out():
 def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alone():
     """Unasked for, it would stand in for a calibration in air that is off."""
     other = replace(AIR, fx=1.01 * AIR.fx, fy=1.01 * AIR.fy)
-    first, second = photographs(AIR, PORT, 6), photographs(other, PORT, 6, seed=1)
+    first, second = photographs(AIR, PORT, 4), photographs(other, PORT, 4, seed=1)
     seen = make_observations(
-        np.concatenate([first.frame, second.frame + 6]),
+        np.concatenate([first.frame, second.frame + 4]),
         *(np.concatenate([getattr(first, name), getattr(second, name)])
           for name in ('landmark', 'uv', 'xyz')))
     for known in ((), ('session_step',)):
