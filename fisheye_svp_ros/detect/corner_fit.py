@@ -162,13 +162,15 @@ def _inner(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array
 def _edge(du: Array, dv: Array, angle: Array, bend: Array, size: Array) -> tuple[Array, ...]:
     """Return the distance (A, P) from an edge over its blur, and its derivatives.
 
-    By u, v, angle, bend, size: the logarithm of the blur.
+    By u, v, angle, bend, size: the logarithm of the blur, which moves a bent edge towards its
+    inner side.
     """
     blur = np.exp(np.clip(size, -5, 5))
     cos, sin = np.cos(angle), np.sin(angle)
     across, along = cos * du + sin * dv, cos * dv - sin * du
-    distance, lean = (across + 0.5 * bend * along * along) / blur, bend * along
+    sharp, lean = (across + 0.5 * bend * along * along) / blur, bend * along
+    inwards = 0.5 * bend * blur
     return (
-        distance, (lean * sin - cos) / blur, -(lean * cos + sin) / blur,
-        along * (1 - bend * across) / blur, 0.5 * along * along / blur, -distance,
+        sharp + inwards, (lean * sin - cos) / blur, -(lean * cos + sin) / blur,
+        along * (1 - bend * across) / blur, 0.5 * (along * along / blur + blur), inwards - sharp,
     )

@@ -20,6 +20,8 @@ _SHORTEST, _LONGEST = 24, 32_766  # px, of an image that OpenCV searches
 _LEAST = 4
 _ODD = 6.0  # times the median sigma
 _ROOM = 30.0  # px to the next edge, three times the largest window
+_NARROW, _NARROWEST = 0.6, 9.0  # of the way to the next edge, which rough points tell badly; px
+_ROUNDS, _STILL = 2, 0.3  # px that a corner may be from the middle of its window
 _SOFT = 2.0  # px of blur; the window must reach well beyond it
 
 
@@ -64,15 +66,10 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
         return f'{len(index)} points found; {_LEAST} are needed'
     if not pattern.marker and len(index) == len(pattern.points):
         uv = _right_handed(uv, pattern)
-    axes = local_axes(pattern.points[index, :2], uv)
-    every = pattern.kind == 'chessboard' and len(index) == len(pattern.points)
-    reach = _least_square(uv, pattern) if every else pattern.clearance * _height(axes)
     if detector == 'circles':
         circles = fit_circles(pixels, uv, pattern.points[index])
-        return _checked(index, circles, pattern, reach)
-    square = bool(np.any(pattern.inward))
-    towards = pattern.inward[index, :, None] if square else 1.0
-    corners = _fitted(pixels, uv, axes * towards, reach, square)
+        return _checked(index, circles, pattern, _surroundings(index, uv, pattern)[1])
+    corners, reach = _fitted(pixels, index, uv, pattern)
     if detector in AS_FOUND:
         corners = corners._replace(uv=uv)
     return _checked(index, corners, pattern, reach)
@@ -86,25 +83,51 @@ def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Ex
         return error
 
 
-def _fitted(pixels: Pixels, start: Array, axes: Array, reach: Array, square: bool) -> Corners:
-    """Fit corners; those too soft for their window again at half the size, if there is room."""
-    corners = fit_corners(pixels, start, axes, reach, square)
-    # The next edge has its blur, too.
-    free = np.minimum(reach, room(reach, corners.blur))
-    if (corners.ok & (free < reach)).any():
-        corners = fit_corners(pixels, start, axes, np.where(corners.ok, free, reach), square)
+def _surroundings(index: Index, uv: Array, pattern: Pattern) -> tuple[Array, Array]:
+    """Return the directions (M, 2, 2) of a corner's edges, px/m, and px to the next edge (M,)."""
+    axes = local_axes(pattern.points[index, :2], uv)
+    if pattern.kind == 'chessboard' and len(index) == len(pattern.points):
+        reach = _least_square(uv, pattern)
+    else:
+        reach = pattern.clearance * _height(axes)
+    square = np.any(pattern.inward)
+    return axes * (pattern.inward[index, :, None] if square else 1.0), reach
+
+
+def _fitted(
+    pixels: Pixels, index: Index, start: Array, pattern: Pattern
+) -> tuple[Corners, Array]:
+    """Fit corners, and again where the first fit puts them; return how far (M,) is left, px.
+
+    About points that are off by a pixel or two a window leans to one side, and may reach into the
+    next edge.  Those too soft for their window are fitted at half the size, if there is room.
+    """
+    square = bool(np.any(pattern.inward))
+    axes, reach = _surroundings(index, start, pattern)
+    narrow = np.minimum(_NARROW * reach, _NARROWEST)
+    corners = fit_corners(pixels, start, axes, narrow, square)
+    for _ in range(_ROUNDS):
+        start = np.where(corners.ok[:, None], corners.uv, start)
+        axes, reach = _surroundings(index, start, pattern)
+        # The next edge has its blur, too.
+        free = np.where(corners.ok, np.minimum(reach, room(reach, corners.blur)), reach)
+        corners = fit_corners(pixels, start, axes, free, square)
+        moved = np.linalg.norm(corners.uv - start, axis=1)
+        if moved[corners.ok].max(initial=0.0) < _STILL:
+            break
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
     if not len(soft):
-        return corners
+        return corners, reach
     height, width = (side // 2 * 2 for side in pixels.shape)
     half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
                       interpolation=cv2.INTER_AREA)
-    again = _fitted(half, (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2, reach[soft] / 2, square)
+    again = fit_corners(half, (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2, reach[soft] / 2,
+                        square)
     found = soft[again.ok]
     size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
         whole[found] = size.get(name, part)[again.ok]
-    return corners
+    return corners, reach
 
 
 def _height(axes: Array) -> Array:

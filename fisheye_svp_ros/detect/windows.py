@@ -28,13 +28,14 @@ _KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after 
 _PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
 _INDEPENDENT = 1 / (2 * np.pi * SMOOTHING**2)  # of smoothed pixels: one over their rho^2 summed
 _TOUCHED = 0.02  # of a smoothed pixel
+_RIM = 2  # px along the border, where smoothing has seen the image's mirror image
 
 
 class Windows(NamedTuple):
     """Round windows (N, P) of a smoothed image: data; offset (2, P), px, from place (N, 2).
 
-    inside (N, P): the image; clipped (N, P): light at the end of the scale is in it; side, px, of
-    the square around, and which of its pixels are in a window, (P,).
+    inside (N, P): the image but for its rim; clipped (N, P): light at the end of the scale is in
+    it; side, px, of the square around, and which of its pixels are in a window, (P,).
     """
 
     data: Array
@@ -82,7 +83,8 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
     round_ = np.flatnonzero(np.hypot(u, v) <= half + 0.5)  # no corners of the square
     u, v = u[round_], v[round_]
     columns, rows = place[:, :1] + u, place[:, 1:] + v
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    inside = ((columns >= _RIM) & (columns < width - _RIM)
+              & (rows >= _RIM) & (rows < height - _RIM))
     smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), SMOOTHING)
     at = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
     return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,

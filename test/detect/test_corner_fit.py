@@ -68,6 +68,22 @@ def test_a_corner_by_the_edge_of_the_field_is_none() -> None:
     assert found.ok[1:].all()
 
 
+@pytest.mark.parametrize(('bend', 'blur', 'column'), [(1 / 200, 1.6, 20.3), (0.0, 1.0, 6.3)])
+def test_bent_soft_edges_and_the_border_move_no_corner(
+    bend: float, blur: float, column: float
+) -> None:
+    """Blur moves a bent edge inwards; smoothing sees the image's mirror image at its border."""
+    fine = (np.arange(5 * SIDE) + 0.5) / 5 - 0.5
+    x, y = np.meshgrid(fine - column, fine - 20.2)
+    x, y = x + 0.4 * y, y - 0.4 * x
+    sharp = np.sign(y + 0.5 * bend * x * x) * np.sign(x + 0.5 * bend * y * y)
+    soft = GaussianBlur(sharp, (0, 0), 5 * blur).reshape(SIDE, 5, SIDE, 5).mean(axis=(1, 3))
+    axes = np.array([[[1.0, 0.4], [-0.4, 1.0]]])
+    found = fit_corners(120 + 95 * soft, np.array([[column, 20.2]]), axes, np.array([30.0]))
+    assert found.ok[0]
+    assert found.uv[0] == pytest.approx([column, 20.2], abs=0.006)
+
+
 def test_windows_of_soft_corners_end_before_the_next_edge() -> None:
     assert room(np.array([12.0, 40.0]), np.array([0.6, 0.6])) == pytest.approx([15.1, 60.2], abs=1)
     assert room(np.array([12.0]), np.array([2.5])) < 12

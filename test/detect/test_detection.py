@@ -50,6 +50,26 @@ def reasons(detection: Detection) -> dict[str, str]:
     return {Path(one.name).name: one.reason for one in detection.searched}
 
 
+def test_corners_do_not_depend_on_where_the_search_saw_them(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Windows about rough points lean to one side, and reach into the next edge."""
+    pose = poses(1).take(0)
+    image, true = photograph(pose, exposure=Exposure(blur=1.2)), true_corners(pose)
+    rough = np.random.default_rng(0).uniform(-2, 2, true.shape)
+
+    def seen(off: float) -> np.ndarray:
+        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
+            'saddle': ((), lambda *_: (np.arange(len(true)), true + off * rough))})
+        points = find_points(image, PATTERN, 'saddle')
+        assert not isinstance(points, str)
+        assert len(points.ids) == len(true)
+        return np.column_stack([points.uv, points.sigma])
+
+    close, far = seen(0.0), seen(1.0)
+    assert np.abs(far - close)[:, :2].max() < 0.3 * close[:, 2].min()
+
+
 class TestPatterns:
     @pytest.mark.parametrize('spec', [
         'chessboard', 'chessboard:9x6', 'chessboard:9x6:24', 'chessboard:9x6:-1mm',
