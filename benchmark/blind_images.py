@@ -293,12 +293,12 @@ def _asked(effect: str, size: float, seed: int, table: Observations, lens: Lens 
 
 
 def todo(trials: int, seed: int) -> list[tuple[str, int]]:
-    """Return effects and seeds: `trials` with an effect in turn, a fifth as many without."""
+    """Return effects and seeds: `trials` with an effect in turn, two fifths as many without."""
     hidden, clean = list(HIDDEN), list(CLEAN)
     tasks = [(hidden[i % len(hidden)], seed + i // len(hidden)) for i in range(trials)]
-    for i in range(trials // 5):
-        tasks.insert(6 * i, (clean[i % len(clean)], seed + i // len(clean)))
-    return [*tasks, *((effect, seed + i) for effect in ASIDE for i in range(trials // 20))]
+    for i in range(2 * trials // 5):
+        tasks.insert(7 * (i // 2), (clean[i % len(clean)], seed + i // len(clean)))
+    return [*tasks, *((effect, seed + i) for effect in ASIDE for i in range(trials // 10))]
 
 
 def load() -> list[Trial]:

@@ -127,7 +127,8 @@ def _fitted(
     problem = _Problem(cut, start, axes, bend, reach)
     values = problem.solve(problem.start(radius))
     judged = problem.judge(values, symmetric=True)
-    uv, contrast = values[:, :2] + cut.place, values[:, 7]
+    # Smoothing a brightness that rises moves edges down the slope.
+    uv, contrast = values[:, :2] + PIXEL * values[:, 8:] + cut.place, values[:, 7]
     blur = np.sqrt(np.maximum(np.exp(2 * values[:, 5]) - PIXEL, 0.0))
     least = 1 / np.linalg.norm(_matrix(values), ord=2, axis=(1, 2))
     with np.errstate(invalid='ignore'):

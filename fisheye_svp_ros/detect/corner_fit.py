@@ -52,7 +52,8 @@ def fit_corners(
     problem = _Problem(cut, radius, start - cut.place, square)
     values = problem.solve(problem.start(axes))
     judged = problem.judge(values, symmetric=not square)
-    uv, contrast = values[:, :2] + cut.place, values[:, 9]
+    # Smoothing a brightness that rises moves edges down the slope.
+    uv, contrast = values[:, :2] + PIXEL * values[:, 10:] + cut.place, values[:, 9]
     blur = np.sqrt(np.maximum(np.exp(2 * values[:, 6:8]).max(axis=1) - PIXEL, 0.0))
     ok = (
         judged.settled & (np.linalg.norm(uv - start, axis=1) < 0.7 * radius)

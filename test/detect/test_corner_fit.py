@@ -68,18 +68,21 @@ def test_a_corner_by_the_edge_of_the_field_is_none() -> None:
     assert found.ok[1:].all()
 
 
-@pytest.mark.parametrize(('bend', 'blur', 'column'), [(1 / 200, 1.6, 20.3), (0.0, 1.0, 6.3)])
-def test_bent_soft_edges_and_the_border_move_no_corner(
-    bend: float, blur: float, column: float
+@pytest.mark.parametrize(('bend', 'blur', 'column', 'slope'), [
+    (1 / 200, 1.6, 20.3, 0.0), (0.0, 1.0, 6.3, 0.0), (0.0, 1.0, 20.3, 0.012)])
+def test_bent_edges_the_border_and_slopes_of_light_move_no_corner(
+    bend: float, blur: float, column: float, slope: float
 ) -> None:
     """Blur moves a bent edge inwards; smoothing sees the image's mirror image at its border."""
     fine = (np.arange(5 * SIDE) + 0.5) / 5 - 0.5
     x, y = np.meshgrid(fine - column, fine - 20.2)
-    x, y = x + 0.4 * y, y - 0.4 * x
+    x, y = x + 0.37 * y, y - 0.37 * x
     sharp = np.sign(y + 0.5 * bend * x * x) * np.sign(x + 0.5 * bend * y * y)
     soft = GaussianBlur(sharp, (0, 0), 5 * blur).reshape(SIDE, 5, SIDE, 5).mean(axis=(1, 3))
-    axes = np.array([[[1.0, 0.4], [-0.4, 1.0]]])
-    found = fit_corners(120 + 95 * soft, np.array([[column, 20.2]]), axes, np.array([30.0]))
+    axes = np.array([[[1.0, 0.37], [-0.37, 1.0]]])
+    light = 1 + slope * (np.arange(SIDE) - column)
+    image = (120 + 95 * soft) * light
+    found = fit_corners(image, np.array([[column, 20.2]]), axes, np.array([30.0]))
     assert found.ok[0]
     assert found.uv[0] == pytest.approx([column, 20.2], abs=0.006)
 
