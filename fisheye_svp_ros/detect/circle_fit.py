@@ -22,7 +22,7 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-_FREE = ('f', 'k1', 'k2')  # of the lens that fits one photograph
+_FREE = ('f', 'k1', 'k2', 'k3')  # of the lens that fits one photograph
 _ROUNDS = 2  # the neighbours' centres are fitted, too
 _WITHIN = 0.7  # of the way from the circle's edge to the next circle's
 _LARGEST = 48.0  # px from the middle of one to the edge of the next; the image is halved then

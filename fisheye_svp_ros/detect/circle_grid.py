@@ -5,6 +5,7 @@ How far apart neighbours are, over the ellipse that each of them is, a fisheye h
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import cv2
@@ -16,7 +17,7 @@ from fisheye_svp_ros.detect.patterns import Pattern
 
 _BLOCKS = (31, 91, 271)  # px, of the local threshold
 _BELOW = 8  # grey levels from the mean there
-_SOFTENED = 1.0  # px; noise has no contours
+_SOFTENED = (1.0, 2.0)  # px, the least that leaves noise without contours
 _LEAST, _LARGEST = 12.0, 0.02  # px^2; of the image: area of a circle
 _FILLED = 0.1  # how far its area may be from its ellipse's
 _NEIGHBOUR = 1.22  # times the usual distance; diagonal neighbours are at 1.41
@@ -36,9 +37,8 @@ class Ellipses(NamedTuple):
 def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
     """Return the circles of a grid in a grey image, dark or bright; None without a whole one."""
     wanted = _lattice(pattern)
-    image = np.asarray(cv2.GaussianBlur(image, (0, 0), _SOFTENED), dtype=np.uint8)
-    for bright in (False, True):
-        seen = _ellipses(image, bright)
+    for soft, bright in itertools.product(_SOFTENED, (False, True)):
+        seen = _ellipses(np.asarray(cv2.GaussianBlur(image, (0, 0), soft), np.uint8), bright)
         if len(seen.centre) < len(wanted):
             continue
         near = _neighbours(seen)
