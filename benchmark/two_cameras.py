@@ -298,8 +298,9 @@ def section(found: Sequence[dict[str, Any]]) -> str:
     """Return the table of docs/whats_wrong.md."""
     lines = [
         '| pairs | agree, undecided, contradict | correlation of the maps | rms of the one that '
-        'did not find it, px | less scatter of the rig: translation | rotation | by the truth |',
-        '| --- | ---: | ---: | ---: | ---: | ---: | ---: |']
+        'did not find it, px | less scatter of the rig: translation | rotation | by the truth | '
+        'of what can be had |',
+        '| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |']
     for kind in KINDS:
         said = [one['external'] for one in found if one['kind'] == kind]
         if not said:
@@ -315,17 +316,26 @@ def section(found: Sequence[dict[str, Any]]) -> str:
         lines.append(f'| {len(said)}: {kind} | {", ".join(map(str, counts))} | '
                      f'{spread(maps, ".3f")} | {px} | '
                      + ' | '.join(f'{spread(one, ".0f")} %' for one in less)
-                     + f' | {_bound(found, kind)} |')
+                     + f' | {" | ".join(_bound(found, kind))} |')
     return '\n'.join(lines)
 
 
-def _bound(found: Sequence[dict[str, Any]], kind: str) -> str:
-    """Return by how much less the rig scatters by the true lenses and the true board."""
-    less = [[100 * (1 - one['reachable'][name] / one['external']['rig'][name]['base'])
-             for one in found if one['kind'] == kind and one['external']['rig']]
-            for name in ('translation_m', 'rotation_rad')]
-    told = less[0] and not (KINDS[kind].apart or KINDS[kind].late)
-    return ', '.join(f'{np.median(one):.0f} %' for one in less) if told else '-'
+def _bound(found: Sequence[dict[str, Any]], kind: str) -> tuple[str, str]:
+    """Return by how much less the rig scatters by the true lenses and board, and how near it is.
+
+    How near: what all pairs together gain over what they gain by the truth.
+    """
+    mine = [one for one in found if one['kind'] == kind and one['external']['rig']]
+    if not mine or KINDS[kind].apart or KINDS[kind].late:
+        return '-', '-'
+    told, near = [], []
+    for name in ('translation_m', 'rotation_rad'):
+        base, extended, truth = np.array([
+            [one['external']['rig'][name][key] for key in ('base', 'extended')]
+            + [one['reachable'][name]] for one in mine]).T
+        told.append(f'{100 * np.median(1 - truth / base):.0f} %')
+        near.append(f'{100 * (base - extended).sum() / (base - truth).sum():.0f} %')
+    return ', '.join(told), ', '.join(near)
 
 
 def spread(values: Sequence[float], form: str) -> str:

@@ -18,7 +18,6 @@ from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
 from fisheye_svp_ros.diagnosis.in_air import InAir
-from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.model import (
     Data,
     Linearised,
@@ -205,14 +204,12 @@ def _told(
 
 def _of_focal(lens: Lens) -> float:
     """Return the relative standard error of a focal length, 0 where a lens says nothing of it."""
+    if known := InAir.of(lens):
+        return known.focal
     match (lens.calibration or {}).get('stderr'):
         case {'fx': float(error)} | {'f': float(error)} if error > 0:
             return error / lens.fx
-    if lens.uncertainty is None:
-        return 0.0
-    known = LensErrors.of(lens)
-    errors = dict(zip(known.names, np.sqrt(np.diag(known.covariance)), strict=True))
-    return float(errors.get('fx', 0.0)) / lens.fx
+    return 0.0
 
 
 def _started(data: Data, lens: Lens) -> Lens | None:

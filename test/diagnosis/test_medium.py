@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
@@ -76,6 +77,13 @@ def test_what_a_lens_file_tells_of_its_focal_length():
     assert known.focal == pytest.approx(0.005) and known.reach == np.inf
     off = replace(AIR, fx=AIR.fx + 4.2, fy=AIR.fx + 4.2)
     assert known.unlikely(off) == pytest.approx(4.0)
+
+
+def test_what_a_diagnosis_in_air_found_takes_the_place_of_the_calibration():
+    given = replace(uncertain(), calibration={'stderr': {'fx': 9.0}, 'covariance': [[81.0]]})
+    known = InAir.of(given)
+    assert known.names == ('fx', 'fy', 'cx', 'cy', 'k1')
+    assert known.focal == pytest.approx(STDERR[0] / given.fx)
 
 
 def test_an_index_is_no_surer_than_the_focal_length_in_air():
