@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
 from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
+_PARTS = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step
 _ROUNDS = 4
 _MODE, _MOST_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _SETTLED = 3e-3  # of the noise: what a step moves predictions by
@@ -80,16 +82,37 @@ def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -
         change = frame[:, :6] / eq.pose_scale, values / fitted.scale
         moves = (linear.frame_columns @ change[0][..., None])[..., 0]
         moves += linear.shared_columns @ change[1]
-        state = moved(data, state, free, *change)
+        state, residual = in_sight(data, free, partial(_after, data, state, free, change))
         if turn == _ROUNDS - 1 or np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
             break
-        residual = Linearised(data, state, free).residual
         pose = linear.frame_columns / eq.pose_scale[:, None]
         e, r = eq.placed(*multiplied_by(fitted.design, pose, residual))
         x = np.einsum('fmk,fm->k', linear.shared_columns, residual) / fitted.scale
         parts = fitted.factored.solved(e[..., None], r[:, None], x[:, None])
         e, r, values = (part[..., 0] for part in parts)
     return state
+
+
+def _after(
+    data: Data, state: State, free: Sequence[str], change: tuple[Array, Array], part: float
+) -> State:
+    return moved(data, state, free, *(part * step for step in change))
+
+
+def in_sight(
+    data: Data, free: Sequence[str], after: Callable[[float], State]
+) -> tuple[State, Array]:
+    """Return the state after so much of a step that all points are still seen, and its residual.
+
+    A step far beyond where the columns hold may take points out of sight.  after: makes a state
+    of a part of the step, 1 for all of it.
+    """
+    for part in _PARTS:
+        state = after(part)
+        residual = Linearised(data, state, free).residual
+        if np.isfinite(residual).all():
+            break
+    return state, residual
 
 
 def fit_linear(linear: Linearised, variances: Variances) -> Fitted:

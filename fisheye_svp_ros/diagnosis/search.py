@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from fisheye_svp_ros.diagnosis.noise import (
     outlying,
     with_noise_growth,
 )
-from fisheye_svp_ros.diagnosis.refit import Fitted, fit_of, refit
+from fisheye_svp_ros.diagnosis.refit import Fitted, fit_of, in_sight, refit
 from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
 from fisheye_svp_ros.diagnosis.single_landmarks import single_landmarks
@@ -157,10 +158,14 @@ def _changed(
     evidence: Evidence, state: State, included: Index, gone: Sequence[str], forms: Sequence[int]
 ) -> State:
     """Return the state without some effects and with chosen forms of others."""
-    state = replace(state, terms=tuple(t for t in state.terms if t[0].name not in gone))
-    for effect, values in _estimated(evidence, included, forms):
-        state = with_effect(state, effect, values)
-    return state
+    kept = replace(state, terms=tuple(t for t in state.terms if t[0].name not in gone))
+    estimated = _estimated(evidence, included, forms)
+
+    def after(part: float) -> State:
+        return reduce(lambda state, one: with_effect(state, one[0], part * one[1]),
+                      estimated, kept)
+
+    return in_sight(evidence.linear.data, evidence.linear.free, after)[0]
 
 
 def _cleaned(

@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import equations, factored, solve
 from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, design
-from fisheye_svp_ros.diagnosis.refit import fit_linear, local_offsets
+from fisheye_svp_ros.diagnosis.refit import fit_linear, in_sight, local_offsets, refit
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances, estimate, start_variances
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -220,6 +220,21 @@ def test_estimates_lower_the_deviance():
     # Where a fit has run away, so have the variances that the next one begins with.
     found, rest = estimate(eq, replace(first, lam=np.full(len(NAMES), 1e-18)))
     assert solve(factored(rest, found.lam, found.weight)).deviance < before
+
+
+def test_a_step_that_takes_points_out_of_sight_is_cut_short():
+    linear = linearised(seed=7)
+    port = CATALOGUE['flat_port']()
+
+    def after(part):
+        return replace(linear.state, terms=((port, np.array([10.0 * part])),))
+
+    assert not np.isfinite(Linearised(linear.data, after(1.0), ()).residual).all()
+    state, residual = in_sight(linear.data, (), after)
+    assert np.isfinite(residual).all() and state.terms[0][1] < 10.0
+    refitted = refit(linear.data, after(0.0), (), gather_evidence(
+        linear.data, linear.state, ()).variances)
+    assert np.isfinite(Linearised(linear.data, refitted, ()).residual).all()
 
 
 def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
