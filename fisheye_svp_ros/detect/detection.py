@@ -16,7 +16,12 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals
 from fisheye_svp_ros.detect.patterns import Pattern
-from fisheye_svp_ros.detect.photographs import Photograph, Pixels, exif_turned
+from fisheye_svp_ros.detect.photographs import (
+    Photograph,
+    Pixels,
+    caught_stderr,
+    exif_turned,
+)
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
@@ -31,6 +36,7 @@ _SAME_PLACE = 0.3  # px
 _UNCERTAIN = 0.9
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
 _UNTURNED = 'asks to be shown turned; taken as the sensor lay'
+_DAMAGED = 'damaged: the JPEG decodes in part; fetch it again'
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,8 +126,11 @@ def examine(task: _Task) -> Searched:
     photograph, pattern, detector = task
     blank = Searched(photograph.name, photograph.key, photograph.camera, photograph.t)
     try:
-        pixels = photograph.pixels()
+        with caught_stderr() as said:
+            pixels = photograph.pixels()
         notes = (_UNTURNED,) if _turned(photograph) else ()
+        if any(line.startswith('Corrupt JPEG') for line in said):
+            notes = (*notes, _DAMAGED)
         points = find_points(pixels, pattern, detector)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
         text = str(cause).removeprefix(f'{photograph.name}: ')

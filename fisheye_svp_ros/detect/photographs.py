@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -127,6 +129,25 @@ def decoded(data: bytes, name: str) -> Pixels:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ObservationError(f'{name}: pixels are {pixels.dtype}; 8 or 16 bit are needed')
     return np.asarray(pixels)
+
+
+@contextmanager
+def caught_stderr() -> Iterator[list[str]]:
+    """Catch what libraries write to the standard error of this process, line by line at the end.
+
+    Not for a process with other threads.
+    """
+    lines: list[str] = []
+    before = os.dup(2)
+    with tempfile.TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield lines
+        finally:
+            os.dup2(before, 2)
+            os.close(before)
+            file.seek(0)
+            lines += file.read().decode(errors='replace').splitlines()
 
 
 def _whole_chunks(data: bytes) -> bool:

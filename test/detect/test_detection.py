@@ -23,9 +23,10 @@ from helpers.photographs import (
 )
 from rosbags.typesys import Stores, get_typestore
 
-from fisheye_svp_ros.detect.detection import Detection, detect
+from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import (
+    Photograph,
     decoded,
     exif_turned,
     find_photographs,
@@ -48,6 +49,17 @@ def found(folder: Path, board: str = BOARD) -> Detection:
 
 def reasons(detection: Detection) -> dict[str, str]:
     return {Path(one.name).name: one.reason for one in detection.searched}
+
+
+def test_a_damaged_jpeg_is_called_so_and_libjpeg_writes_nothing(
+    capfd: pytest.CaptureFixture[str]
+) -> None:
+    data = cv2.imencode('.jpg', photograph(poses(1).take(0)))[1].tobytes()
+    half = data[:len(data) // 2] + data[-2:]
+    seen = examine(_Task(Photograph('a.jpg', 'a', '', 0.0, half), PATTERN, 'quick'))
+    assert seen.size == (LENS.width, LENS.height)
+    assert 'damaged' in seen.notes[0]
+    assert capfd.readouterr().err == ''
 
 
 def test_corners_do_not_depend_on_where_the_search_saw_them(
