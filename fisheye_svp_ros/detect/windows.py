@@ -128,7 +128,8 @@ class WindowProblem(ABC):
         return residual * known, jacobian * known[..., None], self.weight[index] * known
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
-        residual, jacobian, weight = self.parts(state[0], index)
+        with np.errstate(over='ignore', invalid='ignore'):  # wild states are lost, see below
+            residual, jacobian, weight = self.parts(state[0], index)
         weight = weight / self._noise[index, None] ** 2
         transposed = np.swapaxes(jacobian * weight[..., None], -1, -2)
         hessian = transposed @ jacobian

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from cv2 import GaussianBlur
 
-from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
+from fisheye_svp_ros.detect.corner_fit import Corners, _Problem, fit_corners, room
+from fisheye_svp_ros.detect.windows import windows
 
 SIDE, COUNT, BLUR, NOISE = 41, 150, 0.6, 1.5
 
@@ -90,3 +93,15 @@ def test_bent_edges_the_border_and_slopes_of_light_move_no_corner(
 def test_windows_of_soft_corners_end_before_the_next_edge() -> None:
     assert room(np.array([12.0, 40.0]), np.array([0.6, 0.6])) == pytest.approx([15.1, 60.2], abs=1)
     assert room(np.array([12.0]), np.array([2.5])) < 12
+
+
+def test_wild_states_are_lost_in_silence() -> None:
+    image = np.tile([[10.0, 200.0], [200.0, 10.0]], (20, 20))
+    cut = windows(image, np.array([[20.0, 20.0]]), 5.0)
+    problem = _Problem(cut, np.array([5.0]), np.zeros((1, 2)), False)
+    values = problem.start(np.eye(2)[None])
+    values[:, 4] = 1e200
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        cost, _ = problem.linearise((values,), np.arange(1))
+    assert np.isinf(cost[0])
