@@ -41,6 +41,7 @@ INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
 _UNITS = {INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
           THICKNESS: 'm'}
 _SUSPECT = 1.0  # px: less than this is no third of the image
+_LOST = 5.0  # px: what leaves more explains nothing
 _LARGER = 1.1  # than in air: what looks so much larger may be seen through a flat port
 _FOLDS = 5
 _FEW = 12  # frames, enough for a start
@@ -253,6 +254,8 @@ def _behind_port(
     thickness = freed.lens.parameters[THICKNESS]
     if 0 < thickness < _THICKEST and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
+    if rms_px(Linearised(data, state, ())) > _LOST:
+        return None
     return data, gross, state, names
 
 
