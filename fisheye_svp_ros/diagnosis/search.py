@@ -133,6 +133,8 @@ def search(
         # The last variances weigh the last fit.
         state = refit(data, state, free, evidence.variances)
         evidence = evidence.around(data, state, free, wanted.left_out, finest)
+        if not changed:
+            break  # all that is in the model was asked for beside these variances
         included, steps = _needed(evidence, known, wanted.quick)
         if not steps:
             break
