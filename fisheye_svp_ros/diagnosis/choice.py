@@ -77,14 +77,17 @@ def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
         score = evidence.score(remaining, columns)
         if not score.rank or _impossible(effect, score):
             continue
-        found.append(_candidate(evidence, form, score))
+        found.append(_candidate(evidence, included, form, score))
     return sorted(found, key=lambda candidate: -candidate.merit)
 
 
-def _candidate(evidence: Evidence, form: int, score: Score) -> Candidate:
+def _candidate(evidence: Evidence, included: Index, form: int, score: Score) -> Candidate:
     effect, forms = evidence.forms.effects[form], evidence.forms
     factor = forms.names() * forms.count[effect.name]
-    merit = score.statistic - score.rank * np.log(evidence.full.rows)
+    gain, count = score.statistic, score.rank
+    if effect.per_frame:  # what it is in single frames is one variance, as in its random twins
+        gain, count = evidence.random_gain(included, evidence.columns_of(form)), 1
+    merit = gain - count * np.log(evidence.full.rows)
     return Candidate(form, effect, score, min(1.0, score.p_value * factor), float(merit))
 
 
@@ -106,7 +109,8 @@ def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:
             continue
         columns = evidence.columns_of(candidate.form)
         sure = _candidate(
-            evidence, candidate.form, evidence.confident(candidate.score, included, columns)
+            evidence, included, candidate.form,
+            evidence.confident(candidate.score, included, columns),
         )
         if sure.corrected < SIGNIFICANCE:
             yield sure

@@ -28,6 +28,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them fields are tried
 _FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
+_TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # the same, of one coefficient of an effect
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
 
@@ -190,14 +191,34 @@ class Evidence:
         eq = self.full.trimmed(with_it).at_the_border(kind)
         f = factored(eq, self.variances.lam, self.variances.weight)
         count = len(f.information) - len(self.border[0, 0])
-        field, across = f.information[:count, :count], f.information[:count, count:]
         for more in _FIELDS:
             prior = own * self.full.rows / count / more
-            inner = field + prior * np.eye(count)
-            logs = f.log_determinant + np.linalg.slogdet(inner)[1] - count * np.log(prior)
-            rest = f.information[count:, count:] - across.T @ np.linalg.solve(inner, across)
-            found.append((float(logs), rest))
+            logs, information = _integrated(f, np.arange(count), prior)
+            found.append((logs, information[count:, count:]))
         return found
+
+    def random_gain(self, included: Index, columns: Index) -> float:
+        """Return twice the gain in log likelihood if the coefficients of columns are random.
+
+        Of whatever size, beside what frames have of their own or in place of it.
+        """
+        count = self.full.rows - self.full.poses
+
+        def cost(logs: float, information: Array) -> float:
+            rest = swept(self.restored(information, included), included)
+            return logs + count * float(np.log(rest[-1, -1]))
+
+        f = self.factored
+        return cost(f.log_determinant, f.information) - min(
+            cost(*_integrated(one, columns, 1 / size)) for one in (f, self.without_frames)
+            for size in _TURNS)
+
+    @cached_property
+    def without_frames(self) -> Factored:
+        """The equations without what single frames have of their own, factored."""
+        own = np.array([name.startswith('frame_') for name in NAMES])
+        lam = np.where(own, GONE, self.variances.lam)
+        return factored(self.equations.trimmed(lam < GONE), lam, self.variances.weight)
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
         info, f = self.factored.information, self.factored
@@ -282,6 +303,14 @@ def _multiplied(
         at += field.shape[-1]
     nothing = start_variances(full)
     return Evidence(linear, forms, random, full, nothing, own, scale, border, probes)
+
+
+def _integrated(f: Factored, columns: Index, prior: float) -> tuple[float, Array]:
+    """Return log determinant and information with columns of the border random; prior: lambda."""
+    inner = f.information[np.ix_(columns, columns)] + prior * np.eye(len(columns))
+    across = f.information[columns]
+    logs = f.log_determinant + np.linalg.slogdet(inner)[1] - len(columns) * np.log(prior)
+    return float(logs), f.information - across.T @ np.linalg.solve(inner, across)
 
 
 def identifiable(pose: Array, columns: Array, chosen: Index) -> Array:
