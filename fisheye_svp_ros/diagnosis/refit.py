@@ -35,6 +35,7 @@ from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
 _PARTS = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step
+_WORSE = 1.5  # times the misfit: what is random may take up a rise, but no more
 _ROUNDS = 4
 _MODE, _MOST_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _SETTLED = 3e-3  # of the noise: what a step moves predictions by
@@ -77,12 +78,14 @@ def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -
     fitted = fit_linear(Linearised(data, state, free), variances)
     linear, eq = fitted.linear, fitted.factored.equations
     e, r, values = fitted.solution.e, fitted.solution.r, fitted.solution.values
+    residual = linear.residual
     for turn in range(_ROUNDS):
         frame, _, _ = eq.sorted(e, r)
         change = frame[:, :6] / eq.pose_scale, values / fitted.scale
         moves = (linear.frame_columns @ change[0][..., None])[..., 0]
         moves += linear.shared_columns @ change[1]
-        state, residual = in_sight(data, free, partial(_after, data, state, free, change))
+        most = _WORSE * float((residual**2).sum())
+        state, residual = in_sight(data, free, partial(_after, data, state, free, change), most)
         if turn == _ROUNDS - 1 or np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
             break
         pose = linear.frame_columns / eq.pose_scale[:, None]
@@ -100,17 +103,18 @@ def _after(
 
 
 def in_sight(
-    data: Data, free: Sequence[str], after: Callable[[float], State]
+    data: Data, free: Sequence[str], after: Callable[[float], State], most: float = np.inf
 ) -> tuple[State, Array]:
     """Return the state after so much of a step that all points are still seen, and its residual.
 
-    A step far beyond where the columns hold may take points out of sight.  after: makes a state
-    of a part of the step, 1 for all of it.
+    A step far beyond where the columns hold may take points out of sight, or lead away from them.
+    after: makes a state of a part of the step, 1 for all of it; most: sum of squares allowed.
     """
     for part in _PARTS:
         state = after(part)
         residual = Linearised(data, state, free).residual
-        if np.isfinite(residual).all():
+        squares = float((residual**2).sum())
+        if np.isfinite(squares) and squares <= most:
             break
     return state, residual
 

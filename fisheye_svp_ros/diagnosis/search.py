@@ -49,6 +49,7 @@ _ROUNDS = 6
 _PACE = 0.6  # of the work left before a round, what is left after it
 _RIPPLES = 4.0  # standard errors
 _FAR = 25.0  # a misfit so many times the noise's is not linear: one cause a round
+_ASTRAY = 400.0  # and so many: its columns lead nowhere, least squares find the way
 
 
 @dataclass
@@ -123,6 +124,8 @@ def search(
                 continue
         if not changed:
             break
+        if _misfit(evidence) > _ASTRAY:
+            state = refit_by_least_squares(data, state, free)
         state = refit(data, state, free, before)
         if wanted.quick or (cleaned and settled):
             break
@@ -152,8 +155,12 @@ def _names(steps: Sequence[TraceStep]) -> list[str]:
 
 def _most(evidence: Evidence, turn: int) -> int:
     """Return how many causes may be taken in at once."""
-    misfit = float((evidence.linear.residual**2).mean()) / evidence.variances.sigma**2
-    return 1 if misfit > _FAR and not turn else 20
+    return 1 if _misfit(evidence) > _FAR and not turn else 20
+
+
+def _misfit(evidence: Evidence) -> float:
+    """Return the mean square of the residuals over that of the noise."""
+    return float((evidence.linear.residual**2).mean()) / evidence.variances.sigma**2
 
 
 def _changed(
