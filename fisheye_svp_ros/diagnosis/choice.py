@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain, takewhile
 
 import numpy as np
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.evidence import Evidence, Score, pseudo_inverse, swept
@@ -84,11 +85,12 @@ def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
 def _candidate(evidence: Evidence, included: Index, form: int, score: Score) -> Candidate:
     effect, forms = evidence.forms.effects[form], evidence.forms
     factor = forms.names() * forms.count[effect.name]
-    gain, count = score.statistic, score.rank
+    gain, count, p = score.statistic, score.rank, score.p_value
     if effect.per_frame:  # what it is in single frames is one variance, as in its random twins
         gain, count = evidence.random_gain(included, evidence.columns_of(form)), 1
+        p = float(special.chdtrc(count, max(gain, 0.0))) / 2
     merit = gain - count * np.log(evidence.full.rows)
-    return Candidate(form, effect, score, min(1.0, score.p_value * factor), float(merit))
+    return Candidate(form, effect, score._replace(p_value=p), min(1.0, p * factor), float(merit))
 
 
 def _impossible(effect: Effect, score: Score) -> bool:

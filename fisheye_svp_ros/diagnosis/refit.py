@@ -78,13 +78,12 @@ def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -
     fitted = fit_linear(Linearised(data, state, free), variances)
     linear, eq = fitted.linear, fitted.factored.equations
     e, r, values = fitted.solution.e, fitted.solution.r, fitted.solution.values
-    residual = linear.residual
+    most = _WORSE * float((linear.residual**2).sum())
     for turn in range(_ROUNDS):
         frame, _, _ = eq.sorted(e, r)
         change = frame[:, :6] / eq.pose_scale, values / fitted.scale
         moves = (linear.frame_columns @ change[0][..., None])[..., 0]
         moves += linear.shared_columns @ change[1]
-        most = _WORSE * float((residual**2).sum())
         state, residual = in_sight(data, free, partial(_after, data, state, free, change), most)
         if turn == _ROUNDS - 1 or np.sqrt((moves**2).mean()) < _SETTLED * variances.sigma:
             break

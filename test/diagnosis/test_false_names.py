@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis.choice import counted
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.evidence import gather_evidence
+from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.diagnosis.refit import refit
+from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 
 SIGMA = 0.2
 
@@ -41,3 +48,35 @@ def test_a_smooth_image_field_is_not_named_after_the_effect_that_it_resembles(se
     field = np.exp(-squares / 2 / widths**2) @ heights
     found = diagnose(replace(table, uv=table.uv + field), lens())
     assert [cause.effect for cause in found.causes] == []
+
+
+def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves():
+    rng = np.random.default_rng(12)
+    pose, views = scene(rng, cameras=2)
+    angles = 1e-3 * rng.normal(size=(len(views.frame), 3)) * (views.camera > 0)[:, None]
+    bent = pose.compose(Pose(rotation_from_vector(angles), np.zeros_like(angles)))
+    found = diagnose(observe(lens(), (), bent, views, SIGMA, rng), lens())
+    assert [cause.effect for cause in found.causes] == ['rig_flex']
+
+
+def test_one_frame_that_gains_most_is_no_reason_for_doubt_nor_for_trust():
+    near = np.array([-0.4, -0.1, 11.4, 0.4, 2.2, 13.9, 0.6, 2.5, 330.4, 79.8, -0.6, 18.1])
+    assert counted(near).convincing
+    alone = np.array([330.4, -0.4, 0.1, 0.4, -1.2, 0.9, -0.6, 0.5])
+    assert not counted(alone).convincing
+    assert counted(alone).value == pytest.approx(0.6)
+
+
+def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
+    rng = np.random.default_rng(41)
+    pose, views = scene(rng, frames=8)
+    true = lens().with_parameters(('fx', 'fy'), [1.33 * lens().fx, 1.33 * lens().fy])
+    data = prepare(observe(true, (), pose, views, SIGMA, rng))
+    state = fit(data, start(data, lens()), ())
+    variances = gather_evidence(data, state, ()).variances
+    shifted = with_effect(state, CATALOGUE['viewpoint_shift'](), np.array([0.03]))
+
+    def misfit(state):
+        return np.sqrt((Linearised(data, state, ()).residual**2).mean())
+
+    assert misfit(refit(data, shifted, (), variances)) < 1.3 * misfit(shifted)
