@@ -29,7 +29,7 @@ from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
 _QUICK = {'saddle': 'quick'}  # a live camera has another image soon
-_LOOK = 0.002  # s, how often a waiting image is looked for
+_LOOK = 0.005  # s, how often what a search found is looked for
 
 
 @dataclass(frozen=True)
@@ -159,6 +159,7 @@ class Detector(BaseNode):
             if self._waiting[0] > stamp:
                 return
         self._waiting = stamp, image
+        self._work()
 
     @property
     def _detector(self) -> str:
