@@ -69,7 +69,7 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     if detector == 'circles':
         circles = fit_circles(pixels, uv, pattern.points[index])
         return _checked(index, circles, pattern, _surroundings(index, uv, pattern)[1])
-    corners, reach = _fitted(pixels, index, uv, pattern)
+    corners, reach = _fitted(pixels, index, uv, pattern, detector == 'quick')
     if detector in AS_FOUND:
         corners = corners._replace(uv=uv)
     return _checked(index, corners, pattern, reach)
@@ -95,26 +95,32 @@ def _surroundings(index: Index, uv: Array, pattern: Pattern) -> tuple[Array, Arr
 
 
 def _fitted(
-    pixels: Pixels, index: Index, start: Array, pattern: Pattern
+    pixels: Pixels, index: Index, start: Array, pattern: Pattern, live: bool
 ) -> tuple[Corners, Array]:
     """Fit corners, and again where the first fit puts them; return how far (M,) is left, px.
 
     About points that are off by a pixel or two a window leans to one side, and may reach into the
     next edge.  Those too soft for their window are fitted at half the size, if there is room.
+    live: time counts, so that only corners whose window stood wrong are fitted a third time.
     """
     square = bool(np.any(pattern.inward))
     axes, reach = _surroundings(index, start, pattern)
     narrow = np.minimum(_NARROW * reach, _NARROWEST)
     corners = fit_corners(pixels, start, axes, narrow, square)
+    off = np.arange(len(start))
     for _ in range(_ROUNDS):
         start = np.where(corners.ok[:, None], corners.uv, start)
         axes, reach = _surroundings(index, start, pattern)
         # The next edge has its blur, too.
         free = np.where(corners.ok, np.minimum(reach, room(reach, corners.blur)), reach)
-        corners = fit_corners(pixels, start, axes, free, square)
-        moved = np.linalg.norm(corners.uv - start, axis=1)
-        if moved[corners.ok].max(initial=0.0) < _STILL:
+        again = fit_corners(pixels, start[off], axes[off], free[off], square)
+        for whole, part in zip(corners, again, strict=True):
+            whole[off] = part
+        wrong = corners.ok & (np.linalg.norm(corners.uv - start, axis=1) >= _STILL)
+        if not wrong.any():
             break
+        if live:  # the others' windows hardly change
+            off = np.flatnonzero(wrong)
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
     if not len(soft):
         return corners, reach
