@@ -71,7 +71,8 @@ class Reach(NamedTuple):
             lines = _lines_of_functions(ast.Module([node], []))  # type: ignore[list-item]
         else:
             body = getattr(node, 'body', None)
-            last = body[0].lineno - 1 if isinstance(body, list) else node.end_lineno  # type: ignore
+            within = isinstance(body, list)
+            last = body[0].lineno - 1 if within else node.end_lineno  # type: ignore
             lines = set(range(node.lineno, max(last, node.lineno) + 1))  # type: ignore
         return set().union(*(by_line.get(line, set()) for line in lines))
 
