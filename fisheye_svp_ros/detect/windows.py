@@ -26,7 +26,6 @@ _FEW = 8  # points of one photograph, whose noise tells little of each other's
 _MUCH, _CHANCE = 4.0, 1e-6  # so much noisier a window is not by chance
 _KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after smoothing
 _PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
-_INDEPENDENT = 1 / (2 * np.pi * SMOOTHING**2)  # of smoothed pixels: one over their rho^2 summed
 _TOUCHED = 0.02  # of a smoothed pixel
 _RIM = 2  # px along the border, where smoothing has seen the image's mirror image
 
@@ -166,12 +165,17 @@ class WindowProblem(ABC):
         whole = np.zeros((len(values), 2 + _EACH, cut.side**2))
         whole[..., cut.round] = np.concatenate([weight[:, None], residual[:, None], noise], axis=1)
         if symmetric:
-            squares = _odd_squares(whole, values[:, :2], cut.side)
+            share, left = _odd(whole, values[:, :2], cut.side)
         else:
-            squares = np.asarray((whole[:, :1] * whole[:, 1:] ** 2).sum(axis=-1))
+            share, left = whole[:, :1], whole[:, 1:]
+        products = (share * left) @ np.swapaxes(left, -1, -2)
+        squares = np.einsum('nkk->nk', products)
         usual = squares[:, 1:].mean(axis=1)
         noise2 = squares[:, 0] / np.maximum(usual, 1e-9)
-        freedom = np.maximum(usual / _KEPT * _INDEPENDENT, 1.0)
+        # Of correlated pixels as many are independent as the squared trace of their covariance
+        # over the trace of its square, which is what products of two noises are on average.
+        other = products[:, 1:, 1:][:, ~np.eye(_EACH, dtype=bool)]
+        freedom = np.maximum(usual**2 / np.maximum((other**2).mean(axis=1), 1e-18), 1.0)
         # Smoothed noise is correlated: what each raw pixel moves the point by, squared and summed.
         moved = np.zeros((len(values), 2, cut.side**2))
         moved[..., cut.round] = gain[:, :2]
@@ -223,10 +227,10 @@ def _unit_noise(side: int) -> Array:
     return np.asarray(smooth.reshape(_PROBES, -1))
 
 
-def _odd_squares(windows: Array, corner: Array, side: int) -> Array:
-    """Return sums (N, K) of squares of residuals, windows[:, 1:] (N, 1 + K, P); first are weights.
+def _odd(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
+    """Return weights (N, 1, P), and the parts of residuals (N, K, P) odd about corners (N, 2), px.
 
-    Of each residual the part that is odd about the corner (N, 2), px.
+    windows (N, 1 + K, P): weights, then residuals.
     """
     # The mirror image of each pixel lies between four others.
     opposite = 2 * corner[:, ::-1, None] + side - 1 - np.arange(side)
@@ -242,5 +246,5 @@ def _odd_squares(windows: Array, corner: Array, side: int) -> Array:
         mirrored += share[:, None, None, None] * np.moveaxis(
             grid[system, :, first[:, 0, :, None] + down, first[:, 1, None] + right], -1, 1)
     pairs = grid[:, 0] * mirrored[:, 0] * (inside[:, 0, :, None] & inside[:, 1, None])
-    odd2 = (grid[:, 1:] - mirrored[:, 1:]) ** 2 / 4
-    return np.asarray((pairs[:, None] * odd2).sum(axis=(-2, -1)))
+    odd = (grid - mirrored)[:, 1:] / 2
+    return pairs.reshape(len(pairs), 1, -1), odd.reshape(*odd.shape[:2], -1)
