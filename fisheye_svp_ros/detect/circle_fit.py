@@ -14,13 +14,10 @@ from scipy.special import erf
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.corner_fit import CONTRAST, Corners
+from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.windows import PIXEL, WindowProblem, Windows, windows
-from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.scene.observations import make_observations
-from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 _FREE = ('f', 'k1', 'k2', 'k3')  # of the lens that fits one photograph
 _ROUNDS = 2  # the neighbours' centres are fitted, too
@@ -79,14 +76,11 @@ def _bends(
     And second ones (N, 3, 2), px/m^2, of x^2/2, x y and y^2/2: those of the lens that fits this
     one photograph best, by differences over a step, m.
     """
-    table = make_observations(np.zeros(len(uv), dtype=np.int64), np.arange(len(uv)), uv, points)
-    try:
-        fitted = calibrate(table, 'kannala_brandt', (shape[1], shape[0]), _FREE).adjusted
-    except FisheyeSvpError:
+    image_of = imaging(points, uv, shape, _FREE)
+    if image_of is None:
         return local_axes(points[:, :2], uv), np.full((len(uv), 3, 2), np.nan)
     around = step * np.array([[x, y, 0.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])
-    image = project(fitted.lens, fitted.pose.take(0).into_body(
-        (points[:, None] + around).reshape(-1, 3)), limited=False).uv.reshape(-1, 3, 3, 2)
+    image = image_of(points[:, None] + around).reshape(-1, 3, 3, 2)
     right, down = (image[:, 2, 1] - image[:, 0, 1]) / 2, (image[:, 1, 2] - image[:, 1, 0]) / 2
     middle = 2 * image[:, 1, 1]
     both = (image[:, 2, 2] - image[:, 2, 0] - image[:, 0, 2] + image[:, 0, 0]) / 4

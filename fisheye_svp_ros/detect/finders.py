@@ -26,6 +26,8 @@ Finder = Callable[[Grey, Pattern], Found | None]
 
 _ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
 _SEARCHED = 1600  # px; larger images are searched smaller first
+_MANY = 0.5  # of all points
+_SHARPENED = 2.0  # px of blur, against which cells of tags stand out
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB = cv2.CALIB_CB_ACCURACY
 _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -41,6 +43,19 @@ def _smaller(find: Finder) -> Finder:
             if found is not None:
                 return found[0], (found[1] + 0.5) / scale - 0.5
         return find(image, pattern)
+
+    return search
+
+
+def _sharper(find: Finder) -> Finder:
+    """Return a finder that looks again, at the sharpened image, where it finds few points."""
+    def search(image: Grey, pattern: Pattern) -> Found | None:
+        found = find(image, pattern)
+        if found is not None and len(found[0]) >= _MANY * len(pattern.points):
+            return found
+        soft = cv2.GaussianBlur(image, (0, 0), _SHARPENED)
+        more = find(np.asarray(cv2.addWeighted(image, 3.0, soft, -2.0, 0.0), np.uint8), pattern)
+        return max(found, more, key=lambda one: 0 if one is None else len(one[0]))
 
     return search
 
@@ -137,8 +152,8 @@ DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
     'quick': (('chessboard',), _smaller(classic)),
     'sb': (('chessboard',), sector_based),
     'classic': (('chessboard',), classic_subpixel),
-    'charuco': (('charuco',), charuco),
-    'aprilgrid': (('aprilgrid',), aprilgrid),
+    'charuco': (('charuco',), _sharper(charuco)),
+    'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
     'circles': (('circles', 'asymmetric_circles'), _smaller(circles)),
     'squares': (('squares',), squares),
 }, tuple)

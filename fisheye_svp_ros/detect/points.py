@@ -6,11 +6,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.circle_fit import fit_circles
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
 from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey
+from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 
@@ -22,6 +24,9 @@ _ODD = 6.0  # times the median sigma
 _ROOM = 30.0  # px to the next edge, three times the largest window
 _NARROW, _NARROWEST = 0.6, 9.0  # of the way to the next edge, which rough points tell badly; px
 _ROUNDS, _STILL = 2, 0.3  # px that a corner may be from the middle of its window
+_STEP = 1.05  # of the size of a tag or square, to points that are looked for next
+_GROWN = 1.5  # times as many points, and the lens that says where they are is fitted anew
+_FREE = ('f', 'k1')  # of that lens
 _SOFT = 2.0  # px of blur; the window must reach well beyond it
 
 
@@ -64,7 +69,11 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     index, uv = found
     if len(index) < _LEAST:
         return f'{len(index)} points found; {_LEAST} are needed'
-    if not pattern.marker and len(index) == len(pattern.points):
+    if pattern.marker:
+        # Where the board was a moment ago time counts.
+        if near is None or len(index) < _ENOUGH * len(pattern.points):
+            index, uv = _completed(pixels, index, uv, pattern)
+    elif len(index) == len(pattern.points):
         uv = _right_handed(uv, pattern)
     if detector == 'circles':
         circles = fit_circles(pixels, uv, pattern.points[index])
@@ -92,6 +101,42 @@ def _surroundings(index: Index, uv: Array, pattern: Pattern) -> tuple[Array, Arr
         reach = pattern.clearance * _height(axes)
     square = np.any(pattern.inward)
     return axes * (pattern.inward[index, :, None] if square else 1.0), reach
+
+
+def _completed(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Found:
+    """Return the points that a finder of tags found, and those of tags that it missed.
+
+    Tags that are small, or bent through a fisheye, are not decoded.  A lens fitted to the points
+    of this photograph says where the next ones are; corners of the right colours are there.
+    """
+    points, (height, width) = pattern.points, pixels.shape
+    found, where = index[:0], uv[:0]
+    new, start, agreed = index, uv, 0.0
+    missing = np.ones(len(points), dtype=bool)
+    image_of, known = None, 0
+    while len(new):
+        axes, reach = _surroundings(np.append(found, new), np.vstack([where, start]), pattern)
+        narrow = np.minimum(_NARROW * reach, _NARROWEST)[len(found):]
+        corners = fit_corners(pixels, start, axes[len(found):], narrow)
+        tint = np.sign(corners.contrast) * pattern.tint[new]
+        agreed = agreed or np.sign(tint[corners.ok].sum())
+        ok = corners.ok & (tint == agreed)
+        found, where = np.append(found, new[ok]), np.vstack([where, corners.uv[ok]])
+        missing[found] = False
+        far, _ = cKDTree(points[found]).query(points)
+        new = np.flatnonzero(missing & (far < _STEP * pattern.size))
+        missing[new] = False
+        if len(new) and len(found) > _GROWN * known:
+            image_of, known = imaging(points[found], where, pixels.shape, _FREE), len(found)
+        if image_of is None:
+            break
+        start = image_of(points[new])
+        inside = ((start > 0) & (start < (width, height))).all(axis=1)
+        new, start = new[inside], start[inside]
+    if len(found) < len(index):
+        return index, uv
+    order = np.argsort(found)
+    return found[order], where[order]
 
 
 def _fitted(

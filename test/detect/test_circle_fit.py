@@ -4,29 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.patterns import pattern_photograph
 
-from benchmark.detectors import LENS, PRINTED
-from benchmark.prints import printed
-from fisheye_svp_ros.arrays import Array
+from benchmark.detectors import LENS
 from fisheye_svp_ros.detect.circle_grid import find_circles
-from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
+from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points
-from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.simulate.board_views import board_views
-from fisheye_svp_ros.simulate.render import Exposure, render
-
-
-def photograph(
-    pattern: Pattern, number: int, exposure: Exposure | None = None
-) -> tuple[Array, Array]:
-    """Return a photograph of a pattern, and where its points really are in it."""
-    board = printed(pattern)
-    middle = (board.corners.min(axis=0) + board.corners.max(axis=0)) / 2
-    view = board_views(LENS, PRINTED, 4, (0.1, 0.3), np.random.default_rng(0)).take(number)
-    pose = Pose(view.rotation, view.position + middle - PRINTED.corners.mean(axis=0))
-    image = render(LENS, board, pose, exposure or Exposure(), np.random.default_rng(number))
-    return image, project(LENS, pose.into_body(board.corners)).uv
+from fisheye_svp_ros.simulate.render import Exposure
 
 
 @pytest.mark.parametrize(('spec', 'number'), [
@@ -35,7 +19,7 @@ def photograph(
 ])
 def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> None:
     pattern = parse_pattern(spec)
-    image, true = photograph(pattern, number)
+    image, true = pattern_photograph(pattern, number)
     found = find_points(image, pattern, 'circles')
     assert not isinstance(found, str), found
     assert len(found.ids) > 0.95 * len(true)
@@ -50,7 +34,7 @@ def test_centres_are_unbiased_and_as_sure_as_stated(spec: str, number: int) -> N
 
 def test_bright_circles_are_found_as_well() -> None:
     pattern = parse_pattern('circles:8x6:25mm')
-    image, _ = photograph(pattern, 2)
+    image, _ = pattern_photograph(pattern, 2)
     found = [find_points(one, pattern, 'circles') for one in (image, 255 - image)]
     assert not isinstance(found[0], str)
     assert not isinstance(found[1], str)
@@ -60,7 +44,7 @@ def test_bright_circles_are_found_as_well() -> None:
 def test_centres_at_the_edge_of_the_field() -> None:
     """A lens of too few terms bends wrong there: centres were off by 0.008 px."""
     pattern = parse_pattern('circles:8x6:25mm')
-    image, true = photograph(pattern, 3)
+    image, true = pattern_photograph(pattern, 3)
     found = find_points(image, pattern, 'circles')
     assert not isinstance(found, str), found
     error = min((found.uv - true[np.argsort(turn.source)][found.ids]
@@ -73,5 +57,5 @@ def test_centres_at_the_edge_of_the_field() -> None:
 @pytest.mark.parametrize('spec', ['circles:8x6:25mm', 'circles:4x9:18mm:asymmetric'])
 def test_grids_are_found_in_noise(spec: str) -> None:
     pattern = parse_pattern(spec)
-    image, _ = photograph(pattern, 1, Exposure(noise=6.0))
+    image, _ = pattern_photograph(pattern, 1, Exposure(noise=6.0))
     assert find_circles(image, pattern) is not None
