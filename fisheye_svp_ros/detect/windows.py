@@ -186,6 +186,7 @@ class WindowProblem(ABC):
         # What the fit would still move the point by; a blur may take longer to settle.
         left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
         settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + self.slack)
+        settled &= weight.sum(axis=1) > values.shape[1]  # fewer pixels than unknowns fit anything
         return Judged(sigma, np.sqrt(_KEPT * noise2), settled, noise2, gain2, freedom)
 
 

@@ -60,6 +60,14 @@ def test_light_beyond_the_end_of_the_scale_is_none_that_was_measured() -> None:
     assert scatter / np.sqrt((found.sigma[found.ok] ** 2).mean()) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.filterwarnings('ignore:Mean of empty', 'ignore:invalid value')
+@pytest.mark.parametrize('gain', [2.0, 3.0])
+def test_a_window_of_which_little_is_not_overexposed_holds_no_corner(gain: float) -> None:
+    """Fewer pixels than unknowns were fitted without a residual, and sigma was next to nothing."""
+    found, _ = corners(90, 6, False, gain=gain)
+    assert not found.ok.any()
+
+
 def test_sigma_is_that_of_the_photograph_where_a_window_tells_little() -> None:
     found, _ = corners(90, 13, False)
     assert found.sigma.std() < 0.06 * found.sigma.mean()
