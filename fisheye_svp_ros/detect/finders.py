@@ -27,7 +27,7 @@ Finder = Callable[[Grey, Pattern], Found | None]
 _ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
 _SEARCHED = 1600  # px; larger images are searched smaller first
 _MANY = 0.5  # of all points
-_SHARPENED = 2.0  # px of blur, against which cells of tags stand out
+_SHARPENED = 2.0  # px of blur, which makes squares and cells of tags run into one another
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB = cv2.CALIB_CB_ACCURACY
 _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -92,7 +92,7 @@ def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
 
 def chessboard(image: Grey, pattern: Pattern) -> Found | None:
     """The classic search, which is fast, and where it fails the sector-based one."""
-    return classic(image, pattern) or sector_based(image, pattern)
+    return _sharper(classic)(image, pattern) or sector_based(image, pattern)
 
 
 def circles(image: Grey, pattern: Pattern) -> Found | None:

@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.patterns import pattern_photograph
 from helpers.photographs import (
     BOARD,
     LENS,
@@ -194,6 +195,14 @@ class TestCorners:
         monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
             'saddle': (('chessboard',), lambda *_: found)})
         assert 'a square off' in str(find_points(photograph(pose), PATTERN, 'saddle'))
+
+    def test_a_steep_board_out_of_focus(self) -> None:
+        """Neither search finds it unless the image is sharpened."""
+        pattern = parse_pattern('chessboard:9x6:25mm')
+        image, true = pattern_photograph(pattern, 0, Exposure(blur=1.5))
+        points = find_points(image, pattern, 'saddle')
+        assert not isinstance(points, str), points
+        assert np.abs(points.uv - true[points.ids]).max() < 0.2
 
     def test_sixteen_bits(self) -> None:
         pose = poses(4, 2).take(0)
