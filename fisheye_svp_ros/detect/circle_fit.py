@@ -19,7 +19,8 @@ from fisheye_svp_ros.detect.patterns import local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.windows import PIXEL, WindowProblem, Windows, windows
 
-_FREE = ('f', 'k1', 'k2', 'k3')  # of the lens that fits one photograph
+# Of the lens that fits one photograph, as far as that determines it
+_FREE = (('f', 'cx', 'cy', 'k1', 'k2', 'k3'), ('f', 'cx', 'cy', 'k1'), ('f', 'k1', 'k2', 'k3'))
 _ROUNDS = 2  # the neighbours' centres are fitted, too
 _WITHIN = 0.7  # of the way from the circle's edge to the next circle's
 _LARGEST = 48.0  # px from the middle of one to the edge of the next; the image is halved then
@@ -76,7 +77,8 @@ def _bends(
     And second ones (N, 3, 2), px/m^2, of x^2/2, x y and y^2/2: those of the lens that fits this
     one photograph best, by differences over a step, m.
     """
-    image_of = imaging(points, uv, shape, _FREE)
+    fits = (imaging(points, uv, shape, free) for free in _FREE)
+    image_of = next((fit for fit in fits if fit is not None), None)
     if image_of is None:
         return local_axes(points[:, :2], uv), np.full((len(uv), 3, 2), np.nan)
     around = step * np.array([[x, y, 0.0] for x in (-1, 0, 1) for y in (-1, 0, 1)])

@@ -6,7 +6,7 @@ How far apart neighbours are, over the ellipse that each of them is, a fisheye h
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,6 +20,8 @@ _BELOW = 8  # grey levels from the mean there
 _SOFTENED = (1.0, 2.0)  # px, the least that leaves noise without contours
 _LEAST, _LARGEST = 12.0, 0.02  # px^2; of the image: area of a circle
 _FILLED = 0.1  # how far its area may be from its ellipse's
+_RING, _EVEN = 1.3, 0.4  # of its size, where all must be another brightness; of the most
+_AROUND = np.arange(16) * np.pi / 8
 _NEIGHBOUR = 1.22  # times the usual distance; diagonal neighbours are at 1.41
 _ALONG = 0.8  # least cosine between a step and the one before
 _SEEDS = 8
@@ -62,29 +64,52 @@ def _lattice(pattern: Pattern) -> Index:
 
 def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
     kind = cv2.THRESH_BINARY if bright else cv2.THRESH_BINARY_INV
-    parts = []
+    contours: list[Any] = []
     for block in _BLOCKS:
         mask = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, block,
                                      -_BELOW if bright else _BELOW)
-        contours, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        parts += [cv2.moments(contour) for contour in contours]
-    parts = [part for part in parts if _LEAST <= part['m00'] <= _LARGEST * image.size]
-    # The largest first: a circle larger than the block has a hole.
-    parts.sort(key=lambda part: -float(part['m00']))
+        contours += cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+    every = _standing_out(image, _elliptic(contours, _LARGEST * image.size), bright)
     centres, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
-    for part in parts:
-        area = part['m00']
-        spread = np.array([[part['mu20'], part['mu11']], [part['mu11'], part['mu02']]]) / area
-        inner = np.linalg.det(spread)
-        if inner <= 0 or abs(4 * np.pi * np.sqrt(inner) / area - 1) > _FILLED:
-            continue
-        centre = np.array([part['m10'], part['m01']]) / area
+    for centre, matrix in zip(*every, strict=True):
         off = np.linalg.norm(np.einsum('iab,ib->ia', matrices, centre - centres), axis=1)
         if off.min(initial=np.inf) > 1:
-            size, turn = np.linalg.eigh(spread)
             centres = np.vstack([centres, centre])
-            matrices = np.concatenate([matrices, [(turn / (2 * np.sqrt(size))) @ turn.T]])
+            matrices = np.concatenate([matrices, [matrix]])
     return Ellipses(centres, matrices)
+
+
+def _elliptic(contours: list[Any], largest: float) -> Ellipses:
+    """Return those contours that are ellipses, and not too small or too large, px^2."""
+    parts = np.array([[part[name] for name in ('m00', 'm10', 'm01', 'mu20', 'mu11', 'mu02')]
+                      for part in map(cv2.moments, contours)]).reshape(-1, 6)
+    parts = parts[(parts[:, 0] >= _LEAST) & (parts[:, 0] <= largest)]
+    # The largest first: a circle larger than the block has a hole.
+    area, *rest = parts[np.argsort(-parts[:, 0], kind='stable')].T
+    u, v, *spreads = (one / area for one in rest)
+    spread = np.stack(spreads, axis=-1)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+    inner = np.linalg.det(spread)
+    own = inner > 0
+    own[own] = np.abs(4 * np.pi * np.sqrt(inner[own]) / area[own] - 1) <= _FILLED
+    size, turn = np.linalg.eigh(spread[own])
+    matrices = (turn / (2 * np.sqrt(size))[:, None]) @ np.swapaxes(turn, 1, 2)
+    return Ellipses(np.stack([u, v], axis=-1)[own], matrices)
+
+
+def _standing_out(image: NDArray[np.uint8], found: Ellipses, bright: bool) -> Ellipses:
+    """Return the ellipses around which all is darker, or brighter, and much the same.
+
+    Noise is not, nor is the paper between circles.
+    """
+    height, width = image.shape
+    circle = _RING * np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=-1)
+    ring = circle @ np.linalg.inv(found.matrix)
+    places = np.concatenate([found.centre[:, None], found.centre[:, None] + ring], axis=1)
+    u, v = np.moveaxis(np.round(places).astype(np.int64), -1, 0)
+    level = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(float)
+    step = (level[:, 1:] - level[:, :1]) * (-1 if bright else 1)
+    even = step.min(axis=1) > np.maximum(_EVEN * step.max(axis=1), _BELOW)
+    return Ellipses(found.centre[even], found.matrix[even])
 
 
 def _neighbours(found: Ellipses) -> Mask:

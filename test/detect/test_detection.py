@@ -285,7 +285,12 @@ class TestTags:
         flat = np.full((900, 1100), 255, np.uint8)
         for x, y in pattern.points[:, :2] * 3000 + 120:
             cv2.circle(flat, (round(x), round(y)), 40, 0, -1, cv2.LINE_AA)
-        image, turn = self.warped(flat)
+        # A camera with f = 400 px that sees the board turned by 35 deg
+        place = cv2.Rodrigues(np.radians([-20.0, 28.0, 4.0]))[0][:, :2] / 3000
+        turn = np.array([[400.0, 0, 260], [0, 400, 240], [0, 0, 1]]) @ np.column_stack(
+            [place, [0.0, 0.0, 0.33] - place @ [550.0, 450.0]])
+        image = cv2.warpPerspective(flat, turn, (520, 480), flags=cv2.INTER_AREA, borderValue=255)
+        image = cv2.GaussianBlur(image, (0, 0), 0.7)
         points = find_points(image, pattern, 'circles')
         assert not isinstance(points, str), points
         flat_uv = pattern.points[points.ids, :2] * 3000 + 120

@@ -9,18 +9,19 @@ from benchmark.prints import printed
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, render
 
 
 def pattern_photograph(
-    pattern: Pattern, number: int, exposure: Exposure | None = None
+    pattern: Pattern, number: int, exposure: Exposure | None = None, lens: Lens = LENS
 ) -> tuple[Array, Array]:
     """Return a photograph of a pattern, and where its points really are in it."""
     board = printed(pattern)
     middle = (board.corners.min(axis=0) + board.corners.max(axis=0)) / 2
     view = board_views(LENS, PRINTED, 8, (0.1, 0.3), np.random.default_rng(0)).take(number)
     pose = Pose(view.rotation, view.position + middle - PRINTED.corners.mean(axis=0))
-    image = render(LENS, board, pose, exposure or Exposure(), np.random.default_rng(number))
-    return image, project(LENS, pose.into_body(board.corners)).uv
+    image = render(lens, board, pose, exposure or Exposure(), np.random.default_rng(number))
+    return image, project(lens, pose.into_body(board.corners)).uv
