@@ -27,6 +27,7 @@ _MUCH, _CHANCE = 4.0, 1e-6  # so much noisier a window is not by chance
 _KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after smoothing
 _PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
 _TOUCHED = 0.02  # of a smoothed pixel
+_SIGHT = 4  # px that smoothing sees
 _RIM = 2  # px along the border, where smoothing has seen the image's mirror image
 
 
@@ -84,10 +85,18 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
     columns, rows = place[:, :1] + u, place[:, 1:] + v
     inside = ((columns >= _RIM) & (columns < width - _RIM)
               & (rows >= _RIM) & (rows < height - _RIM))
-    smooth = cv2.GaussianBlur(pixels.astype(np.float32), (0, 0), SMOOTHING)
-    at = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
+    top, bottom = _seen(rows)
+    left, right = _seen(columns)
+    around, at = pixels[top:bottom, left:right], (rows - top, columns - left)
+    smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), SMOOTHING)
     return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,
-                   inside & _clipped(pixels)[at], 2 * half + 1, round_)
+                   inside & _clipped(around)[at], 2 * half + 1, round_)
+
+
+def _seen(at: Index) -> tuple[int, int]:
+    """Return from where to where smoothing sees pixels at these places along an axis."""
+    return max(int(at.min()) - _SIGHT, 0), int(at.max()) + _SIGHT + 1
 
 
 class WindowProblem(ABC):
@@ -233,19 +242,12 @@ def _odd(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
 
     windows (N, 1 + K, P): weights, then residuals.
     """
-    # The mirror image of each pixel lies between four others.
-    opposite = 2 * corner[:, ::-1, None] + side - 1 - np.arange(side)
-    first = np.floor(opposite).astype(np.int64)
-    part = opposite[..., 0] - first[..., 0]
-    inside = (first >= 0) & (first < side - 1)
-    first = np.clip(first, 0, side - 2)
+    # The mirror image of each pixel lies between four others, of which it has its share.
+    pixel = np.arange(side)
+    opposite = 2 * corner[:, ::-1, None, None] + side - 1 - pixel[:, None]
+    share = np.maximum(1 - np.abs(opposite - pixel), 0.0)
+    share *= (opposite >= 0) & (opposite < side - 1)
     grid = windows.reshape(*windows.shape[:2], side, side)
-    system = np.arange(len(corner))[:, None, None]
-    mirrored = np.zeros_like(grid)
-    for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        share = np.abs(1 - down - part[:, 0]) * np.abs(1 - right - part[:, 1])
-        mirrored += share[:, None, None, None] * np.moveaxis(
-            grid[system, :, first[:, 0, :, None] + down, first[:, 1, None] + right], -1, 1)
-    pairs = grid[:, 0] * mirrored[:, 0] * (inside[:, 0, :, None] & inside[:, 1, None])
-    odd = (grid - mirrored)[:, 1:] / 2
+    mirrored = share[:, None, 0] @ grid @ np.swapaxes(share[:, None, 1], -1, -2)
+    pairs, odd = grid[:, 0] * mirrored[:, 0], (grid - mirrored)[:, 1:] / 2
     return pairs.reshape(len(pairs), 1, -1), odd.reshape(*odd.shape[:2], -1)
