@@ -145,27 +145,28 @@ def _fitted(
     """Fit corners, and again where the first fit puts them; return how far (M,) is left, px.
 
     About points that are off by a pixel or two a window leans to one side, and may reach into the
-    next edge.  Those too soft for their window are fitted at half the size, if there is room.
-    live: time counts, so that only corners whose window stood wrong are fitted a third time.
+    next edge, so that it is narrow at first.  Those too soft for their window are fitted at half
+    the size, if there is room.
+    live: time counts, so that windows are whole from the first, and only corners whose window
+    stood wrong are fitted again.
     """
     square = bool(np.any(pattern.inward))
     axes, reach = _surroundings(index, start, pattern)
-    narrow = np.minimum(_NARROW * reach, _NARROWEST)
-    corners = fit_corners(pixels, start, axes, narrow, square)
-    off = np.arange(len(start))
+    first = reach if live else np.minimum(_NARROW * reach, _NARROWEST)
+    corners = fit_corners(pixels, start, axes, first, square)
+    wrong = _off(corners, start) if live else np.ones(len(start), dtype=bool)
     for _ in range(_ROUNDS):
+        if not wrong.any():
+            break
         start = np.where(corners.ok[:, None], corners.uv, start)
         axes, reach = _surroundings(index, start, pattern)
         # The next edge has its blur, too.
         free = np.where(corners.ok, np.minimum(reach, room(reach, corners.blur)), reach)
+        off = np.flatnonzero(wrong) if live else np.arange(len(start))
         again = fit_corners(pixels, start[off], axes[off], free[off], square)
         for whole, part in zip(corners, again, strict=True):
             whole[off] = part
-        wrong = corners.ok & (np.linalg.norm(corners.uv - start, axis=1) >= _STILL)
-        if not wrong.any():
-            break
-        if live:  # the others' windows hardly change
-            off = np.flatnonzero(wrong)
+        wrong = _off(corners, start)
     soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
     if not len(soft):
         return corners, reach
@@ -179,6 +180,11 @@ def _fitted(
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
         whole[found] = size.get(name, part)[again.ok]
     return corners, reach
+
+
+def _off(corners: Corners, start: Array) -> Mask:
+    """Return which corners (M,) are not in the middle of their window."""
+    return np.asarray(corners.ok & (np.linalg.norm(corners.uv - start, axis=1) >= _STILL))
 
 
 def _height(axes: Array) -> Array:

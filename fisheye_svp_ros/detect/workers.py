@@ -13,6 +13,8 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
 _START = 60.0  # s a process may take to start
+# bytes; arrays come and go, and memory that glibc gave back would be cleared again, page by page
+_KEPT = {'MALLOC_MMAP_THRESHOLD_': str(2**25), 'MALLOC_TRIM_THRESHOLD_': str(2**27)}
 # No process of multiprocessing, which would run a caller's script anew from its first line.
 _PROGRAM = ('import sys; sys.path[:] = sys.argv[2:]; '
             'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))')
@@ -34,7 +36,7 @@ class _Worker:
             with theirs:
                 self.process = subprocess.Popen(
                     [sys.executable, '-c', _PROGRAM, str(theirs.fileno()), *sys.path],
-                    pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+                    env=_KEPT | os.environ, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self.pipe.send(function)

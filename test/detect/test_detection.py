@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.memory import page_faults
 from helpers.patterns import pattern_photograph
 from helpers.photographs import (
     BOARD,
@@ -24,6 +26,7 @@ from helpers.photographs import (
 )
 from rosbags.typesys import Stores, get_typestore
 
+from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import (
@@ -81,6 +84,28 @@ def test_corners_do_not_depend_on_where_the_search_saw_them(
 
     close, far = seen(0.0), seen(1.0)
     assert np.abs(far - close)[:, :2].max() < 0.3 * close[:, 2].min()
+
+
+def test_live_corners_are_fitted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """But for the few that the search saw elsewhere; and they are as good."""
+    fitted: list[int] = []
+
+    def fit(pixels: np.ndarray, start: np.ndarray, *more: Any) -> Corners:
+        fitted.append(len(start))
+        return fit_corners(pixels, start, *more)
+
+    monkeypatch.setattr('fisheye_svp_ros.detect.points.fit_corners', fit)
+    for i in range(4):
+        pose = poses(4, 2).take(i)
+        image, true = photograph(pose), true_corners(pose)
+        thorough, live = (find_points(image, PATTERN, name) for name in ('saddle', 'quick'))
+        assert not isinstance(thorough, str)
+        assert not isinstance(live, str)
+        assert live.ids.tolist() == thorough.ids.tolist()
+        assert np.abs((live.uv - true) / live.sigma[:, None]).max() < 5
+        assert np.abs((live.uv - thorough.uv) / live.sigma[:, None]).max() < 0.5
+        assert sum(fitted[2:]) < 1.2 * len(true)
+        fitted.clear()
 
 
 class TestPatterns:
@@ -555,3 +580,9 @@ def test_work_is_bounded_in_time() -> None:
     results = dict(bounded_map(sleep, [0.0, 0.0, 0.0, 120.0, 0.0, 0.0], 1.0))
     assert results[3] == Late(True)
     assert [results[i] for i in (0, 1, 2, 4, 5)] == [None] * 5
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='of glibc alone')
+def test_workers_keep_their_memory() -> None:
+    """What is given back has to be cleared anew, page by page, which took as long as the fit."""
+    assert dict(bounded_map(page_faults, [10], 60.0))[0] < 1000
