@@ -109,7 +109,7 @@ class Detector(BaseNode):
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
-        self.every(_LOOK, self._work)
+        self._look = self.every(_LOOK, self._work)
 
     def destroy_node(self) -> None:
         """End the search, too."""
@@ -167,7 +167,7 @@ class Detector(BaseNode):
         return _QUICK.get(name, name)
 
     def _work(self) -> None:
-        """Publish what a search found; start the next one."""
+        """Publish what a search found; start the next one; look again while it is under way."""
         assert self._searches is not None
         if self._guiding is not None:
             self._guiding.work()
@@ -175,9 +175,16 @@ class Detector(BaseNode):
         if found is not None and self._searched is not None:
             searched, self._searched = self._searched, None
             self._finish(found, *searched)
-        if self._waiting is None or self._searches.busy:
-            return
-        (stamp, image), self._waiting = self._waiting, None
+        if self._waiting is not None and not self._searches.busy:
+            (stamp, image), self._waiting = self._waiting, None
+            self._search(stamp, image)
+        if self._searches.busy or self._guiding is not None:
+            self._look.reset()
+        else:
+            self._look.cancel()
+
+    def _search(self, stamp: int, image: Unread) -> None:
+        assert self._searches is not None
         try:
             frame, pixels = image.read()
             self._check_size(pixels)

@@ -68,6 +68,17 @@ def test_images_to_points(detecting: Graph) -> None:
         assert points[-1].header.frame_id == 'camera'
 
 
+def test_it_rests_between_images(detecting: Graph) -> None:
+    points = detecting.hear(PointCloud2, 'image_points')
+    images = detecting.tell(Image, 'image', SENSOR)
+    for stamp in (7, 8):
+        message = raw(photograph(poses(1, 4).take(0)), stamp)
+        detecting.until(lambda message=message: (
+            images.publish(message),
+            any(p.header.stamp == message.header.stamp for p in points))[1])
+        detecting.until(detecting.detector._look.is_canceled)
+
+
 def test_compressed_and_bad_images(detecting: Graph) -> None:
     points = detecting.hear(PointCloud2, 'image_points')
     image = photograph(poses(1, 4).take(0))
