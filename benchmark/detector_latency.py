@@ -1,8 +1,9 @@
 """How long the nodes take from an image to a pose: python -m benchmark.detector_latency.
 
 Rendered images of 848 x 800 px of a board that moves slowly go to a detector and a localizer, each
-a process of its own, all of them on one core; what counts is the time from publishing an image
-until its pose is here.  Leave the machine alone meanwhile.
+a process of its own.  What counts is the time from publishing an image, which includes what the
+camera takes to serialise and send it, until its pose has come back; camera and listener are one
+more process, and all of them share one core.  Leave the machine alone meanwhile.
 """
 
 from __future__ import annotations
