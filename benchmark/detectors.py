@@ -124,12 +124,14 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
             cells = []
             for low, high in itertools.pairwise(ANGLES):
                 own = (theta >= low) & (theta < high)
+                if not own.any():
+                    cells.append('')
+                    continue
                 bias = np.linalg.norm(error[own].mean(axis=0))
                 scatter = np.sqrt((error[own] ** 2).mean())
                 over = np.sqrt(((error[own] / sigma[own, None]) ** 2).mean())
-                cells.append((f'{bias:.4f} / {scatter:.4f}'
-                              + ('' if name in AS_FOUND else f' / {over:.2f}'))
-                             if own.any() else '')
+                stated = '' if name in AS_FOUND else f' / {over:.2f}'
+                cells.append(f'{bias:.4f} / {scatter:.4f}{stated} ({own.sum()})')
             share = 100 * len(error) / seen.points
             lines.append(f'| `{name}` | {seen.found} of {count} | {share:.0f} % | '
                          f'{np.median(seen.seconds):.2f} | ' + ' | '.join(cells) + ' |')
