@@ -22,20 +22,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.diagnosis.adjustment import fit_poses, start_poses
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.lens_errors import (
     LensErrors,
     depth_errors,
     localize_with_errors,
 )
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    State,
-    fit_poses,
-    prepare,
-    start_poses,
-)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text

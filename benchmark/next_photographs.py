@@ -22,15 +22,8 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    State,
-    fit,
-    intrinsic_names,
-    prepare,
-    start,
-)
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.next_photographs import (
     Board,
     Design,

@@ -32,9 +32,10 @@ from benchmark.compare.sets import (  # noqa: E402
     table_set,
 )
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
+from fisheye_svp_ros.diagnosis.adjustment import start_poses  # noqa: E402
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose  # noqa: E402
 from fisheye_svp_ros.diagnosis.inputs import posable  # noqa: E402
-from fisheye_svp_ros.diagnosis.model import prepare, start_poses  # noqa: E402
+from fisheye_svp_ros.diagnosis.model import prepare  # noqa: E402
 from fisheye_svp_ros.diagnosis.prediction import on_other_data  # noqa: E402
 from fisheye_svp_ros.diagnosis.refit import Local  # noqa: E402
 from fisheye_svp_ros.io.files import write_text  # noqa: E402

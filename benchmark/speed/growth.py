@@ -12,9 +12,10 @@ from benchmark.speed.engines import use
 from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.model import fit, prepare, start
+from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment

@@ -231,8 +231,9 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
     import numpy as np
 
     from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.diagnosis.adjustment import start
     from fisheye_svp_ros.diagnosis.inputs import posable
-    from fisheye_svp_ros.diagnosis.model import prepare, start
+    from fisheye_svp_ros.diagnosis.model import prepare
     from fisheye_svp_ros.diagnosis.moments import unrelated
     from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import fit
 from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.evidence import bare_evidence
-from fisheye_svp_ros.diagnosis.model import Data, State, fit
+from fisheye_svp_ros.diagnosis.model import Data, State
 from fisheye_svp_ros.diagnosis.prediction import HeldOut, Less, frames_in_turn, less_between
 from fisheye_svp_ros.diagnosis.refit import Fitted, local_offsets
 from fisheye_svp_ros.diagnosis.reml import Variances

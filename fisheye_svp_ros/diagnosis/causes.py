@@ -16,7 +16,7 @@ from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     candidates,
 )
-from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse, swept
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse
 from fisheye_svp_ros.diagnosis.search import drop_test
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
@@ -117,8 +117,7 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
     if name == LandmarkSurveyEffect.name:
         return []
     rest = np.setdiff1d(np.arange(evidence.own), columns)
-    information = evidence.restored(evidence.information, rest)
-    remaining = swept(information, rest)
+    remaining = evidence.remaining(evidence.information, rest)
     strength = evidence.score(remaining, columns).statistic
     known = {one for effect, _ in evidence.linear.state.terms for one in effect.kinds}
     same: list[str] = []
@@ -128,7 +127,7 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
         if other.score.statistic < CLASS_STRENGTH * strength:
             continue
         both = np.concatenate([rest, evidence.columns_of(other.form)])
-        own = evidence.score(swept(information, both), columns)
+        own = evidence.score(evidence.remaining(evidence.information, both), columns)
         if own.p_value > CLASS_SIGNIFICANCE:
             same.append(other.effect.name)
     return same

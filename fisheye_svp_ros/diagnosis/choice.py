@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, takewhile
 
 import numpy as np
@@ -71,26 +71,25 @@ class TraceStep:
 
 def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
     """Return all forms, best merit first."""
-    remaining = swept(evidence.restored(evidence.information, included), included)
+    remaining = evidence.remaining(evidence.information, included)
     found = []
     for form, effect in enumerate(evidence.forms.effects):
         columns = evidence.columns_of(form)
         score = evidence.score(remaining, columns)
         if not score.rank or _impossible(effect, score):
             continue
-        found.append(_candidate(evidence, included, form, score))
+        gain, count = score.statistic, score.rank
+        if effect.per_frame:  # what it is in single frames is one variance, as in its twins
+            gain, count = evidence.random_gain(included, columns), 1
+            score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
+        merit = float(gain - count * np.log(evidence.full.rows))
+        found.append(Candidate(form, effect, score, _corrected(evidence, effect, score), merit))
     return sorted(found, key=lambda candidate: -candidate.merit)
 
 
-def _candidate(evidence: Evidence, included: Index, form: int, score: Score) -> Candidate:
-    effect, forms = evidence.forms.effects[form], evidence.forms
-    factor = forms.names() * forms.count[effect.name]
-    gain, count, p = score.statistic, score.rank, score.p_value
-    if effect.per_frame:  # what it is in single frames is one variance, as in its random twins
-        gain, count = evidence.random_gain(included, evidence.columns_of(form)), 1
-        p = float(special.chdtrc(count, max(gain, 0.0))) / 2
-    merit = gain - count * np.log(evidence.full.rows)
-    return Candidate(form, effect, score._replace(p_value=p), min(1.0, p * factor), float(merit))
+def _corrected(evidence: Evidence, effect: Effect, score: Score) -> float:
+    forms = evidence.forms
+    return min(1.0, score.p_value * forms.names() * forms.count[effect.name])
 
 
 def _impossible(effect: Effect, score: Score) -> bool:
@@ -109,13 +108,13 @@ def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:
     for candidate in candidates(evidence, included):
         if candidate.corrected >= SIGNIFICANCE or candidate.merit <= 0:
             continue
-        columns = evidence.columns_of(candidate.form)
-        sure = _candidate(
-            evidence, included, candidate.form,
-            evidence.confident(candidate.score, included, columns),
-        )
-        if sure.corrected < SIGNIFICANCE:
-            yield sure
+        if not candidate.effect.per_frame:  # that one holds at any size of the variances
+            columns = evidence.columns_of(candidate.form)
+            score = evidence.confident(candidate.score, included, columns)
+            corrected = _corrected(evidence, candidate.effect, score)
+            candidate = replace(candidate, score=score, corrected=corrected)
+        if candidate.corrected < SIGNIFICANCE:
+            yield candidate
 
 
 def held_out_gain(

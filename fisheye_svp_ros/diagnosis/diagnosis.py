@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
@@ -16,13 +17,7 @@ from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses, thinned
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
-from fisheye_svp_ros.diagnosis.model import (
-    Linearised,
-    State,
-    fit,
-    prepare,
-    start,
-)
+from fisheye_svp_ros.diagnosis.model import Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.moments import each_alone, loose, unrelated
 from fisheye_svp_ros.diagnosis.noise import (
     find_gross_errors,

@@ -131,6 +131,10 @@ class Evidence:
         found[..., -1, -1] += found[..., -1] @ way
         return found
 
+    def remaining(self, information: Array, included: Index) -> Array:
+        """Return what is left of information once what is included, and no more, is swept out."""
+        return swept(self.restored(information, included), included)
+
     def columns_of(self, form: int) -> Index:
         """Return the border's columns of a form."""
         return self.forms.at[form] + self.own
@@ -171,7 +175,7 @@ class Evidence:
         count = self.full.rows - self.full.poses
         without, beside = np.inf, np.inf
         for logs, information in self.with_field:
-            rest = swept(self.restored(information, included), included)
+            rest = self.remaining(information, included)
             remaining = rest[-1, -1]
             without = min(without, logs + count * np.log(remaining))
             inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], least=IDENTIFIABLE)
@@ -205,7 +209,7 @@ class Evidence:
         count = self.full.rows - self.full.poses
 
         def cost(logs: float, information: Array) -> float:
-            rest = swept(self.restored(information, included), included)
+            rest = self.remaining(information, included)
             return logs + count * float(np.log(rest[-1, -1]))
 
         f = self.factored

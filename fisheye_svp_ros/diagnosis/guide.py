@@ -16,16 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import posable
-from fisheye_svp_ros.diagnosis.model import (
-    Linearised,
-    Prior,
-    fit,
-    intrinsic_names,
-    prepare,
-    start,
-)
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.next_photographs import Room
 from fisheye_svp_ros.diagnosis.next_question import Next, next_photographs
 from fisheye_svp_ros.diagnosis.plan import plan

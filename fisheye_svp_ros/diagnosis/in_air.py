@@ -13,17 +13,9 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    Prior,
-    State,
-    fit,
-    intrinsic_names,
-    is_shared,
-    start,
-)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, is_shared
 from fisheye_svp_ros.diagnosis.noise import find_gross_errors, set_aside
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens, field_of_view

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
+from fisheye_svp_ros.diagnosis.adjustment import fit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
 from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.solve.stereo_depth import triangulate
 

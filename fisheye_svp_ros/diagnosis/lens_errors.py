@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import moved
 from fisheye_svp_ros.diagnosis.gathered import Setting
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances
 from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, ModelError, pose_maps

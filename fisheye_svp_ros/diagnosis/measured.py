@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start_poses
 from fisheye_svp_ros.diagnosis.budget import (
     Component,
     budget,
@@ -20,15 +21,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    State,
-    fit,
-    fit_poses,
-    prepare,
-    start_poses,
-)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.moments import each_alone, posed_alone
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (

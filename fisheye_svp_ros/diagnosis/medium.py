@@ -14,19 +14,12 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
 from fisheye_svp_ros.diagnosis.in_air import InAir
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    State,
-    chosen_views,
-    fit,
-    flat_rows,
-    start,
-)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, flat_rows
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
 from fisheye_svp_ros.diagnosis.residuals import rms_px

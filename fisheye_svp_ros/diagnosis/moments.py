@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.inputs import free_names
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit, start
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.noise import between_cameras
 from fisheye_svp_ros.diagnosis.residuals import rms_px
 from fisheye_svp_ros.diagnosis.search import with_effect

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import fit_poses, moved
 from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, fit_poses, moved
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.refit import Local
 
 _RESAMPLES = 2000

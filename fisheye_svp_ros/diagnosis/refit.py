@@ -11,6 +11,7 @@ import numpy as np
 from scipy.sparse.linalg import eigsh
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import moved
 from fisheye_svp_ros.diagnosis.evidence import Evidence
 from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
 from fisheye_svp_ros.diagnosis.mixed import (
@@ -22,7 +23,7 @@ from fisheye_svp_ros.diagnosis.mixed import (
     posterior,
     solve,
 )
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, moved
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.products import multiplied_by
 from fisheye_svp_ros.diagnosis.random_effects import (
     NAMES,

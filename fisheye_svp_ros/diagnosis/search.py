@@ -9,6 +9,7 @@ from functools import reduce
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import fit as refit_by_least_squares
 from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
@@ -24,10 +25,8 @@ from fisheye_svp_ros.diagnosis.evidence import (
     finest_called,
     gather_evidence,
     pseudo_inverse,
-    swept,
 )
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
-from fisheye_svp_ros.diagnosis.model import fit as refit_by_least_squares
 from fisheye_svp_ros.diagnosis.noise import (
     Gross,
     NoiseCause,
@@ -253,8 +252,8 @@ def _doubt(
 def drop_test(evidence: Evidence, included: Index, columns: Index) -> Score:
     """Test an effect in the model given everything else that is included."""
     rest = np.setdiff1d(included, columns)
-    information = evidence.restored(evidence.information, rest)
-    return evidence.confident(evidence.score(swept(information, rest), columns), rest, columns)
+    remaining = evidence.remaining(evidence.information, rest)
+    return evidence.confident(evidence.score(remaining, columns), rest, columns)
 
 
 def _estimated(

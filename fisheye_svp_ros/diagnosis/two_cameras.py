@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.adjustment import fit
 from fisheye_svp_ros.diagnosis.carried import (
     Carried,
     names_of,
@@ -25,7 +26,7 @@ from fisheye_svp_ros.diagnosis.carried import (
     without_terms,
 )
 from fisheye_svp_ros.diagnosis.known_truth import Compared, compared
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, fit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
 from fisheye_svp_ros.diagnosis.moments import posed_alone
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.refit import fit_linear, refit

@@ -17,7 +17,8 @@ from benchmark.blind_oracle import LinearScene
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import FARTHEST, NEAREST, Needs, draw_scene
 from benchmark.blind_trial import Outcome, Task, draw_case
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare
+from fisheye_svp_ros.diagnosis.adjustment import fit
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import thinned
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.noise import (
     FRAME,
     VIEW,

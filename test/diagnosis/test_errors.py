@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
 from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.model import fit, prepare, start
+from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.choice import counted
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.diagnosis.search import with_effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE

@@ -8,9 +8,10 @@ from helpers.guide import LENS, POINTS, SHEET, present, seen_from, session
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import guide as module
+from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.guide import Guide, Seen, Stand, consider, observations_of
-from fisheye_svp_ros.diagnosis.model import Prior, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.next_photographs import Board
 from fisheye_svp_ros.diagnosis.next_question import next_photographs
 from fisheye_svp_ros.effects.forward import ForwardModel

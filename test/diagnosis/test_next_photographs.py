@@ -8,8 +8,9 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.next_photographs import (
     Board,
     Design,

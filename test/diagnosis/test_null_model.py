@@ -7,11 +7,12 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy import stats
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.components import score_components, significance
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
 from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import equations, factored, solve
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, design
 from fisheye_svp_ros.diagnosis.refit import fit_linear, in_sight, local_offsets, refit
 from fisheye_svp_ros.diagnosis.reml import GONE, Variances, estimate, start_variances

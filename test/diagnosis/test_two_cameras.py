@@ -8,10 +8,11 @@ import pytest
 
 from benchmark.two_cameras import Hidden, pair
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.known_truth import known_errors
-from fisheye_svp_ros.diagnosis.model import Linearised, fit, prepare, start
+from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.moments import loose
 from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted

@@ -7,9 +7,10 @@ import pytest
 from helpers.water import AIR, photographs
 from scipy import linalg
 
+from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.model import fit, fit_poses, intrinsic_names, prepare, start
+from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.refit import fit_of, local_offsets, target_modes
 from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
