@@ -14,6 +14,7 @@ from benchmark.speed.scenes import points, shift_lens, svp_lens
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
@@ -51,10 +52,10 @@ def _project(count: int, repeats: int) -> Row:
     )
 
 
-def _project_with_pose(count: int, repeats: int) -> Row:
-    lens, seen = shift_lens(), points(count, _WIDEST['shift'])
+def _linearised(lens: Lens, seen: Array) -> tuple[Callable[[], Array], Callable[[], Side], Array]:
+    """Return projection with derivatives by the pose, ours and as a kernel, and its result."""
     model, pose = ForwardModel(lens), identity(1)
-    views = views_of(seen, np.zeros((1, count, 2)))
+    views = views_of(seen, np.zeros((1, len(seen), 2)))
     exact = model.linearise(pose, views).uv[0]
 
     def ours() -> Array:
@@ -63,8 +64,15 @@ def _project_with_pose(count: int, repeats: int) -> Row:
     def kernel() -> Side:
         compiled = Kernel(lens)
         return Side(
-            KERNEL, lambda: compiled.linearise(seen, *pose.take(0))[0], count, _off(exact)
+            KERNEL, lambda: compiled.linearise(seen, *pose.take(0))[0], len(seen), _off(exact)
         )
+
+    return ours, kernel, exact
+
+
+def _project_with_pose(count: int, repeats: int) -> Row:
+    lens, seen = shift_lens(), points(count, _WIDEST['shift'])
+    ours, kernel, exact = _linearised(lens, seen)
 
     def mrcal() -> Side:
         core = MrcalCore(lens)
@@ -83,18 +91,7 @@ def _project_with_pose(count: int, repeats: int) -> Row:
 
 def _svp(count: int, repeats: int) -> Row:
     lens, seen = svp_lens(), points(count, _WIDEST['svp'])
-    model, pose = ForwardModel(lens), identity(1)
-    views = views_of(seen, np.zeros((1, count, 2)))
-    exact = model.linearise(pose, views).uv[0]
-
-    def ours() -> Array:
-        return model.linearise(pose, views).uv[0]
-
-    def kernel() -> Side:
-        compiled = Kernel(lens)
-        return Side(
-            KERNEL, lambda: compiled.linearise(seen, *pose.take(0))[0], count, _off(exact)
-        )
+    ours, kernel, exact = _linearised(lens, seen)
 
     def opencv() -> Side:
         require('cv2')

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,11 +13,17 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, PlaneEffect, Scene, 
 
 @dataclass(frozen=True)
 class FocalDriftEffect(PlaneEffect):
-    """A relative change of the focal length as a polynomial of time, constant left out."""
+    """A relative change of the focal length as a polynomial of time, constant left out.
+
+    means (degree,): what of each Legendre polynomial is a constant, its mean over the frames where
+    they are known: the lens's own focal length is then that of the whole recording, and not that
+    of a time in a pause.
+    """
 
     degree: int = 1
     start: float = field(default=0.0, metadata={'key': False})
     duration: float = field(default=1.0, metadata={'key': False})
+    means: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'focal_drift'
     signature = 'residuals in proportion to the image height that change smoothly with time'
@@ -26,8 +32,9 @@ class FocalDriftEffect(PlaneEffect):
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         t = require_time(scene, 5)
-        start, duration = float(t.min()), float(np.ptp(t))
-        return [cls(degree, start, duration) for degree in (1, 2, 3)]
+        bare = cls(3, float(t.min()), float(np.ptp(t)))
+        means = tuple(bare._polynomials(t).mean(axis=0).tolist())
+        return [replace(bare, degree=degree, means=means[:degree]) for degree in (1, 2, 3)]
 
     @property
     def of_recording(self) -> bool:
@@ -38,6 +45,10 @@ class FocalDriftEffect(PlaneEffect):
         return tuple(Parameter(f'relative_t{i + 1}', '1', 0.01) for i in range(self.degree))
 
     def plane_columns(self, scene: Scene) -> Array:
-        x = np.nan_to_num(2 * (scene.times - self.start) / self.duration - 1)
-        powers = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
+        powers = np.nan_to_num(self._polynomials(scene.times))
         return np.asarray(scene.normalised()[..., None] * powers[:, None, None, :])
+
+    def _polynomials(self, t: Array) -> Array:
+        x = 2 * (t - self.start) / self.duration - 1
+        powers = np.polynomial.legendre.legvander(x, self.degree)[..., 1:]
+        return np.asarray(powers - (self.means or 0.0))

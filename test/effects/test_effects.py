@@ -1,6 +1,8 @@
 """Every effect: its columns, its YAML, its physics where an exact answer is at hand."""
 
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.scenes import lens, scene
@@ -168,3 +170,14 @@ def test_a_profile_that_turns_back_past_its_data_is_used_up_to_there():
     theta = np.linspace(0.0, curve.limit, 200)[:-1]
     np.testing.assert_allclose(curve.angle(curve.value_and_slope(theta)[0]), theta, atol=1e-9)
     assert model.lens.max_incidence <= curve.limit
+
+
+def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearised):
+    *_, scene_ = linearised
+    late = scene_.views.frame > 2
+    paused = scene_.views._replace(t=scene_.views.t + 50.0 * late[:, None])
+    scene_ = replace(scene_, views=paused)
+    for effect in CATALOGUE['focal_drift'].candidates(scene_):
+        growth = effect.plane_columns(scene_) / scene_.normalised()[..., None]
+        assert np.abs(growth).max() > 0.5
+        np.testing.assert_allclose(np.nanmean(growth, axis=(0, 1, 2)), 0.0, atol=1e-12)
