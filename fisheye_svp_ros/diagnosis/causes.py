@@ -16,12 +16,13 @@ from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     candidates,
 )
-from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed
 from fisheye_svp_ros.diagnosis.search import drop_test
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
 _GUARD = 0.99  # a jackknife so improbable under the model's own error takes its place
+_TOLD = 1e-6  # of the variance of an estimate: a frame that tells less of it is not asked
 
 
 @dataclass(frozen=True)
@@ -47,36 +48,38 @@ class Cause:
 def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
 
-    From the information of the null model; where estimates without each of the frames
-    scatter by more than that allows, from that scatter (jackknife).
+    From the information of the null model; where estimates without each of the frames change by
+    more than that allows, as much larger (jackknife, each change beside what it should be: a
+    frame on which much depends may change much).
     NaN where the data leave a parameter open.
     """
-    own = np.arange(evidence.own)
-    scale = evidence.scale[: evidence.own]
-    variance, open_ = _variances(evidence.information[np.ix_(own, own)])
-    errors = np.sqrt(variance) / scale
-    if jackknife and evidence.linear.data.frames > 2:
-        estimates = np.array([_step(part, own) for part in evidence.in_turn]) / scale
-        count = len(estimates)
-        squares = (count - 1) / count * ((estimates - estimates.mean(axis=0)) ** 2).sum(axis=0)
-        limit = special.chdtri(count - 1, 1 - _GUARD) / (count - 1)
-        errors = np.where(squares > limit * errors**2, np.sqrt(squares), errors)
+    estimate, variance, open_ = _estimates(evidence, evidence.information)
+    errors = np.sqrt(variance) / evidence.scale[: evidence.own]
+    count = evidence.linear.data.frames
+    if jackknife and count > 2:
+        ratios = np.full((count, evidence.own), np.nan)
+        for ratio, part in zip(ratios, evidence.in_turn, strict=True):
+            without, wider, _ = _estimates(evidence, part)
+            told = wider - variance > _TOLD * variance
+            ratio[told] = ((without - estimate) ** 2)[told] / (wider - variance)[told]
+        frames = np.isfinite(ratios).sum(axis=0)
+        excess = np.nansum(ratios, axis=0) / np.maximum(frames, 1)
+        limit = special.chdtri(np.maximum(frames, 1), 1 - _GUARD) / np.maximum(frames, 1)
+        errors = np.where(excess > limit, np.sqrt(excess), 1.0) * errors
     return np.where(open_, np.nan, errors)
 
 
-def _step(information: Array, own: Index) -> Array:
-    inverse, _ = pseudo_inverse(information[np.ix_(own, own)], 1e-13)
-    return np.asarray(inverse @ information[own, -1])
-
-
-def _variances(information: Array) -> tuple[Array, Array]:
-    """Return the variances (K,) and which parameters the information leaves open."""
-    if not len(information):
-        return np.zeros(0), np.zeros(0, dtype=bool)
-    values, vectors = np.linalg.eigh(information)
+def _estimates(evidence: Evidence, information: Array) -> tuple[Array, Array, Array]:
+    """Return estimates (K,) and variances, normalised, and what the information leaves open."""
+    own = evidence.own
+    if not own:
+        return np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool)
+    values, vectors = np.linalg.eigh(information[:own, :own])
     kept = values > 1e-12 * max(float(values[-1]), 1e-300)
-    variance = ((vectors[:, kept] ** 2) / values[kept]).sum(axis=1)
-    return variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+    among = vectors[:, kept]
+    estimate = among @ (among.T @ information[:own, -1] / values[kept])
+    variance = (among**2 / values[kept]).sum(axis=1)
+    return estimate, variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
 
 
 def mean_causes(

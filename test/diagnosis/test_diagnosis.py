@@ -324,6 +324,17 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
     assert standard_errors(evidence, jackknife=False) == pytest.approx(1 / np.sqrt(40) / 2)
 
 
+def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
+    """The mean of frames, and an offset of the last one, which is open without it."""
+    rows = np.column_stack([np.ones(40), np.arange(40) == 39, np.zeros(40)])
+    rows[:, 2] = np.random.default_rng(28).normal(size=40) + 100 * rows[:, 1]
+    without = [np.delete(rows, i, axis=0) for i in range(40)]
+    evidence = SimpleNamespace(
+        own=2, scale=np.ones(2), information=rows.T @ rows, in_turn=[w.T @ w for w in without],
+        linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
+    assert standard_errors(evidence) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
+
+
 def rig_table(seed, right_terms=(), frames=16):
     """Return what two cameras with lenses of their own see, and the lenses."""
     lenses = {'left': lens(), 'right': replace(lens(), fx=395.0, fy=395.0, cx=775.0, name='right')}
