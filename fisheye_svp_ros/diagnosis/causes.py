@@ -16,13 +16,10 @@ from fisheye_svp_ros.diagnosis.choice import (
     SIGNIFICANCE,
     candidates,
 )
-from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse
 from fisheye_svp_ros.diagnosis.search import drop_test
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
-
-_GUARD = 0.99  # a jackknife so improbable under the model's own error takes its place
-_TOLD = 1e-6  # of the variance of an estimate: a frame that tells less of it is not asked
 
 
 @dataclass(frozen=True)
@@ -49,23 +46,19 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
 
     From the information of the null model; where estimates without each of the frames change by
-    more than that allows, as much larger (jackknife, each change beside what it should be: a
-    frame on which much depends may change much).
+    more than that allows, as much larger (a jackknife, beside what it should be: a frame on which
+    much depends may change much).
     NaN where the data leave a parameter open.
     """
     estimate, variance, open_ = _estimates(evidence, evidence.information)
+    if jackknife and evidence.linear.data.frames > 2:
+        changed, allowed = np.zeros(evidence.own), np.zeros(evidence.own)
+        for part in evidence.in_turn:
+            without, wider, lost = _estimates(evidence, part)
+            changed += np.where(lost, 0.0, (without - estimate) ** 2)
+            allowed += np.where(lost, 0.0, wider - variance)
+        variance = variance * np.maximum(changed / np.maximum(allowed, 1e-9 * variance), 1.0)
     errors = np.sqrt(variance) / evidence.scale[: evidence.own]
-    count = evidence.linear.data.frames
-    if jackknife and count > 2:
-        ratios = np.full((count, evidence.own), np.nan)
-        for ratio, part in zip(ratios, evidence.in_turn, strict=True):
-            without, wider, _ = _estimates(evidence, part)
-            told = wider - variance > _TOLD * variance
-            ratio[told] = ((without - estimate) ** 2)[told] / (wider - variance)[told]
-        frames = np.isfinite(ratios).sum(axis=0)
-        excess = np.nansum(ratios, axis=0) / np.maximum(frames, 1)
-        limit = special.chdtri(np.maximum(frames, 1), 1 - _GUARD) / np.maximum(frames, 1)
-        errors = np.where(excess > limit, np.sqrt(excess), 1.0) * errors
     return np.where(open_, np.nan, errors)
 
 
@@ -80,6 +73,31 @@ def _estimates(evidence: Evidence, information: Array) -> tuple[Array, Array, Ar
     estimate = among @ (among.T @ information[:own, -1] / values[kept])
     variance = (among**2 / values[kept]).sum(axis=1)
     return estimate, variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+
+
+def model_uncertainty(evidence: Evidence) -> Array:
+    """Return what effects that may be there, too, add to standard errors (K,) of what is shared.
+
+    Each effect that is not in the model is so probable as its evidence says (BIC; Raftery 1995,
+    eq. 35): so much it adds of the variance it would bring and of the square of the change.
+    Further forms of what is in the model mean other parameters, and do not count.
+    """
+    own = np.arange(evidence.own)
+    known = {kind for effect, _ in evidence.linear.state.terms for kind in effect.kinds}
+    others = [one for one in candidates(evidence, own)
+              if not (one.effect.per_frame or known & set(one.effect.kinds))]
+    weights = special.softmax([0.0, *(one.merit / 2 for one in others)])[1:]
+    information = evidence.information
+    inverse, _ = pseudo_inverse(information[np.ix_(own, own)], 1e-12)
+    remaining = evidence.remaining(information, own)
+    added = np.zeros(evidence.own)
+    for weight, one in zip(weights, others, strict=True):
+        columns = evidence.columns_of(one.form)
+        way = inverse @ information[np.ix_(own, columns)]
+        spread, _ = pseudo_inverse(remaining[np.ix_(columns, columns)])
+        change = way @ (one.score.estimate * evidence.scale[columns])
+        added += weight * (((way @ spread) * way).sum(axis=1) + change**2)
+    return np.asarray(np.sqrt(added) / evidence.scale[own])
 
 
 def mean_causes(

@@ -17,7 +17,7 @@ from fisheye_svp_ros.diagnosis.budget import (
     noise_px,
     stage_of,
 )
-from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, standard_errors
+from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, model_uncertainty, standard_errors
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
@@ -86,7 +86,9 @@ class Measured:
     @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
-        return standard_errors(self.evidence, not self.quick)
+        if self.quick:
+            return standard_errors(self.evidence, jackknife=False)
+        return np.hypot(standard_errors(self.evidence), model_uncertainty(self.evidence))
 
     def _there(self, test: Data, state: State) -> State:
         """Return the state without what other frames had that the test has not."""
