@@ -78,14 +78,14 @@ def _estimates(evidence: Evidence, information: Array) -> tuple[Array, Array, Ar
 def model_uncertainty(evidence: Evidence) -> Array:
     """Return what effects that may be there, too, add to standard errors (K,) of what is shared.
 
-    Each effect that is not in the model is so probable as its evidence says (BIC; Raftery 1995,
-    eq. 35): so much it adds of the variance it would bring and of the square of the change.
-    Further forms of what is in the model mean other parameters, and do not count.
+    Each that is likelier than not is as probable as its evidence says (BIC; Raftery 1995, eq.
+    35): so much it adds of the variance it would bring and of the square of the change.  Further
+    forms of what is in the model mean other parameters, and do not count.
     """
     own = np.arange(evidence.own)
     known = {kind for effect, _ in evidence.linear.state.terms for kind in effect.kinds}
     others = [one for one in candidates(evidence, own)
-              if not (one.effect.per_frame or known & set(one.effect.kinds))]
+              if one.merit > 0 and not (one.effect.per_frame or known & set(one.effect.kinds))]
     weights = special.softmax([0.0, *(one.merit / 2 for one in others)])[1:]
     information = evidence.information
     inverse, _ = pseudo_inverse(information[np.ix_(own, own)], 1e-12)

@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
-from fisheye_svp_ros.diagnosis.causes import standard_errors
+from fisheye_svp_ros.diagnosis.causes import model_uncertainty, standard_errors
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
 from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.refit import refit
@@ -39,6 +40,24 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
     assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
+
+
+@pytest.mark.parametrize('size', [0.0, 4e-4])
+def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(size):
+    """The principal point without the decentering that moved it: as far off as is said."""
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, frames=16)
+    terms = [(CATALOGUE['decentering'](), np.array([size, 0.0]))]
+    data = prepare(observe(lens(), terms, pose, views, SIGMA, rng))
+    state = fit(data, start(data, lens()), ('cx', 'cy'))
+    evidence = gather_evidence(data, state, ('cx', 'cy'))
+    errors, more = standard_errors(evidence), model_uncertainty(evidence)
+    off = abs(state.lens.cy - lens().cy)
+    if size:
+        assert off > 5 * errors[1]
+        assert off < 2 * np.hypot(errors, more)[1]
+    else:
+        assert not more.any()
 
 
 def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
