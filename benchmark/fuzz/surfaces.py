@@ -172,13 +172,14 @@ def _recording(folder: Path) -> bytes:
     from fisheye_svp_ros import standalone
 
     standalone.install()
+    from rclpy.serialization import serialize_message
+
     from fisheye_svp_ros.nodes import messages
-    from fisheye_svp_ros.standalone.messages import serialize
 
     seen = simulate_scenario(Scenario()).observations
     with BagWriter(folder / 'bag') as bag:
         world = messages.landmarks_message(environment('whole', 2.0), 0, 'world')
-        bag.write('/landmarks', 'sensor_msgs/msg/PointCloud2', serialize(world))
+        bag.write('/landmarks', 'sensor_msgs/msg/PointCloud2', serialize_message(world))
         for n in range(1, 4):
             points = messages.image_points_message(seen.landmark, seen.uv, n, 'camera')
             tag = messages.key_values_message('s', {'radius': n, 'lens': 'fish214'}, n)
@@ -188,7 +189,7 @@ def _recording(folder: Path) -> bytes:
                 ('/scenario', 'diagnostic_msgs/msg/DiagnosticArray', tag),
                 ('/localizer/result', 'diagnostic_msgs/msg/DiagnosticArray', result),
             ):
-                bag.write(topic, kind, serialize(message))
+                bag.write(topic, kind, serialize_message(message))
             bag.flush()
     return next((folder / 'bag').glob('*.mcap')).read_bytes()
 

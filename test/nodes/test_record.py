@@ -24,7 +24,8 @@ from mcap.reader import make_reader
 pytest.importorskip('rosbags')
 from helpers import graph  # noqa: F401 - supplies the message packages
 
-from fisheye_svp_ros import standalone
+from rclpy.serialization import serialize_message  # isort: skip
+
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
 from fisheye_svp_ros.io import decoding
@@ -40,26 +41,15 @@ DIAGNOSTICS = 'diagnostic_msgs/msg/DiagnosticArray'
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 
 
-def cdr(message: Any) -> bytes:
-    """Return a message as it travels."""
-    if standalone.is_genuine():
-        from rclpy.serialization import serialize_message
-
-        return bytes(serialize_message(message))
-    from fisheye_svp_ros.standalone.messages import serialize
-
-    return serialize(message)
-
-
 def write_results(path: Path, count: int, flush_each: bool = False) -> None:
     """Write scenarios and results of a localizer, results in reverse order of stamps."""
     with BagWriter(path) as bag:
         for n in range(count):
             tag = messages.key_values_message('scenario', {'scenario': n, 'radius': 0.5 * n}, n)
-            bag.write('/a/scenario', DIAGNOSTICS, cdr(tag))
+            bag.write('/a/scenario', DIAGNOSTICS, serialize_message(tag))
         for n in reversed(range(count)):
             result = messages.key_values_message('n', {'rms_px': n / 3, 'points': 33.0}, n)
-            bag.write('/a/localizer/result', DIAGNOSTICS, cdr(result))
+            bag.write('/a/localizer/result', DIAGNOSTICS, serialize_message(result))
             if flush_each:
                 bag.flush()
 
@@ -83,9 +73,9 @@ def test_results_without_scenarios_and_of_two_nodes_are_rows_as_well(tmp_path: P
     with BagWriter(tmp_path / 'bag') as bag:
         for node, value in (('/x/left/localizer', 1.0), ('/x/stereo_depth', 2.0)):
             message = messages.key_values_message('n', {'rms_px': value}, 5)
-            bag.write(f'{node}/result', DIAGNOSTICS, cdr(message))
+            bag.write(f'{node}/result', DIAGNOSTICS, serialize_message(message))
         failed = messages.key_values_message('n', {}, 6, 'too few points', b'\x01')
-        bag.write('/x/stereo_depth/result', DIAGNOSTICS, cdr(failed))
+        bag.write('/x/stereo_depth/result', DIAGNOSTICS, serialize_message(failed))
     columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
     assert columns['namespace'] == ['/x', '/x', '/x/left'] and columns['stamp_ns'] == [5, 6, 5]
     assert columns['stereo_depth.rms_px'] == [2.0, None, None]
@@ -97,7 +87,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def full(*_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    message = cdr(messages.key_values_message('n', {'rms_px': 1.0}, 5))
+    message = serialize_message(messages.key_values_message('n', {'rms_px': 1.0}, 5))
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/x/result', DIAGNOSTICS, message)
         monkeypatch.setattr(bag._writer, 'write', full)
@@ -109,10 +99,10 @@ def test_a_node_belongs_to_the_nearest_scenario_above_it(tmp_path: Path) -> None
     with BagWriter(tmp_path / 'bag') as bag:
         for base, radius in (('/x', 1.0), ('/x/left', 2.0)):
             tag = messages.key_values_message('scenario', {'radius': radius}, 5)
-            bag.write(f'{base}/scenario', DIAGNOSTICS, cdr(tag))
+            bag.write(f'{base}/scenario', DIAGNOSTICS, serialize_message(tag))
         for node in ('/x/left/localizer', '/x/right/localizer'):
             message = messages.key_values_message('n', {'rms_px': 3.0}, 5)
-            bag.write(f'{node}/result', DIAGNOSTICS, cdr(message))
+            bag.write(f'{node}/result', DIAGNOSTICS, serialize_message(message))
     assert tabulate(Bag(tmp_path / 'bag').records(is_tabulated)) == {
         'namespace': ['/x', '/x/left'], 'stamp_ns': [5, 5], 'radius': [1.0, 2.0],
         'right/localizer.rms_px': [3.0, None], 'localizer.rms_px': [None, 3.0],
@@ -227,7 +217,8 @@ def test_what_is_whole_after_the_damage_is_read_once_and_the_place_is_named(
 
 def test_reading_takes_little_memory_however_long_the_recording(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
-        big = cdr(messages.key_values_message('scenario', {'text': 1_000_000 * 'x'}, 1))
+        long = messages.key_values_message('scenario', {'text': 1_000_000 * 'x'}, 1)
+        big = serialize_message(long)
         for _ in range(40):
             bag.write('/scenario', DIAGNOSTICS, big)
     tracemalloc.start()
@@ -289,7 +280,7 @@ def test_a_recording_without_results_is_refused(
 ) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         message = messages.number_message(1.0)
-        bag.write('/x', 'std_msgs/msg/Float64', cdr(message))
+        bag.write('/x', 'std_msgs/msg/Float64', serialize_message(message))
     assert main(['table', str(tmp_path / 'bag')]) == 2
     assert 'neither scenarios nor results in it' in capsys.readouterr().err
 
@@ -306,12 +297,12 @@ def write_observations(path: Path, scenario: Scenario, namespace: str = '/x') ->
     with BagWriter(path) as bag:
         for stamp, frame in enumerate(table.frames, 1):
             landmarks = messages.landmarks_message(simulation.landmarks, 0, 'world')
-            bag.write(f'{namespace}/landmarks', CLOUD, cdr(landmarks))
+            bag.write(f'{namespace}/landmarks', CLOUD, serialize_message(landmarks))
             for number, name in enumerate(table.cameras):
                 mine = table.take((table.frame == frame) & (table.camera == number))
                 message = messages.image_points_message(mine.landmark, mine.uv, stamp, '')
                 topic = '/'.join(filter(None, (namespace, name, 'image_points')))
-                bag.write(topic, CLOUD, cdr(message))
+                bag.write(topic, CLOUD, serialize_message(message))
     return table
 
 
