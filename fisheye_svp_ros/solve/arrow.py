@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.solve.least_squares import Arrays, with_unit_diagonal
+from fisheye_svp_ros.solve.least_squares import Arrays, never_singular, with_unit_diagonal
 
 _SINGULAR = 1e-14  # relative eigenvalue below which shared parameters are left where they are
 
@@ -121,7 +121,7 @@ def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, 
 def _eliminate(scaled: ArrowEquations) -> tuple[Array, Array]:
     """Return blocks^-1 [cross, gradient] (S, V, B, K + 1) and the Schur complement (S, K, K)."""
     right = np.concatenate([scaled.cross, scaled.block_gradient[..., None]], axis=-1)
-    eliminated = np.linalg.solve(scaled.blocks, right)
+    eliminated = never_singular(lambda h: np.linalg.solve(h, right), scaled.blocks)
     known = np.einsum('svbk,svbl->skl', scaled.cross, eliminated[..., :-1])
     reduced = scaled.shared - known
     return eliminated, (reduced + np.swapaxes(reduced, -1, -2)) / 2

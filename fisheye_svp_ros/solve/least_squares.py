@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from fisheye_svp_ros.optics.engines.marquardt import (
 
 Arrays = tuple[Array, ...]
 
+_RIDGE = 2e-14  # beyond rounding, and less than what counts as determined
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
 
 
@@ -107,8 +109,20 @@ def solve_damped(hessian: Array, gradient: Array, damping: Array) -> Array:
     A parameter that nothing depends on stays where it is.
     """
     scaled, scale = with_unit_diagonal(hessian, damping)
-    step: Array = -np.linalg.solve(scaled, (gradient / scale)[..., None])[..., 0] / scale
+    right = (gradient / scale)[..., None]
+    step: Array = -never_singular(lambda h: np.linalg.solve(h, right), scaled)[..., 0] / scale
     return step
+
+
+def never_singular(operation: Callable[[Array], Any], scaled: Array) -> Array:
+    """Return what an operation makes of matrices (..., P, P) with a unit diagonal.
+
+    Where rounding has made a pivot of any exactly zero, with a little more on the diagonals.
+    """
+    try:
+        return np.asarray(operation(scaled))
+    except np.linalg.LinAlgError:
+        return np.asarray(operation(scaled + _RIDGE * np.eye(scaled.shape[-1])))
 
 
 def with_unit_diagonal(hessian: Array, damping: Array | float) -> tuple[Array, Array]:

@@ -17,6 +17,7 @@ from fisheye_svp_ros.solve.least_squares import (
     Arrays,
     dense_step,
     levenberg_marquardt,
+    never_singular,
     with_unit_diagonal,
 )
 
@@ -155,7 +156,7 @@ def check_views(views: Views, minimum: int, what: str = 'in it') -> None:
 def _covariance(hessian: Array) -> tuple[Array, Mask]:
     """Return the inverses of information (S, 6, 6), and which (S,) are determined."""
     relative, scale = with_unit_diagonal(hessian, 0.0)
-    inverse = np.linalg.inv(relative)
+    inverse = never_singular(np.linalg.inv, relative)
     # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
     spread = np.trace(inverse, axis1=-2, axis2=-1)
     outer = scale[..., :, None] * scale[..., None, :]

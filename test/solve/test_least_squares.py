@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.optics.engines.marquardt import FIRST_GROWTH, STEP_TOLERANCE, adjusted
-from fisheye_svp_ros.solve.least_squares import dense_step, levenberg_marquardt, solve_damped
+from fisheye_svp_ros.solve.least_squares import (
+    dense_step,
+    levenberg_marquardt,
+    never_singular,
+    solve_damped,
+)
 
 # NIST StRD, Misra1a (lower difficulty): y = b1 (1 - exp(-b2 x)), certified values.
 MISRA_X = np.array([77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8,
@@ -142,3 +147,14 @@ def test_damping_falls_with_a_good_step_and_grows_ever_faster_with_bad_ones():
         gained=np.array([1.0, 0.5, -1.0, -1.0]), moved=np.ones(4))
     np.testing.assert_allclose(damping, [1e-4, 1e-3, 2e-3, 8e-3])
     np.testing.assert_allclose(growth, [FIRST_GROWTH, FIRST_GROWTH, 4.0, 16.0])
+
+
+def test_a_pivot_that_rounding_makes_zero_stops_no_other_system():
+    """Two parameters alike but for rounding, beside a system without any fault."""
+    alike = 1 + 5 * np.finfo(float).eps
+    hessian = np.array([[[1.0, alike], [alike, 1.0]], [[2.0, 0.0], [0.0, 4.0]]])
+    step = solve_damped(hessian, np.array([[1.0, 1.0], [2.0, 8.0]]), np.zeros(2))
+    assert np.isfinite(step).all()
+    assert step[1] == pytest.approx([-1.0, -2.0], rel=1e-12)
+    equal = np.full((1, 2, 2), alike)
+    assert np.trace(never_singular(np.linalg.inv, equal)[0]) > 1e13  # nothing that is determined
