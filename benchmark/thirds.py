@@ -23,9 +23,7 @@ import numpy as np
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.wanted import Wanted
-from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.diagnosis.wanted import Wanted, can_be_taken_in
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import Observations
@@ -54,8 +52,7 @@ def diagnosed(table: Observations, size: tuple[int, int], causes: tuple[str, ...
 def named(path: Path, size: tuple[int, int]) -> tuple[str, ...]:
     """Return the causes of a whole set that can be taken in without a test."""
     found = diagnosed(read_observations(path), size, (SHIFT,)).causes
-    return tuple(c.effect for c in found if CATALOGUE[c.effect].stage != 'noise'
-                 and c.effect != LandmarkSurveyEffect.name)
+    return tuple(cause.effect for cause in found if can_be_taken_in(cause.effect))
 
 
 def estimates(part: Part) -> Array:

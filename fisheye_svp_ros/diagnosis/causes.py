@@ -83,7 +83,7 @@ def model_uncertainty(evidence: Evidence) -> Array:
     forms of what is in the model mean other parameters, and do not count.
     """
     own = np.arange(evidence.own)
-    known = {kind for effect, _ in evidence.linear.state.terms for kind in effect.kinds}
+    known = evidence.kinds
     others = [one for one in candidates(evidence, own)
               if one.merit > 0 and not (one.effect.per_frame or known & set(one.effect.kinds))]
     weights = special.softmax([0.0, *(one.merit / 2 for one in others)])[1:]
@@ -140,7 +140,7 @@ def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
     rest = np.setdiff1d(np.arange(evidence.own), columns)
     remaining = evidence.remaining(evidence.information, rest)
     strength = evidence.score(remaining, columns).statistic
-    known = {one for effect, _ in evidence.linear.state.terms for one in effect.kinds}
+    known = evidence.kinds
     same: list[str] = []
     for other in candidates(evidence, rest):
         if known & set(other.effect.kinds) or other.effect.name in (name, *same):

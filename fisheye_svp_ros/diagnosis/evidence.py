@@ -119,6 +119,11 @@ class Evidence:
             start += len(values)
         return placed
 
+    @property
+    def kinds(self) -> set[str]:
+        """Names of the effects in the model, for each camera of a rig that has one for itself."""
+        return {kind for effect, _ in self.linear.state.terms for kind in effect.kinds}
+
     def restored(self, information: Array, kept: Index) -> Array:
         """Return information (..., X + 1, X + 1) as if only these of the effects were fitted."""
         way = np.zeros(information.shape[-1])

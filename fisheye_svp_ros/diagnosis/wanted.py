@@ -9,6 +9,11 @@ from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ParameterError
 
 
+def can_be_taken_in(name: str) -> bool:
+    """Whether an effect can be fitted without a test: not those of noise, or single landmarks."""
+    return CATALOGUE[name].stage != 'noise' and name != LandmarkSurveyEffect.name
+
+
 @dataclass(frozen=True)
 class Wanted:
     """Causes to take in without a test, effects to leave out, whether time matters most.
@@ -26,6 +31,6 @@ class Wanted:
                 known = ', '.join(CATALOGUE)
                 raise ParameterError(f'effect {name!r} is unknown; known are {known}')
         for name in self.included:
-            if CATALOGUE[name].stage == 'noise' or name == LandmarkSurveyEffect.name:
+            if not can_be_taken_in(name):
                 raise ParameterError(f'effect {name} cannot be taken in without a test; leave it '
                                      'to the diagnosis')
