@@ -10,10 +10,10 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.budget import stage_of
-from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.noise import NO_GROSS, Gross, find_gross_errors
+from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values

@@ -1,13 +1,12 @@
-"""Causes: estimates with honest errors, what they may be mistaken for, whether they survive."""
+"""Causes: estimates, what they may be mistaken for, whether they survive."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import (
@@ -18,7 +17,6 @@ from fisheye_svp_ros.diagnosis.choice import (
 )
 from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed
 from fisheye_svp_ros.diagnosis.search import drop_test
-from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
@@ -41,81 +39,6 @@ class Cause:
     gain: float
     indistinguishable_from: list[str]
     to_separate: str
-
-
-def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
-    """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
-
-    From the information of the null model; where estimates without each of the frames change by
-    more than that allows, as much larger (a jackknife, beside what it should be: a frame on which
-    much depends may change much).
-    NaN where the data leave a parameter open.
-    """
-    own = np.arange(evidence.own)
-    estimate, variance, open_ = _estimates(evidence.information, own)
-    if jackknife and evidence.linear.data.frames > 2:
-        changed, allowed = np.zeros(evidence.own), np.zeros(evidence.own)
-        for part in evidence.in_turn:
-            without, wider, lost = _estimates(part, own)
-            changed += np.where(lost, 0.0, (without - estimate) ** 2)
-            allowed += np.where(lost, 0.0, wider - variance)
-        variance = variance * np.maximum(changed / np.maximum(allowed, 1e-9 * variance), 1.0)
-    errors = np.sqrt(variance) / evidence.scale[: evidence.own]
-    return np.where(open_, np.nan, errors)
-
-
-def _estimates(information: Array, included: Index) -> tuple[Array, Array, Array]:
-    """Return estimates (K,) and variances of what is included, normalised, and what is open."""
-    if not len(included):
-        return np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool)
-    values, vectors = np.linalg.eigh(information[np.ix_(included, included)])
-    kept = values > 1e-12 * max(float(values[-1]), 1e-300)
-    among = vectors[:, kept]
-    estimate = among @ (among.T @ information[included, -1] / values[kept])
-    variance = (among**2 / values[kept]).sum(axis=1)
-    return estimate, variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
-
-
-def model_uncertainty(evidence: Evidence) -> Array:
-    """Return what effects that may be there, too, add to standard errors (K,) of what is shared.
-
-    Models with one more effect, and with more beside the likeliest of them: each is as probable as
-    its evidence says (BIC; Raftery 1995, eq. 35), and adds so much of the variance that it brings
-    and of the square of the change.
-    """
-    own, information = evidence.own, evidence.information
-    estimate, variance, _ = _estimates(information, np.arange(own))
-    models = [*_larger_models(evidence)]
-    weights = special.softmax([0.0, *(merit / 2 for merit, _ in models)])[1:]
-    added = np.zeros(own)
-    for weight, (_, included) in zip(weights, models, strict=True):
-        other, wider, _ = _estimates(information, included)
-        added += weight * (np.maximum(wider[:own] - variance, 0.0) + (other[:own] - estimate) ** 2)
-    return np.asarray(np.sqrt(added) / evidence.scale[:own])
-
-
-def _larger_models(evidence: Evidence) -> Iterator[tuple[float, Index]]:
-    """Yield merit and columns of models with more effects, as long as one is likelier than not."""
-    included, known, merit = np.arange(evidence.own), evidence.kinds, 0.0
-    while True:
-        others = [one for one in candidates(evidence, included)
-                  if one.merit > 0 and _leaves_meanings(one.effect, known)]
-        for one in others:
-            columns = np.concatenate([included, evidence.columns_of(one.form)])
-            yield merit + one.merit, columns
-        if not others:
-            return
-        best = others[0]
-        included = np.concatenate([included, evidence.columns_of(best.form)])
-        known, merit = known | set(best.effect.kinds), merit + best.merit
-
-
-def _leaves_meanings(effect: Effect, known: set[str]) -> bool:
-    """Whether what is known in a model means the same beside another effect.
-
-    Beside a further form of itself it does not; one of the target leaves those of the lens alone.
-    """
-    return not effect.per_frame and (effect.stage == 'target' or not known & set(effect.kinds))
 
 
 def mean_causes(

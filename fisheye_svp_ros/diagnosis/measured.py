@@ -17,7 +17,7 @@ from fisheye_svp_ros.diagnosis.budget import (
     noise_px,
     stage_of,
 )
-from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes, model_uncertainty, standard_errors
+from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
@@ -35,6 +35,7 @@ from fisheye_svp_ros.diagnosis.prediction import (
 from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, rms_px
 from fisheye_svp_ros.diagnosis.search import Found, drop_test
+from fisheye_svp_ros.diagnosis.standard_errors import model_uncertainty, standard_errors
 from fisheye_svp_ros.scene.observations import Observations
 
 

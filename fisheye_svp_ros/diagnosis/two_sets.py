@@ -22,12 +22,12 @@ from fisheye_svp_ros.diagnosis.carried import (
     with_target,
     without_terms,
 )
-from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.evidence import bare_evidence
 from fisheye_svp_ros.diagnosis.model import State
 from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.diagnosis.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import Term

@@ -8,7 +8,6 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.causes import standard_errors
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import thinned
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
@@ -20,6 +19,7 @@ from fisheye_svp_ros.diagnosis.noise import (
     quantisation_step,
 )
 from fisheye_svp_ros.diagnosis.search import search
+from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
