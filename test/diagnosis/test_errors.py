@@ -61,7 +61,7 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
 
 
 def test_two_effects_that_hide_each_other_widen_the_errors():
-    """What tilt and decentering do to the residual cancels; what they do to the centre does not."""
+    """What tilt and decentering do to residuals cancels; what they do to the centre does not."""
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     terms = [(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
