@@ -11,7 +11,6 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import candidates
 from fisheye_svp_ros.diagnosis.evidence import Evidence
 
-_WINDOW = 6.0  # twice the log odds of the likeliest model to one that need not be counted: 20 to 1
 _MOST = 40  # models
 
 
@@ -80,24 +79,20 @@ class _Model(NamedTuple):
 
 
 def _larger_models(evidence: Evidence) -> list[_Model]:
-    """Return the chosen model and larger ones that are not much less likely than the likeliest.
+    """Return the chosen model and larger ones, each likelier than one that it extends.
 
-    Occam's window (Madigan and Raftery 1994), the likeliest of those at hand extended first.
+    The likeliest of those at hand is extended first, and so many are enough.
     """
     found: dict[frozenset[int], _Model] = {}
     waiting = {frozenset[int](): _Model(0.0, np.arange(evidence.own), frozenset())}
-    least = -_WINDOW
     while waiting and len(found) < _MOST:
         forms, model = max(waiting.items(), key=lambda item: item[1].merit)
-        del waiting[forms]
-        if model.merit < least:
-            break
-        found[forms], least = model, max(least, model.merit - _WINDOW)
+        found[forms] = waiting.pop(forms)
         for one in candidates(evidence, model.included):
-            if one.effect.per_frame or model.kinds & set(one.effect.kinds):
+            kinds = set(one.effect.kinds)
+            if one.merit <= 0 or one.effect.per_frame or model.kinds & kinds:
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, evidence.columns_of(one.form)])
-                waiting[larger] = _Model(
-                    model.merit + one.merit, columns, model.kinds | set(one.effect.kinds))
-    return [model for model in found.values() if model.merit >= least]
+                waiting[larger] = _Model(model.merit + one.merit, columns, model.kinds | kinds)
+    return [*found.values()]
