@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
-    from fisheye_svp_ros.commands.photographs import measured
+    from fisheye_svp_ros.commands.photographs import check_sizes, measured, sizes_beside
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.scene.observations import rig_cameras
 
@@ -72,10 +72,11 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
                              'water, or --port')
     observations, sizes = measured(args.observations, args)
+    sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
     if args.lens:
         air = load_lens(args.lens)
+        check_sizes(args.observations, sizes, {'': air})
         sizes = {'': (air.width, air.height)}
-    sizes = args.image_size or sizes or _sizes_beside(Path(args.observations))
     unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
     if unknown:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
@@ -162,25 +163,6 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
-
-
-def _sizes_beside(path: Path) -> dict[str, tuple[int, int]]:
-    """Return the image size of each camera that `detect` wrote beside its observations."""
-    from fisheye_svp_ros.io.documents import read_json
-
-    beside = path.with_suffix('.detect.json')
-    if not beside.exists():
-        return {}
-    document = read_json(beside, ObservationError)
-    entries = document.get('image_sizes', {'': document.get('image_size')})
-    sizes: dict[str, tuple[int, int]] = {}
-    for camera, entry in entries.items() if isinstance(entries, dict) else ():
-        match entry:
-            case [int(width), int(height)] if width > 0 < height:
-                sizes[camera] = width, height
-    if not sizes:
-        raise ObservationError(f'{beside}: image_sizes are no whole numbers; give --image-size')
-    return sizes
 
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
@@ -66,6 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
+    import numpy as np
+
     from fisheye_svp_ros.commands.lenses import load_lenses
     from fisheye_svp_ros.diagnosis.diagnosis import diagnose
     from fisheye_svp_ros.diagnosis.inputs import free_names, poses_by_frame, rig_lenses
@@ -94,10 +96,16 @@ def run(args: argparse.Namespace) -> None:
             'wanted': Wanted(tuple(args.included), tuple(args.left_out), args.quick),
             'progress': progress,
         }
-        if other is None:
-            diagnosis = diagnose(observations, lens, **settings)
-        else:
-            diagnosis = diagnose_against(observations, other, lens, **settings)
+        try:
+            if other is None:
+                diagnosis = diagnose(observations, lens, **settings)
+            else:
+                diagnosis = diagnose_against(observations, other, lens, **settings)
+        except np.linalg.LinAlgError as cause:
+            raise GeometryError(
+                f'{args.observations}: its views cannot be fitted with this lens; is it that of '
+                'another camera, or of another image size? `localize` says how far each is off'
+            ) from cause
         progress('errors where the truth is known', 0.88)
         known = known_errors(diagnosis.before, diagnosis.after, names)
         wanted = _wanted(args, diagnosis) if args.count else None
@@ -123,12 +131,14 @@ def _read(
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.commands.lenses import lenses_of
     from fisheye_svp_ros.commands.notes import note_left_out
-    from fisheye_svp_ros.commands.photographs import measured
+    from fisheye_svp_ros.commands.photographs import check_sizes, measured, sizes_beside
     from fisheye_svp_ros.diagnosis.inputs import posable
 
-    table, _ = measured(path, args)
+    table, sizes = measured(path, args)
+    lenses = lenses_of(table.cameras, given)
+    check_sizes(path, sizes or sizes_beside(Path(path)), lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
-    lens = given[''] if one else lenses_of(table.cameras, given)
+    lens = given[''] if one else lenses
     observations, left_out = posable(table, lens)
     note_left_out(left_out)
     return observations, lens

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.errors import ParameterError
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.lens_formats import Foreign
     from fisheye_svp_ros.optics.lens import Lens
@@ -22,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'another camera than the first), or the name of one that comes with it')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
-                        help='form of the file; by default a lens file of this package')
+                        help='form of the file that -o writes; by default a lens file of this package')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -35,6 +37,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.rig_files import save_rig
     from fisheye_svp_ros.io.share import lens_path
 
+    if args.format and not args.output:
+        raise ParameterError(f'--format {args.format}: name the file to write, -o FILE')
     path = lens_path(args.lens)
     foreign = read_lens_file(path)
     if foreign is not None and not foreign.lenses and not args.format:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
+    from fisheye_svp_ros.optics.lens import Lens
     from fisheye_svp_ros.scene.observations import Observations
 
+Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _SHOWN = 12
 
 
@@ -30,9 +32,7 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         help='take one of N photographs or video frames')
 
 
-def measured(
-    path: str, args: argparse.Namespace
-) -> tuple[Observations, dict[str, tuple[int, int]]]:
+def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
     """Return observations from a file, or from photographs, with the image size of each camera.
 
     Raises ObservationError for anything missing or malformed, ParameterError for photographs
@@ -49,6 +49,35 @@ def measured(
         raise ParameterError(f'{path}: these are photographs; say what they show, for example '
                              '--board chessboard:9x6:24mm')
     return read_observations(path), {}
+
+
+def sizes_beside(path: Path) -> Sizes:
+    """Return the image size of each camera that `detect` wrote beside its observations."""
+    from fisheye_svp_ros.io.documents import read_json
+
+    beside = path.with_suffix('.detect.json')
+    if not beside.exists():
+        return {}
+    document = read_json(beside, ObservationError)
+    entries = document.get('image_sizes', {'': document.get('image_size')})
+    sizes: Sizes = {}
+    for camera, entry in entries.items() if isinstance(entries, dict) else ():
+        match entry:
+            case [int(width), int(height)] if width > 0 < height:
+                sizes[camera] = width, height
+    if not sizes:
+        raise ObservationError(f'{beside}: image_sizes are no whole numbers; give --image-size')
+    return sizes
+
+
+def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
+    """Raise LensError where images of a known size are not of the size that their lens has."""
+    for camera, lens in lenses.items():
+        size = sizes.get(camera) or sizes.get('')
+        if size and size != (lens.width, lens.height):
+            raise LensError(f'{path}: images of {size[0]}x{size[1]} px, and lens {lens.name!r} is '
+                            f'of {lens.width}x{lens.height} px; give the lens of this camera at '
+                            'this size')
 
 
 def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:

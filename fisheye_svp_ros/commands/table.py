@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fisheye_svp_ros.io.files import together
 
+if TYPE_CHECKING:
+    from fisheye_svp_ros.io.recording_table import Columns
+
+Cells = dict[str, list[str]]  # by column
 _SHOWN = 40  # rows for people
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('bag', metavar='BAG',
-                        help='a rosbag2 recording: its folder or its .mcap file')
+                        help='a rosbag2 recording: its folder, or its .mcap or .db3 file')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for table.csv, table.parquet and table.json')
 
@@ -50,21 +55,42 @@ def run(args: argparse.Namespace) -> None:
         note_formats()
 
 
-def _print(bag: str, columns: dict[str, list[Any]]) -> None:
+def _print(bag: str, columns: Columns) -> None:
     """Print the columns that differ from row to row; the others once, above the table."""
+    from fisheye_svp_ros.io.recording_table import STAMP
     from fisheye_svp_ros.reporting.tables import print_table
 
-    rows = list(zip(*columns.values(), strict=True))
     varying = [name for name, cells in columns.items() if len(set(cells)) > 1] or list(columns)
     for name in columns:
         if name not in varying:
             print(f'  {name}: {_cell(columns[name][0])}')
-    picked = [list(columns).index(name) for name in varying]
-    print_table(
-        f'{bag}: {len(rows)} rows' + (f', the first {_SHOWN}' if len(rows) > _SHOWN else ''),
-        varying,
-        [[_cell(row[i]) for i in picked] for row in rows[:_SHOWN]],
-    )
+    rows = len(columns[STAMP])
+    print(f'{bag}: {rows} rows' + (f', the first {_SHOWN}' if rows > _SHOWN else ''))
+    tags, metrics = dict[str, list[str]](), dict[str, list[str]]()
+    for name in varying:
+        to = metrics if '.' in name else tags
+        to[name] = [_cell(value) for value in columns[name][:_SHOWN]]
+    if len(tags) > 1:
+        tags.pop(STAMP, None)  # the scenario says it more readably
+    for block in _blocks(tags, metrics):
+        print_table('', list(block), zip(*block.values(), strict=True),
+                    words=[name for name in block if name.endswith('.note')])
+
+
+def _blocks(tags: Cells, metrics: Cells) -> Iterator[Cells]:
+    """Yield the tags and as many of the metrics as a line has room for, until all are told."""
+    from fisheye_svp_ros.reporting.tables import console
+
+    def wide(columns: Cells) -> int:
+        return sum(3 + max(map(len, (name, *cells))) for name, cells in columns.items())
+
+    block: Cells = {}
+    for name, cells in metrics.items():
+        if block and wide({**tags, **block, name: cells}) > console().width:
+            yield tags | block
+            block = {}
+        block[name] = cells
+    yield tags | block
 
 
 def _cell(value: Any) -> str:

@@ -12,6 +12,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 _WIDE = 200  # columns where no terminal says how many it has
+_NARROW = 10  # columns that text is broken into at the narrowest
 
 
 def print_table(
@@ -23,17 +24,19 @@ def print_table(
     Numbers are never cut: a terminal that is too narrow folds the lines.
     """
     table = Table(box=box.SIMPLE_HEAD)
-    cells = [header, *rows]
+    cells, least = [header, *rows], 1
     for i, name in enumerate(header):
         text = name in words
         justify: JustifyMethod = 'right' if i and not text else 'left'
         widest = max(len(row[i]) for row in cells)
         table.add_column(name, justify=justify, no_wrap=not text,
                          min_width=None if text else widest)
+        least += 3 + (_NARROW if text else widest)
     for row in cells[1:]:
         table.add_row(*row)
     out = console()
     out.print(title)
+    out.width = max(out.width, least)  # in less room rich leaves out whole columns
     out.print(table, crop=False, overflow='ignore')
 
 

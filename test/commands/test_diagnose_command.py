@@ -287,6 +287,16 @@ class TestWords:
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
 
 
+def test_views_that_cannot_be_fitted_are_one_line(scene, monkeypatch, capsys):
+    def singular(*_, **__):
+        raise np.linalg.LinAlgError('SVD did not converge')
+
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnosis.diagnose', singular)
+    assert run('shift.csv', scene) == 2
+    said, = capsys.readouterr().err.strip().splitlines()
+    assert 'shift.csv: its views cannot be fitted with this lens' in said
+
+
 def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)

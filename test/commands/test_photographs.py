@@ -89,6 +89,23 @@ def test_localize_photographs(
     assert '--board chessboard' in said
 
 
+def test_a_lens_of_another_image_size_is_refused(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(replace(LENS, width=848, height=800), tmp_path / 'large.yaml')
+    table = tmp_path / 'observations.csv'
+    write_observations(table, make_observations(
+        np.repeat(0, 8), np.arange(8), np.ones((8, 2)), PRINTED.corners[:8]))
+    (tmp_path / 'observations.detect.json').write_text('{"image_sizes": {"": [424, 400]}}')
+    photographs = str(folder), '--board', BOARD
+    for command, *rest in (('localize', str(table)), ('diagnose', str(table)),
+                           ('calibrate', str(table), '--medium', 'water'),
+                           ('localize', *photographs)):
+        assert cli.main([command, *rest, '--lens', str(tmp_path / 'large.yaml')]) == 2
+        said = capsys.readouterr().err
+        assert "424x400 px, and lens 'small' is of 848x800 px" in said
+
+
 def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     where, left_in_right = poses(10, 3), rig('vergent', 0.05)
     columns: list[tuple[np.ndarray, ...]] = []

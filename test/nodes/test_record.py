@@ -127,6 +127,30 @@ def test_the_command_writes_csv_parquet_and_json(
     assert document['rows'] == 5 and document['damage'] == ''
 
 
+def test_the_command_prints_all_columns_in_the_width_of_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    metrics = [f'a_metric_with_a_long_name_{i}_m' for i in range(30)]
+    with BagWriter(tmp_path / 'bag') as bag:
+        for n in range(3):
+            tag = messages.key_values_message('scenario', {'radius': 0.5 * n}, n)
+            bag.write('/scenario', DIAGNOSTICS, serialize_message(tag))
+            result = messages.key_values_message('n', dict.fromkeys(metrics, n / 3), n)
+            bag.write('/localizer/result', DIAGNOSTICS, serialize_message(result))
+    monkeypatch.setenv('COLUMNS', '100')
+    monkeypatch.setenv('NO_COLOR', '1')
+    monkeypatch.setenv('TERM', 'dumb')
+    monkeypatch.setattr('sys.stdout.isatty', lambda: True, raising=False)
+    monkeypatch.chdir(tmp_path)
+    assert main(['table', 'bag']) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 100
+    headers = [line.split() for line in lines if 'localizer.' in line]
+    assert [name for _, *names in headers for name in names] == [
+        f'localizer.{name}' for name in metrics]
+    assert {first for first, *_ in headers} == {'radius'}
+
+
 @pytest.mark.parametrize('part', [0.35, 0.6, 0.9, 0.999])
 def test_a_recording_that_was_cut_short_yields_what_is_whole(
     tmp_path: Path, part: float, capsys: pytest.CaptureFixture[str]
