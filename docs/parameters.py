@@ -8,7 +8,6 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,18 +17,10 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from fisheye_svp_ros import standalone  # noqa: E402
-from fisheye_svp_ros.io.parameters import Row, rows  # noqa: E402
-from fisheye_svp_ros.nodes import NODES  # noqa: E402
+from fisheye_svp_ros.io.parameters import Row  # noqa: E402
+from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 
 _TABLE = '<!-- parameters of {node} -->\n{table}<!-- end -->'
-
-
-def table_of(node: str) -> list[Row]:
-    """Return the parameter table of a node, its own parameters before those of every node."""
-    module = import_module(f'fisheye_svp_ros.nodes.{node}')
-    kind = getattr(module, ''.join(word.title() for word in node.split('_')))
-    table = rows(kind.SETTINGS)
-    return sorted(table, key=lambda row: row.name == 'wait_for_subscribers')
 
 
 def markdown(table: list[Row]) -> str:
@@ -63,7 +54,7 @@ def documents() -> dict[Path, str]:
     for node in NODES:
         if not (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists():
             continue
-        table = table_of(node)
+        table = executables.parameters(node)
         pattern = re.escape(_TABLE.format(node=node, table='\0')).replace('\0', '.*?')
         new = _TABLE.format(node=node, table=markdown(table))
         text, found = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)

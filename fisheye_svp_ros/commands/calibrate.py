@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
-_UNITS = {
+UNITS = {  # of the parameters of a lens; 1 where there is none
     **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
     **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
     **dict.fromkeys(('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y',
@@ -263,7 +263,7 @@ def _print(result: Calibration, trust: Trust) -> None:
         ('parameter', 'value', 'std. error', 'with any target', 'unit'),
         [
             (name, *with_error(value, errors.get(name, 0.0)),
-             open_ones.get(name, ''), _UNITS.get(name, '1'))
+             open_ones.get(name, ''), UNITS.get(name, '1'))
             for name, value in lens.parameters.items()
         ],
     )

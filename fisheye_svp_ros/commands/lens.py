@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'another camera than the first), or the name of one that comes with it')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
-                        help='form of the file that -o writes; by default a lens file of this package')
+                        help='form of the file to write; by default a lens file of this package')
 
 
 def run(args: argparse.Namespace) -> None:

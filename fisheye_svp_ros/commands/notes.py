@@ -32,7 +32,8 @@ def note_left_out(frames: Sequence[int]) -> None:
     if frames:
         names = ', '.join(map(str, frames[:_SHOWN]))
         more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
-        say(f'left out, since their points do not fix a pose: frames {names}{more}')
+        say(f'left out, since their points do not fix a pose (all near one line, or of '
+            f'another lens?): frames {names}{more}')
 
 
 def note_gross_errors(table: Observations, gross: Gross) -> None:

@@ -42,6 +42,7 @@ def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
     import numpy as np
 
+    from fisheye_svp_ros.commands.calibrate import UNITS
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.diagnosis.plan import plan
     from fisheye_svp_ros.effects.forward import ForwardModel
@@ -65,7 +66,8 @@ def run(args: argparse.Namespace) -> None:
     print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
                 shot_list.HEADER, shot_list.rows(wanted), words=shot_list.WORDS)
     print('  standard errors to expect: '
-          + ', '.join(f'{name} {error:.2g}' for name, error in planned.stderr.items()))
+          + ', '.join(f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
+                      for name, error in planned.stderr.items()))
     if args.output:
         print(f'{args.output}: plan.pdf, plan.json, poses.csv')
 

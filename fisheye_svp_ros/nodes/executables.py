@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 
+from fisheye_svp_ros.io.parameters import Row, rows
 from fisheye_svp_ros.nodes import NODES
 
 
@@ -32,6 +33,13 @@ def run(name: str, args: list[str] | None = None) -> int:
     with ending_quietly():
         module = import_module(f'fisheye_svp_ros.nodes.{name}')
     return int(module.main(args))
+
+
+def parameters(name: str) -> list[Row]:
+    """Return the parameters of a node, its own before those of every node; rclpy must be there."""
+    module = import_module(f'fisheye_svp_ros.nodes.{name}')
+    kind = getattr(module, name.title().replace('_', ''))
+    return sorted(rows(kind.SETTINGS), key=lambda row: row.name == 'wait_for_subscribers')
 
 
 def __getattr__(name: str) -> Callable[..., int]:

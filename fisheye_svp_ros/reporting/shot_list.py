@@ -59,7 +59,10 @@ def purpose(wanted: Next) -> str:
         return (f'to tell {wanted.asked} from {" and ".join(wanted.others)}; now '
                 f'{then(wanted, 0)}')
     what = 'the whole lens' if wanted.asked == 'lens' else wanted.asked
-    return f'for {what}' + (f'; now {then(wanted, 0)}' if wanted.unit else '')
+    if wanted.unit:
+        return f'for {what}; now {then(wanted, 0)}'
+    beside = 'now' if wanted.answers[0] == 1 else 'after the first'
+    return f'for {what}; errors in % of those {beside}'
 
 
 def draw_shots(path: Path, model: ForwardModel, wanted: Next) -> None:

@@ -232,6 +232,8 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert '0.1 m' in said
     assert cli.main(['lens', str(tmp_path / 'ros.yaml'), '-o', str(tmp_path / 'back.yaml')]) == 0
     assert load_lens(tmp_path / 'back.yaml').viewpoint_shift is None
+    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '--format', 'ros']) == 2
+    assert '-o FILE' in capsys.readouterr().err
 
 
 RIG = Pose(rotation_from_vector(np.array([0.02, -0.3, 0.1])), np.array([-0.15, 0.01, 0.002]))
@@ -296,7 +298,7 @@ def of_ours(folder: Path, suffix: str) -> Path:
 
 
 @pytest.mark.parametrize(('write', 'suffix'), [
-    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_opencv_in_a_row, '.yml'),
+    (of_opencv, '.yml'), (of_opencv, '.xml'), (of_opencv, '.json'), (of_opencv_in_a_row, '.yml'),
     (of_urdf, '.urdf'), (of_tf, '.yaml'), (of_ours, '.yaml'),
 ])
 def test_rigs(tmp_path: Path, write: Callable[[Path, str], Path], suffix: str) -> None:

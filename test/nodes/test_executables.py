@@ -71,6 +71,22 @@ def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
     assert 'Traceback' not in '\n'.join(node.lines)
 
 
+def test_help_tells_the_parameters_of_a_node(capsys: pytest.CaptureFixture[str]) -> None:
+    from fisheye_svp_ros import cli
+
+    assert cli.main(['run', 'stereo_depth', '--help']) == 0
+    told = capsys.readouterr().out
+    for row in executables.parameters('stereo_depth'):
+        assert f'  {row.name} ' in told
+
+
+def test_ros_arguments_without_ros_args_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    from fisheye_svp_ros import cli
+
+    assert cli.main(['run', 'localizer', '-p', 'svp:=true']) == 2
+    assert "'-p' stands before --ros-args" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('after', [0.0, 0.3, 0.6, 1.0, 1.5, 2.2])
 def test_a_signal_while_a_node_starts_ends_it_quietly(

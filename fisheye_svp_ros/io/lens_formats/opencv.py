@@ -1,4 +1,4 @@
-"""OpenCV FileStorage (YAML or XML) of cv2.fisheye: a matrix and four coefficients, or two cameras.
+"""OpenCV FileStorage (YAML, XML, JSON) of cv2.fisheye: a matrix and coefficients, or two cameras.
 
 Of two (K1, D1, K2, D2) R and T bring points of the first camera into the second, as
 cv2.fisheye.stereoCalibrate returns them.
@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
+from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_json, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, nearest_rotation
@@ -28,7 +28,9 @@ _SIZE = ('image_size', 'imageSize', 'size')
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return text.lstrip().startswith('%YAML') or '<opencv_storage>' in text
+    start = text.lstrip()
+    return (start.startswith('%YAML') or '<opencv_storage>' in text
+            or (start.startswith('{') and '"opencv-matrix"' in text))
 
 
 def read(text: str, where: str) -> Foreign:
@@ -36,6 +38,8 @@ def read(text: str, where: str) -> Foreign:
     # A file that is nested deeply ends the process in OpenCV's own parser.
     if text.lstrip().startswith('%YAML'):
         document = parse_yaml(text.lstrip().partition('\n')[2], where, LensError)
+    elif text.lstrip().startswith('{'):
+        document = parse_json(text, where, LensError)
     else:
         document = _from_xml(text, where)
 
