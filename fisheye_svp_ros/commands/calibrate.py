@@ -17,14 +17,6 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
-UNITS = {  # of the parameters of a lens; 1 where there is none
-    **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
-    **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
-    **dict.fromkeys(('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y',
-                     'port_z'), 'm'),
-    **dict.fromkeys(('port_tilt_x', 'port_tilt_y'), 'rad'),
-}
-_HUGE = 20.0  # m; a target larger than this was measured in other units
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 
 # Matrices are small for BLAS: more threads than one wait for each other.
@@ -107,9 +99,7 @@ def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> tuple[Calibration, Observations]:
     """Return the lens and the rows that it is of: those that are no gross errors."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import note_gross_errors, say
+    from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge
     from fisheye_svp_ros.commands.ports import port_of
     from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
     from fisheye_svp_ros.io.lens_files import load_lens
@@ -117,9 +107,7 @@ def _calibrated(
     from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
 
     port = port_of(args)
-    across = float(np.ptp(table.xyz, axis=0).max())
-    if across > _HUGE:
-        say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
+    note_huge(table)
     air = load_lens(args.lens) if args.lens else None
 
     def fitted(rows: Observations) -> Calibration:
@@ -247,7 +235,13 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
 def _print(result: Calibration, trust: Trust) -> None:
     import numpy as np
 
-    from fisheye_svp_ros.reporting.tables import interval, noise_text, print_table, with_error
+    from fisheye_svp_ros.reporting.tables import (
+        UNITS,
+        interval,
+        noise_text,
+        print_table,
+        with_error,
+    )
 
     lens = result.adjusted.lens
     figures = lens.calibration or {}

@@ -130,11 +130,12 @@ def _read(
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.commands.lenses import lenses_of
-    from fisheye_svp_ros.commands.notes import note_left_out
+    from fisheye_svp_ros.commands.notes import note_huge, note_left_out
     from fisheye_svp_ros.commands.photographs import check_sizes, measured, sizes_beside
     from fisheye_svp_ros.diagnosis.inputs import posable
 
     table, sizes = measured(path, args)
+    note_huge(table)
     lenses = lenses_of(table.cameras, given)
     check_sizes(path, sizes or sizes_beside(Path(path)), lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations
 
 _SHOWN = 10
+_HUGE = 20.0  # m; a target larger than this was measured in other units
 
 
 def say(note: str) -> None:
@@ -34,6 +35,13 @@ def note_left_out(frames: Sequence[int]) -> None:
         more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
         say(f'left out, since their points do not fix a pose (all near one line, or of '
             f'another lens?): frames {names}{more}')
+
+
+def note_huge(table: Observations) -> None:
+    """Ask for the unit of a target that is larger than targets are."""
+    across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
+    if across > _HUGE:
+        say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
 
 
 def note_gross_errors(table: Observations, gross: Gross) -> None:

@@ -42,7 +42,6 @@ def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
     import numpy as np
 
-    from fisheye_svp_ros.commands.calibrate import UNITS
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.diagnosis.plan import plan
     from fisheye_svp_ros.effects.forward import ForwardModel
@@ -50,7 +49,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.readers import write_poses
     from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting import shot_list
-    from fisheye_svp_ros.reporting.tables import print_table
+    from fisheye_svp_ros.reporting.tables import UNITS, print_table
 
     if args.count < 1 or not args.noise > 0:
         raise ParameterError('--count and --noise must be above 0')

@@ -16,7 +16,7 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.target_map import board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.reporting.tables import with_error
+from fisheye_svp_ros.reporting.tables import UNITS, with_error
 
 EXTENDED = 'extended_lens.yaml'
 VERDICTS = {
@@ -270,10 +270,12 @@ def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
 
 
 def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:
-    """Yield each free intrinsic before and after, with its standard error."""
+    """Yield each free intrinsic and its unit, before and after, with its standard error."""
     for name, value in diagnosis.intrinsics.items():
+        unit = UNITS.get(name.rpartition('.')[2])
         yield (
-            name, ' ± '.join(with_error(value.before, value.before_stderr)),
+            f'{name}, {unit}' if unit else name,
+            ' ± '.join(with_error(value.before, value.before_stderr)),
             ' ± '.join(with_error(value.after, value.after_stderr)),
         )
 

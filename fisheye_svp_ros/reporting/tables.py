@@ -11,6 +11,13 @@ from rich.console import Console, JustifyMethod
 from rich.padding import Padding
 from rich.table import Table
 
+UNITS = {  # of the parameters of a lens; 1 where there is none
+    **dict.fromkeys(('f', 'fx', 'fy', 'cx', 'cy'), 'px'),
+    **dict.fromkeys(('s0', 'e0', 'e1', 'e2', 'thickness'), 'm'),
+    **dict.fromkeys(('port_distance', 'port_thickness', 'port_radius', 'port_x', 'port_y',
+                     'port_z'), 'm'),
+    **dict.fromkeys(('port_tilt_x', 'port_tilt_y'), 'rad'),
+}
 _WIDE = 200  # columns where no terminal says how many it has
 _NARROW = 10  # columns that text is broken into at the narrowest
 

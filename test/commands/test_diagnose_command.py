@@ -2,7 +2,9 @@
 
 import json
 import re
+from collections import namedtuple
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,12 +23,12 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
-from fisheye_svp_ros.io.readers import write_observations, write_poses
+from fisheye_svp_ros.io.readers import read_observations, write_observations, write_poses
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
-from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, verdict_sentences
+from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, intrinsic_rows, verdict_sentences
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
@@ -287,14 +289,32 @@ class TestWords:
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
 
 
-def test_views_that_cannot_be_fitted_are_one_line(scene, monkeypatch, capsys):
+@pytest.fixture
+def without_solution(monkeypatch):
+    """Have the equations of a diagnosis no solution."""
     def singular(*_, **__):
         raise np.linalg.LinAlgError('SVD did not converge')
 
     monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnosis.diagnose', singular)
+
+
+def test_views_that_cannot_be_fitted_are_one_line(scene, without_solution, capsys):
     assert run('shift.csv', scene) == 2
     said, = capsys.readouterr().err.strip().splitlines()
     assert 'shift.csv: its views cannot be fitted with this lens' in said
+
+
+def test_landmarks_in_millimetres_are_asked_about(scene, without_solution, capsys):
+    table = read_observations(scene / 'shift.csv')
+    write_observations(scene / 'mm.csv', replace(table, xyz=1000 * table.xyz))
+    assert run('mm.csv', scene) == 2
+    assert 'x, y, z must be in m: are these mm?' in capsys.readouterr().err
+
+
+def test_intrinsics_are_told_with_their_unit():
+    values = namedtuple('Values', 'before before_stderr after after_stderr')(1.0, 0.1, 2.0, 0.1)
+    diagnosis = SimpleNamespace(intrinsics={'left.fx': values, 'k1': values})
+    assert [row[0] for row in intrinsic_rows(diagnosis)] == ['left.fx, px', 'k1']
 
 
 def test_a_single_frame_is_drawn(tmp_path):
