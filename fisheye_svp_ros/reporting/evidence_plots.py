@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.target_map import BoardMap
@@ -28,6 +29,10 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
             color=[AFTER if step.accepted else _REFUSED for step in steps],
         )
         left.set(xlabel='score statistic', title='steps of the search', xscale='log')
+        if steps:  # bars begin at a power of ten, whose names alone have room below them
+            least = min(step.statistic for step in steps)
+            left.set_xlim(left=10.0 ** math.ceil(math.log10(least) - 1))
+        left.xaxis.set_minor_formatter(NullFormatter())
         left.plot([], [], 's', color=AFTER, label='accepted')
         left.plot([], [], 's', color=_REFUSED, label='refused')
         left.legend(loc='lower right', fontsize=8)

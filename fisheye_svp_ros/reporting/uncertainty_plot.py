@@ -26,7 +26,7 @@ def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
             square = part.reshape(-1, 2).mean(axis=-1)
             image = np.sqrt(_cells(uv, square, (lens.width, lens.height)))
             shown = axis.imshow(image, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
-                                cmap='Blues', vmin=0.0)
+                                cmap='Blues', vmin=0.0, vmax=np.nanmax(image) or 1.0)
             figure.colorbar(shown, ax=axis, label='px', shrink=0.8)
             rms = np.sqrt(np.nanmean(square))
             axis.set_title(f'{_TITLES[name]}: {rms:.3g} px', fontsize=9.5)
