@@ -236,6 +236,16 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert '-o FILE' in capsys.readouterr().err
 
 
+def test_command_shows_the_rig_of_calibrate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_rig(RIG, tmp_path / 'rig.yaml')
+    assert cli.main(['lens', str(tmp_path / 'rig.yaml')]) == 0
+    assert 'camera 0 in camera 1 at -150.000, 10.000, 2.000 mm' in capsys.readouterr().out
+    assert cli.main(['localize', 'none.csv', '--lens', str(tmp_path / 'rig.yaml')]) == 2
+    assert 'rig.yaml: it holds a rig and no lens' in capsys.readouterr().err
+
+
 RIG = Pose(rotation_from_vector(np.array([0.02, -0.3, 0.1])), np.array([-0.15, 0.01, 0.002]))
 # How the optical frames of RIG hang on a robot: urdf says xyz and roll, pitch, yaw
 URDF = """<?xml version="1.0"?>

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -38,6 +39,5 @@ def test_no_tick_label_of_the_evidence_covers_another(
               if label.get_text()]
     places = sorted((box.x0, box.x1) for box in labels
                     if left.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= left.bbox.x1 + 1)
-    assert places and all(end < start for (_, end), (start, _) in zip(
-        places, places[1:], strict=False))
+    assert places and all(end < start for (_, end), (start, _) in pairwise(places))
     assert left.get_xlim()[0] < min(statistics)

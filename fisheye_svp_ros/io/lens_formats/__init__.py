@@ -15,8 +15,8 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
-FORMATS = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'boofcv', 'transforms')
-WRITABLE = FORMATS[:-2]
+FORMATS = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'boofcv', 'transforms', 'rig')
+WRITABLE = FORMATS[:-3]
 
 
 class Foreign(NamedTuple):
