@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
@@ -136,7 +136,10 @@ def _read(
 
     table, sizes = measured(path, args)
     note_huge(table)
-    lenses = lenses_of(table.cameras, given)
+    try:
+        lenses = lenses_of(table.cameras, given)
+    except LensError as cause:
+        raise LensError(f'{path}: {cause}') from cause
     check_sizes(path, sizes or sizes_beside(Path(path)), lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = given[''] if one else lenses

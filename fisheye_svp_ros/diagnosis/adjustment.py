@@ -9,14 +9,18 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.cameras import Cameras
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows, is_shared
 from fisheye_svp_ros.effects.forward import ForwardModel, Term
 from fisheye_svp_ros.effects.of_cameras import by_camera
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_step
 from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+
+_TRIED = 5  # rigs that a start is chosen from
 
 
 def start(data: Data, lens: Lens, others: Sequence[Lens] = ()) -> State:
@@ -43,7 +47,7 @@ def start(data: Data, lens: Lens, others: Sequence[Lens] = ()) -> State:
     state = State(identity(data.frames), identity(data.cameras), bare[0], terms, tuple(bare[1:]),
                   labels)
     solved = state.cameras.localize(data.views)
-    rig = _rig(data, solved)
+    rig = _rig(data, state.cameras, solved)
     return replace(state, rig=rig, pose=data.poses or _frame_poses(data, solved, rig))
 
 
@@ -54,8 +58,8 @@ def start_poses(data: Data, trained: State) -> State:
     return fit_poses(data, replace(trained, pose=pose))
 
 
-def _rig(data: Data, solved: Pose) -> Pose:
-    """Return the cameras (C,) in the first one, each from the frame in the middle of all."""
+def _rig(data: Data, model: Cameras, solved: Pose) -> Pose:
+    """Return the cameras (C,) in the first one, each from the frame that suits most others."""
     rig, placed = identity(data.cameras), np.zeros(data.frames, dtype=bool)
     body = identity(data.frames) if data.poses is None else data.poses
     placed[:] = data.poses is not None
@@ -64,8 +68,9 @@ def _rig(data: Data, solved: Pose) -> Pose:
         frames = data.frame_of[mine]
         shared = placed[frames]
         if camera and shared.any():
-            relative = body.take(frames[shared]).inverse().compose(solved.take(mine[shared]))
-            rig.put(camera, relative.take(_middle(relative)))
+            seen, views = body.take(frames[shared]), data.views.take(mine[shared])
+            relative = seen.inverse().compose(solved.take(mine[shared]))
+            rig.put(camera, relative.take(_best(model, views, seen, relative)))
         new = ~shared
         own = solved.take(mine[new]).compose(rig.take([camera] * int(new.sum())).inverse())
         body.put(frames[new], own)
@@ -73,8 +78,20 @@ def _rig(data: Data, solved: Pose) -> Pose:
     return rig
 
 
-def _middle(poses: Pose) -> int:
-    """Return which pose is nearest to all others."""
+def _best(model: Cameras, views: Views, body: Pose, rigs: Pose) -> int:
+    """Return which rig (S,), one from each view and its body (S,), predicts most views best."""
+    count = len(rigs.position)
+
+    def misfit(i: int) -> float:
+        offset = model.offsets(body.compose(rigs.take([i] * count)), views)
+        return float(np.median(np.nanmedian(offset, axis=1)))
+
+    # A far view says little of where its camera stands: among the middle ones images decide.
+    return int(min(_middle(rigs)[:_TRIED].tolist(), key=misfit))
+
+
+def _middle(poses: Pose) -> Index:
+    """Return poses in the order of how near each is to most others."""
     count = len(poses.position)
     far = np.zeros((count, count))
     size = max(float(np.median(np.linalg.norm(poses.position, axis=1))), 1e-9)
@@ -82,7 +99,7 @@ def _middle(poses: Pose) -> int:
         change = poses.difference(poses.take([i] * count))
         far[i] = np.linalg.norm(change[:, 3:], axis=1)
         far[i] += np.linalg.norm(change[:, :3], axis=1) / size
-    return int(np.argmin(np.median(far, axis=1)))
+    return np.argsort(np.median(far, axis=1), kind='stable')
 
 
 def _frame_poses(data: Data, solved: Pose, rig: Pose) -> Pose:

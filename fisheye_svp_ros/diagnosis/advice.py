@@ -10,10 +10,12 @@ import numpy as np
 from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.measured import Measured
-from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW
+from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW, Gross
 from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
+from fisheye_svp_ros.scene.observations import Observations
 
+LOOK = 'look at these'
 _STANDS_OUT = 2.0  # times the typical one
 _MOST = 8
 
@@ -50,6 +52,17 @@ def advise(
     if any(part.stage == 'target' for part in parts):
         advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
     advice += _frames(found)
+    advice += _set_aside(found.evidence.linear.data.observations, found.gross)
+    if measured.test is not None:
+        table = measured.test.observations
+        advice += _set_aside(table, measured.test_gross, 'held-out ')
+        if measured.test_moved:
+            advice.append(Advice(
+                f'{LOOK} held-out photographs: their cameras do not stand as in the others, so '
+                'that each view was posed by itself; was the rig touched, are the cameras '
+                'exchanged, are photographs of one moment numbered alike, and the points from the '
+                'same end?',
+                frames=_seen_by_several(table)))
     advice += [
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
         if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
@@ -84,7 +97,7 @@ def _local(measured: Measured, gain: float) -> list[Advice]:
 
 
 def _frames(found: Found) -> list[Advice]:
-    """Return the frames that scatter more than the others, and views that are off as a whole."""
+    """Return the frames that scatter more than the others."""
     data = found.evidence.linear.data
     squares = standardised_squares(found.fitted)
     used = found.evidence.linear.used
@@ -98,10 +111,19 @@ def _frames(found: Found) -> list[Advice]:
             'take these photographs again: they scatter more than the others',
             frames=[int(numbers[i]) for i in order],
         ))
-    gross = found.gross
-    for reason in (VIEW, FRAME):
-        off = sorted({int(data.observations.frame[row]) for row, why in
-                      zip(gross.rows, gross.why, strict=True) if why == reason})
-        if off:
-            advice.append(Advice('look at these photographs: ' + reason, frames=off))
     return advice
+
+
+def _set_aside(table: Observations, gross: Gross, where: str = '') -> list[Advice]:
+    """Return the frames of which whole views are gross errors, by reason."""
+    off = {reason: sorted({int(table.frame[row]) for row, why in
+                           zip(gross.rows, gross.why, strict=True) if why == reason})
+           for reason in (VIEW, FRAME)}
+    return [Advice(f'{LOOK} {where}photographs: {reason}', frames=frames)
+            for reason, frames in off.items() if frames]
+
+
+def _seen_by_several(table: Observations) -> list[int]:
+    views = np.unique(np.stack([table.frame, table.camera]), axis=1)
+    frames, count = np.unique(views[0], return_counts=True)
+    return [int(frame) for frame in frames[count > 1]]

@@ -88,6 +88,11 @@ class Cameras:
             found.put(rows, localize(model, views.take(rows), near).pose)
         return found
 
+    def offsets(self, pose: Pose, views: Views) -> Array:
+        """Distances (S, N) of points from their predictions, px; NaN: padding; inf: unseen."""
+        distance = np.linalg.norm(views.uv - self.linearise(pose, views).uv, axis=-1)
+        return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
+
     def scene(self, pose: Pose, views: Views, seen: Seen) -> Scene:
         """Return what effects may look at once the views are linearised."""
         parts = tuple(

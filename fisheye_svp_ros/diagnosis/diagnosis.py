@@ -13,12 +13,12 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
-from fisheye_svp_ros.diagnosis.inputs import free_names, rig_lenses, thinned
+from fisheye_svp_ros.diagnosis.inputs import free_names, of_rig, rig_lenses, thinned
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import Linearised, State, prepare
-from fisheye_svp_ros.diagnosis.moments import each_alone, loose, unrelated
+from fisheye_svp_ros.diagnosis.moments import each_alone, few_shared, loose, unrelated
 from fisheye_svp_ros.diagnosis.noise import (
     find_gross_errors,
     quantisation_step,
@@ -34,7 +34,6 @@ from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.of_cameras import camera_terms
-from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -137,9 +136,8 @@ def diagnose(
     lenses = rig_lenses(observations, lens)
     free = free_names(lenses, free_intrinsics)
     first, *others = lenses.values()
-    if held_out is not None and others and held_out.cameras != observations.cameras:
-        raise ObservationError(f'{held_out.source}: its cameras are not those of the rig, '
-                               + ', '.join(observations.cameras))
+    if held_out is not None:
+        held_out = of_rig(held_out, observations.cameras)
     wanted = wanted or Wanted()
     if wanted.quick:
         observations = thinned(observations)
@@ -151,7 +149,7 @@ def diagnose(
         simulated = start(everything, first, others)
     data, gross = find_gross_errors(everything, simulated)
     base = fit(data, start(data, first, others), free)
-    if loose(data, (first, *others), base, free):
+    if few_shared(data) or loose(data, (first, *others), base, free):
         data = each_alone(data)
         base = fit(data, start(data, first, others), free)
     step = quantisation_step(observations.uv)
@@ -195,7 +193,7 @@ def _judged(
     )
     remaining = with_outliers(remaining, found.gross, len(observations))
     gross = gross_rows(observations, found.gross)
-    if held_out is not None and measured.test_gross is not None:
+    if held_out is not None:
         gross += gross_rows(held_out, measured.test_gross, 'held out: ')
     return Diagnosis(
         verdict=_verdict(causes, remaining),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,6 +30,21 @@ def rig_lenses(observations: Observations, lens: Lens | Mapping[str, Lens]) -> d
     if missing:
         raise ObservationError(f'{observations.source}: camera {missing[0]!r} has no lens')
     return {name: lens[name] for name in observations.cameras}
+
+
+def of_rig(table: Observations, cameras: tuple[str, ...]) -> Observations:
+    """Return other observations of a rig with its cameras in the order of these.
+
+    Raises ObservationError where they are of other cameras.
+    """
+    if len(cameras) == 1:
+        return table
+    if set(table.cameras) != set(cameras):
+        held = ', '.join(filter(None, table.cameras)) or 'one without a name'
+        raise ObservationError(f'{table.source}: its cameras ({held}) are not those of the rig, '
+                               + ', '.join(cameras))
+    order = np.array([cameras.index(name) for name in table.cameras])
+    return replace(table, cameras=cameras, camera=order[table.camera])
 
 
 def free_names(lenses: Mapping[str, Lens], free: bool | None = None) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start_poses
+from fisheye_svp_ros.diagnosis.adjustment import fit, start_poses
 from fisheye_svp_ros.diagnosis.budget import (
     Component,
     budget,
@@ -22,8 +22,8 @@ from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.medium import Medium
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
-from fisheye_svp_ros.diagnosis.moments import each_alone, posed_alone
-from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
+from fisheye_svp_ros.diagnosis.moments import each_alone, stands_elsewhere, without_rig
+from fisheye_svp_ros.diagnosis.noise import NO_GROSS, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import (
     Gain,
     HeldOut,
@@ -74,15 +74,19 @@ class Measured:
         self.names = [effect.name for effect, _, _ in found.causes]
         self.local: Local = local_offsets(found.fitted)
         self.test: Data | None = None
-        self.test_gross: Gross | None = None
+        self.test_gross = NO_GROSS
+        self.test_moved = False
         if held_out is not None:
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
-            if posed_alone(found.evidence.linear.data):
+            if without_rig(found.evidence.linear.data):
                 test = each_alone(test)
-            solved = start_poses(test, self._there(test, found.state))
-            self.test, self.test_gross = find_gross_errors(test, solved)
-            self.test_pose = fit_poses(self.test, solved).pose
+            state = self._there(test, found.state)
+            self.test, self.test_gross = find_gross_errors(test, start_poses(test, state))
+            if stands_elsewhere(self.test, state):
+                self.test_moved, test = True, each_alone(test)
+                self.test, self.test_gross = find_gross_errors(test, start_poses(test, state))
+            self.test_pose = start_poses(self.test, state).pose
 
     @cached_property
     def errors(self) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.adjustment import fit, start, start_poses
 from fisheye_svp_ros.diagnosis.inputs import free_names
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.noise import between_cameras
@@ -18,6 +18,7 @@ from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
 from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.optics.lens import Lens
 
+FEWEST = 5  # frames that two cameras saw: of fewer, the others hardly predict one by the rig
 _UNRELATED = 0.05  # of the image, by which most frames contradict a rig: none is there
 _LOOSE = 2.0  # times the misfit that each camera has by itself: they do not stand still
 _EXPLAINED = 1.1  # times that misfit, if an effect of a rig is all that moves them
@@ -32,6 +33,27 @@ def posed_alone(data: Data) -> bool:
     """Whether there are frames of several cameras that `each_alone` has taken apart."""
     views = len(data.views.frame)
     return data.frames == views > len(np.unique(data.views.frame))
+
+
+def without_rig(data: Data) -> bool:
+    """Whether no frame has several views, so that nothing says how the cameras stand."""
+    return data.frames == len(data.views.frame)
+
+
+def few_shared(data: Data) -> bool:
+    """Whether several cameras saw so few frames that what they say of a rig is no measure."""
+    shared = int((np.bincount(data.frame_of) > 1).sum())
+    return data.cameras > 1 and data.poses is None and shared < FEWEST
+
+
+def stands_elsewhere(test: Data, state: State) -> bool:
+    """Whether the cameras do not stand as in a state fitted to other frames."""
+    if without_rig(test):
+        return False
+    alone = each_alone(test)
+    together, own = (rms_px(Linearised(data, start_poses(data, state), ()))
+                     for data in (test, alone))
+    return together > _LOOSE * own
 
 
 def unrelated(data: Data, state: State) -> bool:
@@ -49,8 +71,7 @@ def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) 
 
     lenses: as they were given; base: the fit of the data as a rig's.
     """
-    shared = len(data.frame_of) > data.frames
-    if data.cameras < 2 or data.poses is not None or not shared:
+    if data.poses is not None or without_rig(data):
         return False
     alone = each_alone(data)
 

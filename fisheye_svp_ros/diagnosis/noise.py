@@ -25,7 +25,7 @@ VIEW = 'the whole view is off: its points may be in another order'
 FRAME = 'its cameras contradict each other: points in another order, or another moment'
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
 _FRAME = 6.0  # times the median frame: cameras that contradict each other
-_FEW_TORN = 0.4  # of the views, at most
+_FEW_TORN = 0.5  # of the views that another camera can contradict: a minority
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _SETTLED = 0.1  # of the scale: how little predictions may move
@@ -82,14 +82,14 @@ def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
     views, pose = data.views, state.view_poses(data)
     alone = model.localize(views) if data.cameras > 1 else pose
     unsure = _unsure(views)
-    scale, offset = _scale(views, _offset(model, pose, views) / unsure)
+    scale, offset = _scale(views, model.offsets(pose, views) / unsure)
     if np.nanmax(offset / scale) > _SUSPECT:
         for _ in range(_ROUNDS):
             before = offset
             fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
             weight = np.where(views.used, views.weight * fading, 0.0)
             alone = pose = model.localize(views._replace(weight=weight), pose)
-            scale, offset = _scale(views, _offset(model, pose, views) / unsure)
+            scale, offset = _scale(views, model.offsets(pose, views) / unsure)
             with np.errstate(invalid='ignore'):  # what is out of sight stays so
                 change = np.nanmax(np.abs(offset - before) / scale)
             if change < _SETTLED:
@@ -127,7 +127,10 @@ def _torn_frames(
     several = np.isfinite(misfit)
     usual = float(np.median(misfit[several])) if several.any() else 0.0
     torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
-    return np.asarray(torn & (torn.mean() < _FEW_TORN)), apart
+    # Of two views that contradict each other either may be wrong.
+    borne_out = np.bincount(data.frame_of, several & ~torn)[data.frame_of] > 1
+    torn |= several & ~borne_out & np.isin(data.frame_of, data.frame_of[torn])
+    return np.asarray(torn & (torn.sum() < _FEW_TORN * several.sum())), apart
 
 
 def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array]:
@@ -147,7 +150,7 @@ def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array
         other = np.arange(len(views.frame))
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
-        offset = _offset(model, body.take(other).compose(place), views)
+        offset = model.offsets(body.take(other).compose(place), views)
         median = np.nanmedian(np.where(np.isinf(offset), 1e9, offset), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
         apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
@@ -182,12 +185,6 @@ def outlying(
     mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
     px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
     return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
-
-
-def _offset(model: Cameras, pose: Pose, views: Views) -> Array:
-    """Distances (S, N) of the points from their predictions, px; NaN for padding."""
-    distance = np.linalg.norm(views.uv - model.linearise(pose, views).uv, axis=-1)
-    return np.where(views.used, np.nan_to_num(distance, nan=np.inf), np.nan)
 
 
 def _unsure(views: Views) -> Array:

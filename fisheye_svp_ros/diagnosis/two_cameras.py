@@ -27,7 +27,7 @@ from fisheye_svp_ros.diagnosis.carried import (
 )
 from fisheye_svp_ros.diagnosis.known_truth import Compared, compared
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
-from fisheye_svp_ros.diagnosis.moments import posed_alone
+from fisheye_svp_ros.diagnosis.moments import FEWEST, posed_alone
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import Found
@@ -36,7 +36,6 @@ from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 
-_FEWEST = 5  # frames of a camera, or of both
 _ALIKE = 6  # landmarks, the fewest that two maps are compared by
 
 
@@ -60,7 +59,8 @@ class TwoCameras:
     target: its shape found by one, tried on the other; rig: translation_m and rotation_rad, mean
     distance of a frame's rig from the middle of all, before and after; withdrawn: the causes that
     were given up because the two contradict each other; posed_alone: whether each view was posed
-    by itself, since the two did not keep their places, or were not photographed together.
+    by itself, since the two did not keep their places, were not photographed together, or saw
+    too few frames together.
     """
 
     cameras: tuple[str, str]
@@ -129,7 +129,7 @@ def two_cameras(found: Found, free: Sequence[str]) -> list[TwoCameras]:
     data = found.evidence.linear.data
     known = KnownTarget.of(data.views)
     cameras = [_alone(found, free, camera, known) for camera in range(data.cameras)
-               if (data.camera_of == camera).sum() >= _FEWEST]
+               if (data.camera_of == camera).sum() >= FEWEST]
     alone = posed_alone(data)
     return [replace(_compared(one, other, known), posed_alone=alone)
             for one, other in combinations(cameras, 2)]
@@ -211,7 +211,7 @@ def _scatter(
     """Compare how the rig scatters that each frame gives, before and after."""
     shared, first, second = np.intersect1d(
         data[0].views.frame, data[1].views.frame, return_indices=True)
-    if len(shared) < _FEWEST:
+    if len(shared) < FEWEST:
         return {}
     before, after = (
         deviations(one.take(first).inverse().compose(other.take(second)))

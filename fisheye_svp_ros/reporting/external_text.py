@@ -81,12 +81,12 @@ def _agreement(pair: TwoCameras) -> str:
 
 
 def _rig(pair: TwoCameras) -> str:
+    if not pair.rig:
+        return '; too few frames were seen by both to say how their rig scatters'
     if pair.posed_alone:
         return _ALONE
     if pair.verdict in ('nothing', 'contradict'):
         return ''
-    if not pair.rig:
-        return '; too few frames were seen by both to say how their rig scatters'
     said = []
     for label, before, after, less in _rig_rows(pair.rig):
         said.append(f'{label} {before} before and {after} after ({less} less)')

@@ -17,9 +17,11 @@ from fisheye_svp_ros.diagnosis.moments import loose
 from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.rig_files import load_rig
+from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
 
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
@@ -132,3 +134,79 @@ def test_a_wrong_lens_is_no_rig_that_moves():
     data = prepare(seen.table)
     base = fit(data, start(data, left, [right]), ())
     assert not loose(data, (left, right), base, ())
+
+
+def few_shared(seen, count):
+    """Return the table with the first of the frames that both saw, and which these are."""
+    table = seen.table
+    both = np.intersect1d(*(table.frame[table.camera == i] for i in (0, 1)))
+    own = (table.camera == 1) & np.isin(table.frame, both[count:])
+    return replace(table, frame=table.frame + 1000 * own), both[:count].tolist()
+
+
+def reversed_in(table, frames):
+    """Return the table with the right camera's points of some frames numbered from the end."""
+    turned = np.isin(table.frame, frames) & (table.camera == 1)
+    places = table.landmarks()
+    landmark = np.where(turned, places.ids.max() - table.landmark, table.landmark)
+    return replace(table, landmark=landmark, xyz=places.points[landmark])
+
+
+def torn_frames(found, where=''):
+    return sorted({one['frame'] for one in found.gross if one['why'] == where + FRAME})
+
+
+@pytest.mark.parametrize('seed, which', [(2, 1), (4, 0)])
+def test_one_of_three_shared_frames_is_reversed(seed, which):
+    # In seed 2 the pose of one view is far less certain than the others'.
+    seen = pair(replace(SMALL, bend=1e-3, columns=9, rows=6, frames=24, reversed_frames=0), seed)
+    table, shared = few_shared(seen, 3)
+    found = diagnose(reversed_in(table, shared[which]), seen.lenses, wanted=Wanted(quick=True))
+    assert torn_frames(found) == [shared[which]]
+    # Two frames say too little of the rig for one to predict the other.
+    assert found.named.heldout_rms_px < 0.13 < found.base.heldout_rms_px < 0.21
+    (said,) = found.cameras
+    assert said.verdict == 'agree' and not said.rig
+    assert f'(frame {shared[which]})' in verdict_sentences(found)[2]
+
+
+def halves(seen):
+    """Return the two halves of a pair's frames as tables."""
+    later = seen.table.frame >= np.median(seen.table.frames)
+    return seen.table.take(~later), seen.table.take(later)
+
+
+@pytest.fixture(scope='module')
+def longer():
+    return pair(replace(SMALL, frames=32, reversed_frames=0), 1)
+
+
+def test_reversed_frames_among_those_held_out_are_named(longer):
+    train, test = halves(longer)
+    shared = np.intersect1d(*(test.frame[test.camera == i] for i in (0, 1)))[:2].tolist()
+    found = diagnose(train, longer.lenses, held_out=reversed_in(test, shared),
+                     wanted=Wanted(quick=True))
+    assert torn_frames(found, 'held out: ') == shared
+    assert found.named.heldout_rms_px < 0.16
+    assert f'(frames {shared[0]} and {shared[1]})' in verdict_sentences(found)[2]
+
+
+def test_held_out_frames_in_which_the_rig_stands_elsewhere_are_posed_view_by_view(longer):
+    train, test = halves(longer)
+    late = replace(test, frame=test.frame + test.camera)
+    found = diagnose(train, longer.lenses, held_out=late, wanted=Wanted(quick=True))
+    assert found.named.heldout_rms_px < 0.16
+    assert 'do not stand as in the others' in verdict_sentences(found)[2]
+
+
+def test_a_rig_that_was_not_seen_predicts_nothing_in_held_out_frames(longer):
+    train, test = halves(longer)
+    apart, _ = few_shared(longer._replace(table=train), 0)
+    # The right camera's rows come first.
+    test = test.take(np.argsort(-test.camera, kind='stable'))
+    test = replace(test, cameras=('right', 'left'), camera=1 - test.camera)
+    found = diagnose(apart, longer.lenses, held_out=test, wanted=Wanted(quick=True))
+    assert found.named.heldout_rms_px < 0.16
+    assert not any('held-out' in advice.what for advice in found.advice)
+    with pytest.raises(ObservationError, match='cam0, right'):
+        diagnose(train, longer.lenses, held_out=replace(test, cameras=('cam0', 'right')))
