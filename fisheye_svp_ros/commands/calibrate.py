@@ -167,11 +167,14 @@ def _rig(
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
+    import numpy as np
+
     from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.diagnosis.moments import FEWEST, LOOSE
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.io.rig_files import save_rig
     from fisheye_svp_ros.scene.observations import stereo_views
-    from fisheye_svp_ros.solve.measured import sigma_known
+    from fisheye_svp_ros.solve.measured import rms_px, sigma_known
     from fisheye_svp_ros.study.solutions import calibrated
 
     left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
@@ -184,9 +187,18 @@ def _rig(
     fitted, reason = found.solution, found.reasons[0]
     if reason and sigma_known(both):
         say(f'rig: {reason}')
+    frames, rms = len(both.frames), rms_px(np.concatenate(
+        [residual.reshape(-1, 2) for residual in (fitted.left_residual, fitted.right_residual)]))
+    own = max((results[name].adjusted.lens.calibration or {})['rms_px'] for name in names)
+    if rms > LOOSE * own:
+        say(f'rig: with it {rms:.2f} px are left, where the cameras alone leave {own:.2f} px at '
+            'most: they moved, were not photographed at the same moments, or a lens is wrong')
+    if frames < FEWEST:
+        say(f'rig: {frames} of the frames alone show it; photograph the target with both cameras '
+            'at once more often')
     place = 1000 * fitted.rig.position[0]
     print(f'rig: camera {names[0]} in {names[1]} at {place[0]:.3f}, {place[1]:.3f}, '
-          f'{place[2]:.3f} mm, from {len(both.frames)} frames')
+          f'{place[2]:.3f} mm, from {frames} frames, rms {rms:.4f} px')
     if folder:
         save_rig(fitted.rig.take(0), folder / 'rig.yaml', names)
 
@@ -223,7 +235,8 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
     if unrelated(data, state):
         raise ObservationError(
             f'{observations.source}: none explains where {" and ".join(lenses)} stand in most '
-            'frames; photographs of one moment must have one frame number, others different ones')
+            'frames; photographs of one moment must have one frame number, others different ones, '
+            'and points be numbered from the same end')
     _, gross = find_gross_errors(data, state)
     torn = sorted({int(both.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
                    if why == FRAME})

@@ -19,8 +19,8 @@ from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.optics.lens import Lens
 
 FEWEST = 5  # frames that two cameras saw: of fewer, the others hardly predict one by the rig
-_UNRELATED = 0.05  # of the image, by which most frames contradict a rig: none is there
-_LOOSE = 2.0  # times the misfit that each camera has by itself: they do not stand still
+_UNRELATED = 0.05  # of the image, by which half of the views contradict a rig: none is there
+LOOSE = 2.0  # times the misfit that each camera has by itself: they do not stand still
 _EXPLAINED = 1.1  # times that misfit, if an effect of a rig is all that moves them
 
 
@@ -53,7 +53,7 @@ def stands_elsewhere(test: Data, state: State) -> bool:
     alone = each_alone(test)
     together, own = (rms_px(Linearised(data, start_poses(data, state), ()))
                      for data in (test, alone))
-    return together > _LOOSE * own
+    return together > LOOSE * own
 
 
 def unrelated(data: Data, state: State) -> bool:
@@ -63,7 +63,8 @@ def unrelated(data: Data, state: State) -> bool:
     misfit, _ = between_cameras(data, state, state.cameras.localize(data.views))
     several = np.isfinite(misfit)
     extent = float(np.ptp(data.views.uv[data.views.used], axis=0).max())
-    return bool(several.any() and np.median(misfit[several]) > _UNRELATED * extent)
+    return bool(several.any() and
+                np.quantile(misfit[several], 0.5, method='higher') > _UNRELATED * extent)
 
 
 def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) -> bool:
@@ -80,13 +81,13 @@ def loose(data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]) 
         return rms_px(Linearised(data, together, ())), rms_px(Linearised(alone, posed, ()))
 
     whole, own = misfits(free, base)
-    if whole < _LOOSE * own:
+    if whole < LOOSE * own:
         return False
     # Lenses that are wrong look like a rig that moves: they get what they want first.
     every = free_names(dict(zip(base.labels, lenses, strict=True)), True)
     base = fit(data, base, every)
     whole, own = misfits(every, base)
-    if whole < _LOOSE * own:
+    if whole < LOOSE * own:
         return False
     scene = Linearised(data, base, ()).scene
     for kind in (RigFlexEffect, StereoTimeOffsetEffect):

@@ -22,7 +22,8 @@ _SUSPECT = 6.0  # below this no point is worth a robust fit
 SWAPPED = 'it lies where another landmark is predicted'
 FAR = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
-FRAME = 'its cameras contradict each other: points in another order, or another moment'
+FRAME = ('its cameras contradict each other: points in another order, another moment, or cameras '
+         'exchanged')
 _VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
 _FRAME = 6.0  # times the median frame: cameras that contradict each other
 _FEW_TORN = 0.5  # of the views that another camera can contradict: a minority
@@ -125,7 +126,7 @@ def _torn_frames(
         return np.zeros(len(data.frame_of), dtype=bool), np.zeros(data.views.used.shape)
     misfit, apart = between_cameras(data, state, alone)
     several = np.isfinite(misfit)
-    usual = float(np.median(misfit[several])) if several.any() else 0.0
+    usual = float(np.quantile(misfit[several], 0.5, method='lower')) if several.any() else 0.0
     torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
     # Of two views that contradict each other either may be wrong.
     borne_out = np.bincount(data.frame_of, several & ~torn)[data.frame_of] > 1

@@ -101,6 +101,49 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     assert np.abs(np.linalg.norm(place) - 0.1205) < 0.003
 
 
+def few_shared(seen, count):
+    """Return the table with the first of the frames that both saw, and which these are."""
+    table = seen.table
+    both = np.intersect1d(*(table.frame[table.camera == i] for i in (0, 1)))
+    own = (table.camera == 1) & np.isin(table.frame, both[count:])
+    return replace(table, frame=table.frame + 1000 * own), both[:count].tolist()
+
+
+def reversed_in(table, frames):
+    """Return the table with the right camera's points of some frames numbered from the end."""
+    turned = np.isin(table.frame, frames) & (table.camera == 1)
+    places = table.landmarks()
+    landmark = np.where(turned, places.ids.max() - table.landmark, table.landmark)
+    return replace(table, landmark=landmark, xyz=places.points[landmark])
+
+
+def calibrated_rig(folder, table):
+    write_observations(folder / 'rig.csv', table)
+    assert cli.main(['calibrate', str(folder / 'rig.csv'), '--image-size',
+                     'left=1280x960,right=1024x768', '-o', str(folder / 'rig')]) == 0
+    return folder / 'rig' / 'rig.yaml'
+
+
+def test_a_rig_that_half_of_the_frames_contradict_is_none(tmp_path, capsys):
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    table, shared = few_shared(seen, 6)
+    assert not calibrated_rig(tmp_path, reversed_in(table, shared[::2])).exists()
+    said = capsys.readouterr().err
+    assert 'none explains where left and right stand' in said and 'rig: frames' not in said
+
+
+def test_a_calibrated_rig_says_what_it_rests_on(tmp_path, capsys):
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    assert calibrated_rig(tmp_path, few_shared(seen, 3)[0]).exists()
+    said = capsys.readouterr()
+    assert 'rig: 3 of the frames alone show it' in said.err
+    assert 'mm, from 3 frames, rms 0.' in said.out
+    table = seen.table
+    turned = replace(table, uv=table.uv + 2 * (np.sin(table.frame) * table.camera)[:, None])
+    assert calibrated_rig(tmp_path, turned).exists()
+    assert 'they moved, were not photographed' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('late', [0.002, 0.0])
 def test_cameras_that_were_not_photographed_together(late):
     seen = pair(replace(SMALL, reversed_frames=0, late=late), 1)
@@ -134,22 +177,6 @@ def test_a_wrong_lens_is_no_rig_that_moves():
     data = prepare(seen.table)
     base = fit(data, start(data, left, [right]), ())
     assert not loose(data, (left, right), base, ())
-
-
-def few_shared(seen, count):
-    """Return the table with the first of the frames that both saw, and which these are."""
-    table = seen.table
-    both = np.intersect1d(*(table.frame[table.camera == i] for i in (0, 1)))
-    own = (table.camera == 1) & np.isin(table.frame, both[count:])
-    return replace(table, frame=table.frame + 1000 * own), both[:count].tolist()
-
-
-def reversed_in(table, frames):
-    """Return the table with the right camera's points of some frames numbered from the end."""
-    turned = np.isin(table.frame, frames) & (table.camera == 1)
-    places = table.landmarks()
-    landmark = np.where(turned, places.ids.max() - table.landmark, table.landmark)
-    return replace(table, landmark=landmark, xyz=places.points[landmark])
 
 
 def torn_frames(found, where=''):
