@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.measured import Measured
@@ -15,7 +16,6 @@ from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
 from fisheye_svp_ros.scene.observations import Observations
 
-LOOK = 'look at these'
 _STANDS_OUT = 2.0  # times the typical one
 _MOST = 8
 
@@ -53,15 +53,22 @@ def advise(
         advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
     advice += _frames(found)
     advice += _set_aside(found.evidence.linear.data.observations, found.gross)
-    if measured.test is not None:
+    if measured.test is None:
+        alone = _numbers(found)[~measured.predicted]
+        if len(alone):
+            advice.append(Advice(
+                'take more photographs like these: the others do not predict them, since they '
+                'alone show some of the image, or since something is wrong with them; the '
+                'held-out rms is that of the others', frames=alone.tolist()))
+    else:
         table = measured.test.observations
         advice += _set_aside(table, measured.test_gross, 'held-out ')
         if measured.test_moved:
             advice.append(Advice(
-                f'{LOOK} held-out photographs: their cameras do not stand as in the others, so '
-                'that each view was posed by itself; was the rig touched, are the cameras '
-                'exchanged, are photographs of one moment numbered alike, and the points from the '
-                'same end?',
+                'look at these held-out photographs: their cameras do not stand as in the '
+                'others, so that each view was posed by itself; was the rig touched, are the '
+                'cameras exchanged, are photographs of one moment numbered alike, and the points '
+                'from the same end?',
                 frames=_seen_by_several(table)))
     advice += [
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
@@ -98,11 +105,10 @@ def _local(measured: Measured, gain: float) -> list[Advice]:
 
 def _frames(found: Found) -> list[Advice]:
     """Return the frames that scatter more than the others."""
-    data = found.evidence.linear.data
     squares = standardised_squares(found.fitted)
     used = found.evidence.linear.used
     size = squares.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
-    numbers = data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
+    numbers = _numbers(found)
     bad = size > _STANDS_OUT * np.median(size)
     advice = []
     if bad.any():
@@ -114,12 +120,18 @@ def _frames(found: Found) -> list[Advice]:
     return advice
 
 
+def _numbers(found: Found) -> Index:
+    """Return the numbers (F,) of the frames."""
+    data = found.evidence.linear.data
+    return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
+
+
 def _set_aside(table: Observations, gross: Gross, where: str = '') -> list[Advice]:
     """Return the frames of which whole views are gross errors, by reason."""
     off = {reason: sorted({int(table.frame[row]) for row, why in
                            zip(gross.rows, gross.why, strict=True) if why == reason})
            for reason in (VIEW, FRAME)}
-    return [Advice(f'{LOOK} {where}photographs: {reason}', frames=frames)
+    return [Advice(f'look at these {where}photographs: {reason}', frames=frames)
             for reason, frames in off.items() if frames]
 
 

@@ -36,7 +36,9 @@ class Carried:
 
     @classmethod
     def of(cls, source: str, to: str, without: HeldOut, carried: HeldOut) -> Carried:
-        """Compare two predictions of the same frames."""
+        """Compare two predictions of the same frames, those that the others can predict."""
+        rows = without.predicted | carried.predicted
+        without, carried = without.take(rows), carried.take(rows)
         return cls(source, to, without.rms, carried.rms, less_between(without, carried))
 
     def to_dict(self) -> dict[str, Any]:

@@ -133,6 +133,7 @@ def diagnose(
     causes to take in or leave out; progress: told what is being done, and which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
+    observations.landmarks()  # each is in one place
     lenses = rig_lenses(observations, lens)
     free = free_names(lenses, free_intrinsics)
     first, *others = lenses.values()

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.adjustment import fit, start_poses
 from fisheye_svp_ros.diagnosis.budget import (
     Component,
@@ -103,7 +103,7 @@ class Measured:
     def held_out(self, without: Sequence[str] = (), local: bool = False) -> HeldOut:
         """Predict held-out frames without some causes, with or without local offsets."""
         if self.test is None:
-            return frames_in_turn(self.evidence, without, local)
+            return frames_in_turn(self.evidence, without, local).take(self.predicted)
         if set(without) >= set(self.names):
             state = self.found.base.linear.state
         elif without:
@@ -115,6 +115,13 @@ class Measured:
         return on_other_data(self.test, near, self.local if local else None)
 
     @cached_property
+    def predicted(self) -> Mask:
+        """Which frames (F,) count where each is left out in turn: what any model predicts."""
+        with_causes, without = (
+            frames_in_turn(self.evidence, gone) for gone in ((), self.names))
+        return with_causes.predicted | without.predicted
+
+    @cached_property
     def _base(self) -> HeldOut:
         return self.held_out(self.names)
 
@@ -123,7 +130,7 @@ class Measured:
         if self.medium is None:
             return self._base
         if self.test is None:
-            return self.medium.held_out()
+            return self.medium.held_out().take(self.predicted)
         return on_other_data(self.test, replace(self.medium.air.state, pose=self.test_pose))
 
     @property

@@ -8,13 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.adjustment import fit_poses, moved
 from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.refit import Local
 
 _RESAMPLES = 2000
+_FAR = 5.0  # times the median frame
 
 
 class HeldOut(NamedTuple):
@@ -27,6 +28,16 @@ class HeldOut(NamedTuple):
     def rms(self) -> float:
         """Root mean square of the 2-D residual norm, px."""
         return float(self.rms_of(np.arange(len(self.squares))))
+
+    @property
+    def predicted(self) -> Mask:
+        """Which frames (F,) are not far worse than most: those show what no other frame does."""
+        size = np.sqrt(self.squares / self.counts)
+        return np.asarray(size <= _FAR * np.median(size))
+
+    def take(self, rows: Index | Mask) -> HeldOut:
+        """Return some of the frames."""
+        return HeldOut(self.squares[rows], self.counts[rows])
 
     def rms_of(self, rows: Index) -> Array:
         """Return the rms (...), px, of the frames (..., F) that count."""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import LOOK, Advice
+from fisheye_svp_ros.diagnosis.advice import Advice
 from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -225,7 +225,7 @@ def _next(d: Diagnosis) -> str:
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
         'it until then' for pair in d.cameras if pair.verdict == 'contradict'
     ]
-    steps += [advice_text(one) for one in d.advice if one.what.startswith(LOOK)]
+    steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
