@@ -30,8 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file or a folder of ORPC files; or photographs, '
-                        'with --board')
+                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
+                        'photographs, with --board')
     add_board_arguments(parser)
     parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
                         metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)

@@ -23,8 +23,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from fisheye_svp_ros.commands.photographs import add_board_arguments
 
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file or a folder of ORPC files; or photographs, '
-                        'with --board')
+                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
+                        'photographs, with --board')
     add_board_arguments(parser)
     add_lens_argument(parser)
     parser.add_argument('--model-error', action='store_true',

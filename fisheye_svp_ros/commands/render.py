@@ -47,6 +47,7 @@ def run(args: argparse.Namespace) -> None:
     """Render the photographs, write them and the truth."""
     import numpy as np
 
+    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.io.files import together
     from fisheye_svp_ros.io.lens_files import load_lens
@@ -76,6 +77,9 @@ def run(args: argparse.Namespace) -> None:
     with together():
         write_photographs(lens, boards, poses, Exposure(blur=args.blur, noise=args.noise),
                           args.seed, args.output, args.output)
+    others = len(list(args.output.glob('*.png'))) - len(poses.position)
+    if others:
+        say(f'{args.output}: {others} other photographs are in it, too; `detect` takes them all')
     print(f'{args.output}: {len(poses.position)} photographs, observations.csv with their true '
           'corners, poses.csv')
 

@@ -214,3 +214,15 @@ def test_the_truth_about_a_room(tmp_path: Path) -> None:
                      str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'found')]) == 0
     found, true = (read_poses(tmp_path / name).pose for name in ('found/poses.csv', 'poses.csv'))
     assert np.abs(found.position - true.position).max() < 1e-6
+
+
+def test_photographs_of_before_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(LENS, tmp_path / 'lens.yaml')
+    command = ['render', '--lens', str(tmp_path / 'lens.yaml'), '--board', BOARD,
+               '-o', str(tmp_path / 'out'), '--ranges', '0.1', '0.2', '--count']
+    assert cli.main([*command, '2']) == cli.main([*command, '2']) == 0
+    assert capsys.readouterr().err == ''
+    assert cli.main([*command, '1']) == 0
+    assert 'out: 1 other photographs are in it, too' in capsys.readouterr().err
