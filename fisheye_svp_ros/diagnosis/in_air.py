@@ -27,6 +27,7 @@ _GROWS = 1.25  # from fit to fit: the field whose points are taken in
 _FEWEST = 8  # points of a view
 _LEAST = 1e-8  # eigenvalue of correlations, beside what numbers hold
 _MEDIAN = 0.6745  # of the size of a normal number
+_FAR = 4.0  # standard deviations, rms, that no intrinsics are off
 _INDEX = 0.1  # standard deviation of an index before anything is known of the medium
 
 
@@ -75,12 +76,15 @@ class InAir:
         open_ = spread > (self.focal + _KNOWN) * lens.fx * height
         return float(lens.fx * height[np.argmax(open_)]) if open_.any() else np.inf
 
-    def behind(self, everything: Data, lens: Lens, place: tuple[str, ...], index: str) -> Lens:
+    def behind(
+        self, everything: Data, lens: Lens, place: tuple[str, ...], index: str
+    ) -> Lens | None:
         """Return the lens with the intrinsics that photographs behind its port call for.
 
         They move within what is known of them, beside the port's `place` and the medium's `index`;
         the field whose points are taken in grows, for beyond it nothing is known of the curve.
-        Raises GeometryError where a view cannot be posed.
+        None if they are far from what is known.  Raises GeometryError where a view cannot be
+        posed.
         """
         names, reach = (*place, index, *self.names), self.reach
         while near := self.within(everything, reach):
@@ -91,7 +95,7 @@ class InAir:
             if near.views.used.sum() == everything.views.used.sum():
                 break
             reach *= _GROWS
-        return lens
+        return lens if self.unlikely(lens) < _FAR**2 * len(self.names) else None
 
     def within(self, data: Data, reach: float) -> Data | None:
         """Return the points up to a distance from the principal point, px; None if too few."""

@@ -163,7 +163,7 @@ def _corrected(everything: Data, lens: Lens, known: InAir) -> Lens | None:
     except GeometryError:
         return None
     # What index the lens is found beside need not be that of a liquid: it is asked for anew.
-    return found.with_parameters([INDEX], [MEDIA['water']])
+    return found and found.with_parameters([INDEX], [MEDIA['water']])
 
 
 def _told(

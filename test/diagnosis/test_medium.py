@@ -10,6 +10,8 @@ from helpers.water import AIR, photographs
 from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.in_air import InAir
+from fisheye_svp_ros.diagnosis.medium import INDEX, PLACE
+from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
@@ -104,6 +106,18 @@ def test_an_index_is_no_surer_than_the_focal_length_in_air():
 def test_what_is_no_medium_is_not_called_one(true):
     found = diagnose(photographs(true, true.port, 10), AIR, wanted=Wanted(quick=True))
     assert found.causes and medium_of(found) is None
+
+
+@pytest.mark.parametrize(('true', 'near'), [
+    (replace(AIR, port=PORT), True), (replace(AIR, fx=1.33 * AIR.fx, fy=1.33 * AIR.fy), False),
+], ids=['water', 'focal length'])
+def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
+    stderr = {'fx': 0.02 * AIR.fx, 'fy': 0.02 * AIR.fy, 'cx': 2.0, 'cy': 2.0, 'k1': 0.1}
+    covariance = np.diag(np.square([*stderr.values()])).tolist()
+    known = InAir.of(replace(AIR, calibration={'stderr': stderr, 'covariance': covariance}))
+    data = prepare(photographs(true, true.port, seed=20))
+    wet = known.behind(data, replace(known.lens, port=PORT), PLACE, INDEX)
+    assert (wet is not None) == near
 
 
 def test_a_medium_can_be_ruled_out():
