@@ -13,7 +13,14 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
-from fisheye_svp_ros.diagnosis.inputs import free_names, of_rig, rig_lenses, thinned
+from fisheye_svp_ros.diagnosis.inputs import (
+    check_cameras,
+    check_other,
+    free_names,
+    of_rig,
+    rig_lenses,
+    thinned,
+)
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
@@ -134,11 +141,13 @@ def diagnose(
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     observations.landmarks()  # each is in one place
+    check_cameras(observations)
     lenses = rig_lenses(observations, lens)
     free = free_names(lenses, free_intrinsics)
     first, *others = lenses.values()
     if held_out is not None:
         held_out = of_rig(held_out, observations.cameras)
+        check_other(observations, held_out)
     wanted = wanted or Wanted()
     if wanted.quick:
         observations = thinned(observations)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -16,6 +17,8 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.measured import posable_views
 
+_OUTSIDE = 0.02  # of the points of a camera: more than single gross errors
+_AGAIN = 0.5  # of the image points: no two photographs have so many alike to the last digit
 _MANY, _FEWEST = 1500, 24  # points of a thinned table, and of a view that stays whole
 
 
@@ -47,6 +50,24 @@ def of_rig(table: Observations, cameras: tuple[str, ...]) -> Observations:
     return replace(table, cameras=cameras, camera=order[table.camera])
 
 
+def check_other(observations: Observations, other: Observations) -> None:
+    """Raise ObservationError where most of other observations are these once more."""
+    seen, again = (set(zip(table.landmark.tolist(), *table.uv.T.tolist(), strict=True))
+                   for table in (observations, other))
+    if len(seen & again) > _AGAIN * len(again):
+        raise ObservationError(f'{other.source}: these image points are those of '
+                               f'{observations.source}; other photographs are needed')
+
+
+def check_cameras(observations: Observations) -> None:
+    """Raise ObservationError where two cameras of a rig hold the same image points."""
+    tables = [replace(observations.take(observations.camera == camera),
+                      source=f'{observations.source}, camera {name}')
+              for camera, name in enumerate(observations.cameras)]
+    for one, other in combinations(tables, 2):
+        check_other(one, other)
+
+
 def free_names(lenses: Mapping[str, Lens], free: bool | None = None) -> tuple[str, ...]:
     """Return the intrinsics that are fitted, those of a rig with the camera's name before them.
 
@@ -64,19 +85,29 @@ def posable(
 ) -> tuple[Observations, tuple[int, ...]]:
     """Return the views that fix a pose, and the frames that have others.
 
-    Raises GeometryError where a camera has no view left.
+    Raises GeometryError where a camera has no view left, ObservationError where image points lie
+    outside the images that its lens is of.
     """
-    lenses = rig_lenses(observations, lens)
-    models = [ForwardModel(one) for one in lenses.values()]
+    lenses = list(rig_lenses(observations, lens).values())
+    models = [ForwardModel(one) for one in lenses]
     kept = np.ones(len(observations), dtype=bool)
     left_out: set[int] = set()
     for camera in np.unique(observations.camera):
         mine = observations.camera == camera
-        model = models[int(camera) if len(models) > 1 else 0]
-        _, frames = posable_views(observations.take(mine), model)
+        which = int(camera) if len(models) > 1 else 0
+        _check_inside(observations.take(mine), lenses[which])
+        _, frames = posable_views(observations.take(mine), models[which])
         kept[mine & np.isin(observations.frame, frames)] = False
         left_out.update(frames)
     return observations.take(kept), tuple(sorted(left_out))
+
+
+def _check_inside(observations: Observations, lens: Lens) -> None:
+    outside = (observations.uv < 0) | (observations.uv > (lens.width, lens.height))
+    if outside.any(axis=1).mean() > _OUTSIDE:
+        raise ObservationError(
+            f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '
+            f'of lens {lens.name!r}; is it the lens of this camera?')
 
 
 def thinned(observations: Observations) -> Observations:

@@ -24,6 +24,7 @@ from fisheye_svp_ros.diagnosis.carried import (
 )
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.evidence import bare_evidence
+from fisheye_svp_ros.diagnosis.inputs import check_other
 from fisheye_svp_ros.diagnosis.model import State
 from fisheye_svp_ros.diagnosis.refit import fit_linear, refit
 from fisheye_svp_ros.diagnosis.search import with_effect
@@ -130,6 +131,7 @@ def diagnose_against(
         if len(np.unique(table.camera)) > 1:
             raise ObservationError(f'{table.source}: two data sets of one camera are compared; '
                                    'choose the rows of one camera')
+    check_other(observations, other)
     wanted = wanted or Wanted()
 
     def part(begin: float, end: float, of: str = '') -> Callable[[str, float], None]:

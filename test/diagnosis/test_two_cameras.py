@@ -1,7 +1,7 @@
 """Two cameras that see one bent board say the same of it, and of where they stand."""
 
 import warnings
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -11,10 +11,12 @@ from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.candidates import simplest_form
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.diagnosis.known_truth import known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.moments import loose
 from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
+from fisheye_svp_ros.diagnosis.two_sets import diagnose_against
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
@@ -256,3 +258,26 @@ def test_cameras_must_mean_the_same_place_by_a_landmark(longer):
     off = replace(table, xyz=table.xyz + 0.05 * table.camera[:, None])
     with pytest.raises(ObservationError, match='landmark 0 is said to be in two places'):
         diagnose(off, longer.lenses)
+
+
+def test_the_same_photographs_twice_are_no_witness(longer):
+    train, test = halves(longer)
+    again = replace(train, frame=train.frame + 100, source='again')
+    with pytest.raises(ObservationError, match='again: these image points are those of pair'):
+        diagnose(train, longer.lenses, held_out=again)
+    left = test.take(test.camera == 0)
+    with pytest.raises(ObservationError, match='image points are those of pair'):
+        diagnose_against(left, replace(left, frame=left.frame + 100), longer.lenses['left'])
+    right = replace(left, camera=np.ones_like(left.camera))
+    both = replace(left, **{one.name: np.concatenate([getattr(left, one.name),
+                                                      getattr(right, one.name)])
+                            for one in fields(left) if one.name not in ('cameras', 'source')})
+    with pytest.raises(ObservationError, match='camera right: these image points are those of'):
+        diagnose(both, longer.lenses)
+
+
+def test_lenses_of_another_image_size_are_refused(longer):
+    left, right = longer.lenses.values()
+    with pytest.raises(ObservationError, match='outside the 1024x768 px of lens'):
+        posable(longer.table, {'left': right, 'right': left})
+    assert len(posable(longer.table, longer.lenses)[0]) == len(longer.table)
