@@ -30,6 +30,7 @@ _FEW_TORN = 0.5  # of the views that another camera can contradict: a minority
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _SETTLED = 0.1  # of the scale: how little predictions may move
+_UNSEEN = 1e6  # px, for points out of the field of view: further off than any other
 _ROUNDING = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
@@ -196,8 +197,9 @@ def _unsure(views: Views) -> Array:
 
 def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
     """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
-    median = np.nanmedian(offset, axis=1, keepdims=True)
-    return np.maximum(median, max(np.nanmedian(offset), _ROUNDING)) / _MEDIAN, offset
+    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN), axis=axis, keepdims=True)
+                       for axis in (1, None))
+    return np.maximum(median, np.maximum(typical, _ROUNDING)) / _MEDIAN, offset
 
 
 def _scale_of_landmark(views: Views, offset: Array) -> Array:

@@ -7,14 +7,17 @@ import pytest
 from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
+from fisheye_svp_ros.diagnosis.adjustment import start
 from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.medium import INDEX, PLACE
 from fisheye_svp_ros.diagnosis.model import prepare
+from fisheye_svp_ros.diagnosis.noise import find_gross_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
@@ -138,3 +141,17 @@ def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alon
         found = diagnose(seen, AIR, wanted=Wanted(included=known, quick=True))
         assert medium_of(found) is not None
         assert known == tuple(c.effect for c in found.causes if c.effect == 'session_step')
+
+
+def test_a_view_of_which_half_is_out_of_sight_is_posed_by_the_other_half():
+    """So it may begin behind a port that is not there."""
+    data = prepare(photographs(AIR, None))
+    state = start(data, replace(AIR, port=FlatGlass(0.03, 1.333)))
+    turn = np.tile(np.eye(3), (data.frames, 1, 1))
+    turn[0] = rotation_from_vector(np.radians([0.0, -95.0, 0.0]))
+    away = replace(state, pose=state.pose.compose(Pose(turn, np.zeros((data.frames, 3)))))
+    offset = away.cameras.offsets(away.pose, data.views)
+    assert 0.5 < np.isinf(offset[0]).mean() < 0.9
+    kept, _ = find_gross_errors(data, away)
+    again, _ = find_gross_errors(data, state)
+    np.testing.assert_array_equal(kept.views.used, again.views.used)
