@@ -101,10 +101,11 @@ def run(args: argparse.Namespace) -> None:
                 diagnosis = diagnose(observations, lens, **settings)
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
-        except np.linalg.LinAlgError as cause:
+        except (GeometryError, np.linalg.LinAlgError) as cause:
             raise GeometryError(
-                f'{args.observations}: its views cannot be fitted with this lens; is it that of '
-                'another camera, or of another image size? `localize` says how far each is off'
+                f'{args.observations}: its views cannot be fitted with this lens: {cause}; is it '
+                'that of another camera, or of another image size? `localize` says how far each '
+                'is off'
             ) from cause
         progress('errors where the truth is known', 0.88)
         known = known_errors(diagnosis.before, diagnosis.after, names)

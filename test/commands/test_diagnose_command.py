@@ -21,6 +21,7 @@ from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, write_observations, write_poses
@@ -289,11 +290,12 @@ class TestWords:
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
 
 
-@pytest.fixture
-def without_solution(monkeypatch):
+@pytest.fixture(params=[np.linalg.LinAlgError('SVD did not converge'),
+                        GeometryError('frame 3 has 0 usable points in it')], ids=repr)
+def without_solution(monkeypatch, request):
     """Have the equations of a diagnosis no solution."""
     def singular(*_, **__):
-        raise np.linalg.LinAlgError('SVD did not converge')
+        raise request.param
 
     monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnosis.diagnose', singular)
 
@@ -301,7 +303,7 @@ def without_solution(monkeypatch):
 def test_views_that_cannot_be_fitted_are_one_line(scene, without_solution, capsys):
     assert run('shift.csv', scene) == 2
     said, = capsys.readouterr().err.strip().splitlines()
-    assert 'shift.csv: its views cannot be fitted with this lens' in said
+    assert 'shift.csv: its views cannot be fitted with this lens: ' in said
 
 
 def test_landmarks_in_millimetres_are_asked_about(scene, without_solution, capsys):
