@@ -110,7 +110,8 @@ def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:
             continue
         if not candidate.effect.per_frame:  # that one holds at any size of the variances
             columns = evidence.columns_of(candidate.form)
-            score = evidence.confident(candidate.score, included, columns)
+            score = evidence.confident(
+                candidate.score, included, columns, candidate.effect.of_recording)
             corrected = _corrected(evidence, candidate.effect, score)
             candidate = replace(candidate, score=score, corrected=corrected)
         if candidate.corrected < SIGNIFICANCE:

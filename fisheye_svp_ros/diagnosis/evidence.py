@@ -22,7 +22,13 @@ from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
-from fisheye_svp_ros.diagnosis.reml import GONE, Variances, nothing_random, start_variances
+from fisheye_svp_ros.diagnosis.reml import (
+    GONE,
+    Variances,
+    estimate,
+    nothing_random,
+    start_variances,
+)
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
@@ -156,12 +162,15 @@ class Evidence:
         p = float(special.chdtrc(rank, max(statistic, 0.0))) if rank else 1.0
         return Score(statistic, rank, p, estimate / self.scale[columns], np.inf)
 
-    def confident(self, score: Score, included: Index, columns: Index) -> Score:
+    def confident(
+        self, score: Score, included: Index, columns: Index, varying: bool = False
+    ) -> Score:
         """Return the score with what the uncertainty of the variances does to its p-value.
 
         F test with Satterthwaite's degrees of freedom, of the direction that was estimated; where
         it is not beyond doubt, the likelihood ratio beside a smooth image field, too: the variance
         of one that was too small to be called for says nothing of its uncertainty.
+        varying: whether what columns do changes from frame to frame.
         """
         covariance = self.variances.covariance
         if covariance is None or not score.rank:
@@ -169,17 +178,23 @@ class Evidence:
         freedom = self._freedom(score.estimate * self.scale[columns], included, columns)
         p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
         if p < _DOUBTFUL and score.statistic < _BEYOND_DOUBT:
-            p = max(p, float(special.chdtrc(score.rank, self._beside_fields(included, columns))))
+            gain = self._beside_fields(included, columns, varying)
+            p = max(p, float(special.chdtrc(score.rank, gain)))
         return score._replace(p_value=p, freedom=freedom)
 
-    def _beside_fields(self, included: Index, columns: Index) -> float:
+    def _beside_fields(self, included: Index, columns: Index, varying: bool) -> float:
         """Return the likelihood ratio of columns, whatever the size of a smooth image field.
 
-        Its variance is found with the columns and without them.
+        Its variance is found with the columns and without them.  For what varies in a rig so is
+        what frames have of their own: no pose of a single view takes up most of that there.
         """
         count = self.full.rows - self.full.poses
         without, beside = np.inf, np.inf
-        for logs, information in self.with_field:
+        fields = self.with_field
+        if varying and self.linear.data.cameras > 1:
+            fields = [*fields, *((f.log_determinant, f.information)
+                                 for f in self._frames_anew(included))]
+        for logs, information in fields:
             rest = self.remaining(information, included)
             remaining = rest[-1, -1]
             without = min(without, logs + count * np.log(remaining))
@@ -209,7 +224,8 @@ class Evidence:
     def random_gain(self, included: Index, columns: Index) -> float:
         """Return twice the gain in log likelihood if the coefficients of columns are random.
 
-        Of whatever size, beside what frames have of their own or in place of it.
+        Of whatever size, beside what frames have of their own or in place of it, against what
+        frames may have of their own without the columns.
         """
         count = self.full.rows - self.full.poses
 
@@ -217,17 +233,30 @@ class Evidence:
             rest = self.remaining(information, included)
             return logs + count * float(np.log(rest[-1, -1]))
 
-        f = self.factored
-        return cost(f.log_determinant, f.information) - min(
-            cost(*_integrated(one, columns, 1 / size)) for one in (f, self.without_frames)
-            for size in _TURNS)
+        parts = [self.factored, *self._frames_anew(included)]
+        return min(cost(f.log_determinant, f.information) for f in parts) - min(
+            cost(*_integrated(f, columns, 1 / size)) for f in parts for size in _TURNS)
+
+    def _frames_anew(self, included: Index) -> list[Factored]:
+        """Return the equations with nothing that single frames have of their own, and with all.
+
+        Beside the whole catalogue its effects that change with time take a part of that.
+        """
+        key = included.tobytes()
+        if key not in self._anew:
+            own = np.array([name.startswith('frame_') for name in NAMES])
+            nothing = replace(self.variances, lam=np.where(own, GONE, self.variances.lam))
+            columns = self.border[..., :-1]
+            eq = self.full.bordered(identifiable(self.linear.frame_columns, columns, included))
+            start = np.where(own, start_variances(eq).lam, self.variances.lam)
+            found, _ = estimate(eq, replace(self.variances, lam=start))
+            self._anew[key] = [factored(self.full.trimmed(one.alive), one.lam, one.weight)
+                               for one in (nothing, found)]
+        return self._anew[key]
 
     @cached_property
-    def without_frames(self) -> Factored:
-        """The equations without what single frames have of their own, factored."""
-        own = np.array([name.startswith('frame_') for name in NAMES])
-        lam = np.where(own, GONE, self.variances.lam)
-        return factored(self.equations.trimmed(lam < GONE), lam, self.variances.weight)
+    def _anew(self) -> dict[bytes, list[Factored]]:
+        return {}
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
         info, f = self.factored.information, self.factored

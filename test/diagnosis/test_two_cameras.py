@@ -53,6 +53,14 @@ def test_cameras_that_see_different_boards_contradict_each_other():
     assert 'withdrawn' in sections(found)[0].sentence
 
 
+@pytest.mark.parametrize('seed', [4, 12])
+def test_a_smooth_field_of_each_frame_is_no_rig_that_moves(seed):
+    """No pose takes it up where two cameras share one."""
+    seen = pair(replace(Hidden(), frames=26, rows=6, reversed_frames=0), seed)
+    found = diagnose(seen.table, seen.lenses, free_intrinsics=True)
+    assert not {cause.effect for cause in found.causes} & {'rig_flex', 'session_step'}
+
+
 def test_reversed_frames_are_found_among_cameras_that_fit_badly():
     rough = Hidden((0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25)
     seen = pair(rough, 1)
