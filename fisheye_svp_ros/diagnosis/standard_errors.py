@@ -30,7 +30,8 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
             without, wider, lost = _estimates(part, own)
             changed += np.where(lost, 0.0, (without - estimate) ** 2)
             allowed += np.where(lost, 0.0, wider - variance)
-        variance = variance * np.maximum(changed / np.maximum(allowed, 1e-9 * variance), 1.0)
+        least = np.maximum(1e-9 * variance, 1e-300)  # nothing is known of what the data leave open
+        variance = variance * np.maximum(changed / np.maximum(allowed, least), 1.0)
     errors = np.sqrt(variance) / evidence.scale[: evidence.own]
     return np.where(open_, np.nan, errors)
 

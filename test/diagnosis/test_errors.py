@@ -1,6 +1,7 @@
 """Standard errors, proved by sampling: noise and local errors drawn anew."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,6 +59,16 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
         assert off < 2 * np.hypot(errors, more)[1]
     else:
         assert not more.any()
+
+
+@pytest.mark.filterwarnings('error')
+def test_what_no_frame_tells_of_has_no_error():
+    information = np.diag([0.0, 4.0, 1.0])
+    evidence = SimpleNamespace(
+        own=2, scale=np.ones(2), information=information,
+        in_turn=np.stack([0.9 * information] * 3), linear=SimpleNamespace(
+            data=SimpleNamespace(frames=3)))
+    np.testing.assert_allclose(standard_errors(evidence), [np.nan, 0.5])
 
 
 def test_two_effects_that_hide_each_other_widen_the_errors():
