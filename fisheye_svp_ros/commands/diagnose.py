@@ -132,7 +132,7 @@ def _read(
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.commands.lenses import lenses_of
     from fisheye_svp_ros.commands.notes import note_huge, note_left_out
-    from fisheye_svp_ros.commands.photographs import check_sizes, measured, sizes_beside
+    from fisheye_svp_ros.commands.photographs import check_sizes, measured
     from fisheye_svp_ros.diagnosis.inputs import posable
 
     table, sizes = measured(path, args)
@@ -141,7 +141,7 @@ def _read(
         lenses = lenses_of(table.cameras, given)
     except LensError as cause:
         raise LensError(f'{path}: {cause}') from cause
-    check_sizes(path, sizes or sizes_beside(Path(path)), lenses)
+    check_sizes(path, sizes, lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = given[''] if one else lenses
     observations, left_out = posable(table, lens)

@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
     from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
     from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
-    from fisheye_svp_ros.commands.photographs import check_sizes, sizes_beside
+    from fisheye_svp_ros.commands.photographs import check_sizes
     from fisheye_svp_ros.commands.photographs import measured as read
     from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.reporting.progress import progress
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> None:
     given = load_lenses(args.lens)
     observations, sizes = read(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
-    check_sizes(args.observations, sizes or sizes_beside(Path(args.observations)), lenses)
+    check_sizes(args.observations, sizes, lenses)
     for camera, (name, lens) in enumerate(lenses.items()):
         model, uncertainty = ForwardModel(lens), None
         table = observations.take(observations.camera == camera)

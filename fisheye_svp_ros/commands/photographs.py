@@ -71,7 +71,11 @@ def sizes_beside(path: Path) -> Sizes:
 
 
 def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
-    """Raise LensError where images of a known size are not of the size that their lens has."""
+    """Raise LensError where images are of another size than their lens.
+
+    sizes: as far as they are known from elsewhere than from what `detect` wrote.
+    """
+    sizes = sizes or sizes_beside(Path(path))
     for camera, lens in lenses.items():
         size = sizes.get(camera) or sizes.get('')
         if size and size != (lens.width, lens.height):

@@ -21,7 +21,7 @@ from fisheye_svp_ros.diagnosis.fields import mean_fields
 from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, Design, design
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, Design, design
 from fisheye_svp_ros.diagnosis.reml import (
     GONE,
     Variances,
@@ -33,10 +33,10 @@ from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them fields are tried
+_OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
 _FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
 _TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # the same, of one coefficient of an effect
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
-
 
 Placed = tuple[Effect, Index, Array]  # an effect, its columns among what is shared, its values
 
@@ -192,8 +192,8 @@ class Evidence:
         without, beside = np.inf, np.inf
         fields = self.with_field
         if varying and self.linear.data.cameras > 1:
-            fields = [*fields, *((f.log_determinant, f.information)
-                                 for f in self._frames_anew(included))]
+            fields = [*fields, *((f.log_determinant, f.information) for f in (
+                self.without_frames, self._frames_anew(included)))]
         for logs, information in fields:
             rest = self.remaining(information, included)
             remaining = rest[-1, -1]
@@ -233,30 +233,40 @@ class Evidence:
             rest = self.remaining(information, included)
             return logs + count * float(np.log(rest[-1, -1]))
 
-        parts = [self.factored, *self._frames_anew(included)]
+        parts = [self.factored, self.without_frames, self._frames_anew(included)]
         return min(cost(f.log_determinant, f.information) for f in parts) - min(
             cost(*_integrated(f, columns, 1 / size)) for f in parts for size in _TURNS)
 
-    def _frames_anew(self, included: Index) -> list[Factored]:
-        """Return the equations with nothing that single frames have of their own, and with all.
+    @cached_property
+    def without_frames(self) -> Factored:
+        """The equations without what single frames have of their own, factored."""
+        return self._factored_by(
+            replace(self.variances, lam=np.where(_OF_FRAMES, GONE, self.variances.lam)))
+
+    def _frames_anew(self, included: Index) -> Factored:
+        """Return the equations with all that single frames have of their own, factored.
 
         Beside the whole catalogue its effects that change with time take a part of that.
         """
         key = included.tobytes()
         if key not in self._anew:
-            own = np.array([name.startswith('frame_') for name in NAMES])
-            nothing = replace(self.variances, lam=np.where(own, GONE, self.variances.lam))
-            columns = self.border[..., :-1]
-            eq = self.full.bordered(identifiable(self.linear.frame_columns, columns, included))
-            start = np.where(own, start_variances(eq).lam, self.variances.lam)
-            found, _ = estimate(eq, replace(self.variances, lam=start))
-            self._anew[key] = [factored(self.full.trimmed(one.alive), one.lam, one.weight)
-                               for one in (nothing, found)]
+            eq = self.beside(included)
+            start = np.where(_OF_FRAMES, start_variances(eq).lam, self.variances.lam)
+            self._anew[key] = self._factored_by(
+                estimate(eq, replace(self.variances, lam=start))[0])
         return self._anew[key]
 
     @cached_property
-    def _anew(self) -> dict[bytes, list[Factored]]:
+    def _anew(self) -> dict[bytes, Factored]:
         return {}
+
+    def _factored_by(self, variances: Variances) -> Factored:
+        return factored(self.full.trimmed(variances.alive), variances.lam, variances.weight)
+
+    def beside(self, chosen: Index) -> Equations:
+        """Return the equations of all components with chosen columns as their whole border."""
+        columns = self.border[..., :-1]
+        return self.full.bordered(identifiable(self.linear.frame_columns, columns, chosen))
 
     def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
         info, f = self.factored.information, self.factored
@@ -298,8 +308,7 @@ def finest_called(
 def _all_free(bare: Evidence) -> Equations:
     """Return the equations with what is in the model and the whole catalogue free."""
     chosen = np.concatenate([np.arange(bare.own), bare.own + bare.forms.generic])
-    columns = bare.border[..., :-1]
-    return bare.full.bordered(identifiable(bare.linear.frame_columns, columns, chosen))
+    return bare.beside(chosen)
 
 
 def bare_evidence(

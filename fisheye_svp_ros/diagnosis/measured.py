@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis.budget import (
 )
 from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes
 from fisheye_svp_ros.diagnosis.components import significance
-from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
+from fisheye_svp_ros.diagnosis.evidence import Evidence
 from fisheye_svp_ros.diagnosis.medium import Medium
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.moments import each_alone, stands_elsewhere, without_rig
@@ -230,10 +230,7 @@ class Measured:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""
         evidence = self.evidence
         own = np.arange(evidence.own)
-        eq = evidence.full.bordered(
-            identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
-        )
-        p_values = significance(eq, evidence.variances)
+        p_values = significance(evidence.beside(own), evidence.variances)
         found = {effect.name: drop_test(evidence, own, columns).p_value
                  for effect, columns, _ in self.found.causes}
         parts = budget(evidence, self.found.causes, p_values, found | dict(noise_causes))

@@ -30,7 +30,7 @@ _FEW_TORN = 0.5  # of the views that another camera can contradict: a minority
 _OUTLYING = 0.005  # probability of one such point among clean ones
 _FADE = 2.0
 _SETTLED = 0.1  # of the scale: how little predictions may move
-_UNSEEN = 1e6  # px, for points out of the field of view: further off than any other
+_UNSEEN = 1e9  # px, for points out of the field of view: further off than any other
 _ROUNDING = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN = 1.1774  # of the norm of two standard normal coordinates
 _ROUNDS = 8
@@ -153,9 +153,9 @@ def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
         offset = model.offsets(body.take(other).compose(place), views)
-        median = np.nanmedian(np.where(np.isinf(offset), 1e9, offset), axis=1)
+        median = np.nanmedian(np.minimum(offset, _UNSEEN), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
-        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=1e9), median[mine]
+        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=_UNSEEN), median[mine]
     return misfit, apart
 
 
