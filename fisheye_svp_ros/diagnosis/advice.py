@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis.measured import Measured
 from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW, Gross
 from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.scene.observations import Observations
 
 _STANDS_OUT = 2.0  # times the typical one
@@ -51,6 +52,8 @@ def advise(
         ))
     if any(part.stage == 'target' for part in parts):
         advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
+    if measured.local.views is not None:
+        advice.append(_differ(measured.local.views))
     advice += _frames(found)
     advice += _set_aside(found.evidence.linear.data.observations, found.gross)
     if measured.test is None:
@@ -101,6 +104,15 @@ def _local(measured: Measured, gain: float) -> list[Advice]:
     chosen = [int(measured.local.landmark[i]) for i in order if far[i] > _STANDS_OUT * typical]
     what = 'measure single landmarks: they lie off by more than the others'
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
+
+
+def _differ(views: SimilarViews) -> Advice:
+    """Return what to do where landmarks err alike in similar views."""
+    soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
+    return Advice(
+        f'take photographs that differ from each other: landmarks err alike in those that are '
+        f'alike{soon}, so that more of the same average nothing out; does the paper lie anew each '
+        'time, does light reflect, is something printed near the corners?')
 
 
 def _frames(found: Found) -> list[Advice]:

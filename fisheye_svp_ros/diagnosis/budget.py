@@ -13,8 +13,10 @@ from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, swept
 from fisheye_svp_ros.diagnosis.mixed import factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
+REPEATED = 'frame_similar'
 STAGES = ('lens', 'target', 'frame', 'noise')
 _OF_FRAMES = {'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
               'dot_centroid', 'detector_bias'}
@@ -70,12 +72,12 @@ def _px2(evidence: Evidence) -> float:
 
 def budget(
     evidence: Evidence, named: Sequence[Placed], p_values: Mapping[str, float],
-    causes: Mapping[str, float],
+    causes: Mapping[str, float], repeated: SimilarViews | None = None,
 ) -> list[Component]:
     """Return all parts: of the catalogue (p-values by name), random components, noise.
 
     named: the effects that were found; causes: their p-values; p_values: of the random components
-    that are there.
+    that are there; repeated: what of the noise comes again in similar views.
     """
     px, variances = _px2(evidence), evidence.variances
     traces = component_traces(evidence.full, evidence.variances)
@@ -91,7 +93,11 @@ def budget(
             size = float(variances.tau[i] ** 2 * traces[name]) * px
             parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
     freedom = evidence.full.rows - evidence.full.poses - evidence.own
-    parts.append(('noise', 'noise', variances.sigma**2 * freedom * px, False, 0.0))
+    noise = variances.sigma**2 * freedom * px
+    if repeated is not None:
+        parts.append((REPEATED, 'frame', repeated.share * noise, False, repeated.p_value))
+        noise *= 1 - repeated.share
+    parts.append(('noise', 'noise', noise, False, 0.0))
     total = sum(size for _, _, size, _, _ in parts)
     return [
         Component(name, stage, float(np.sqrt(size / 2)), size / total, known * size / total, p)
@@ -101,7 +107,7 @@ def budget(
 
 def found_components(components: list[Component]) -> list[Component]:
     """Return the random components that are there beyond chance."""
-    held = [c for c in components if c.name in STAGE_OF]
+    held = [c for c in components if c.name in (*NAMES, REPEATED)]
     return [c for c in held if c.p_value * len(NAMES) < SIGNIFICANCE]
 
 

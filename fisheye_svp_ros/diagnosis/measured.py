@@ -35,6 +35,7 @@ from fisheye_svp_ros.diagnosis.prediction import (
 from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, rms_px
 from fisheye_svp_ros.diagnosis.search import Found, drop_test
+from fisheye_svp_ros.diagnosis.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.standard_errors import model_uncertainty, standard_errors
 from fisheye_svp_ros.scene.observations import Observations
 
@@ -70,9 +71,13 @@ class Measured:
     ) -> None:
         self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
         self.evidence = found.evidence
-        self.noise = noise_px(found.evidence)
         self.names = [effect.name for effect, _, _ in found.causes]
-        self.local: Local = local_offsets(found.fitted)
+        self.local: Local = local_offsets(found.fitted)._replace(
+            views=similar_views(found.fitted.linear, conditional_residuals(found.fitted)))
+        views = self.local.views
+        self.noise = noise_px(found.evidence)
+        if views is not None:
+            self.noise *= float(np.sqrt(1 - views.share))
         self.test: Data | None = None
         self.test_gross = NO_GROSS
         self.test_moved = False
@@ -100,7 +105,7 @@ class Measured:
         t, known = (data.observations.t for data in (test, self.evidence.linear.data))
         return replace(state, terms=tuple(e for e in state.terms if e[0].holds_for(t, known)))
 
-    def held_out(self, without: Sequence[str] = (), local: bool = False) -> HeldOut:
+    def held_out(self, without: Sequence[str] = (), local: Local | None = None) -> HeldOut:
         """Predict held-out frames without some causes, with or without local offsets."""
         if self.test is None:
             return frames_in_turn(self.evidence, without, local).take(self.predicted)
@@ -112,7 +117,7 @@ class Measured:
             state = self.found.state
         state = replace(self._there(self.test, state), pose=self.test_pose)
         near = replace(state, rig=self.found.state.rig)
-        return on_other_data(self.test, near, self.local if local else None)
+        return on_other_data(self.test, near, local)
 
     @cached_property
     def predicted(self) -> Mask:
@@ -147,7 +152,7 @@ class Measured:
 
     @cached_property
     def _best(self) -> HeldOut:
-        return self.held_out(local=True)
+        return self.held_out(local=self.local)
 
     @cached_property
     def _lens(self) -> HeldOut:
@@ -200,11 +205,14 @@ class Measured:
         return gain_between(self._simulation, self._best, self.noise)
 
     def gains(self) -> dict[str, Gain]:
-        """Return what the lens alone, and then the target and its offsets, gain."""
+        """Return what the lens alone, all causes, and then offsets of landmarks and image gain."""
+        offsets = self._best
+        if self.local.views is not None:
+            offsets = self.held_out(local=self.local._replace(views=None))
         return {
             'lens': gain_between(self._simulation, self._lens, self.noise),
             'named': gain_between(self._simulation, self._prefixes[-1], self.noise),
-            'local': gain_between(self._prefixes[-1], self._best, self.noise),
+            'local': gain_between(self._prefixes[-1], offsets, self.noise),
         }
 
     def causes(self, components: Sequence[Component]) -> list[Cause]:
@@ -233,7 +241,8 @@ class Measured:
         p_values = significance(evidence.beside(own), evidence.variances)
         found = {effect.name: drop_test(evidence, own, columns).p_value
                  for effect, columns, _ in self.found.causes}
-        parts = budget(evidence, self.found.causes, p_values, found | dict(noise_causes))
+        parts = budget(
+            evidence, self.found.causes, p_values, found | dict(noise_causes), self.local.views)
         return parts if self.medium is None else self.medium.budget(parts)
 
     def _free_errors(self) -> dict[str, float]:

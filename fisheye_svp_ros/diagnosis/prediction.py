@@ -100,10 +100,14 @@ def _ratio(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> Array:
 
 def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldOut:
     """Predict other frames of the same camera and target, from poses in the state."""
-    data = test if local is None else local.applied(test)
     # In px every point counts alike, however noisy it is.
     plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
-    linear = Linearised(data, fit_poses(data, plain), ())
+    data = test if local is None else local.applied(test)
+    fitted = fit_poses(data, plain)
+    if local is not None:
+        data = local.without_repeated(data, replace(fitted, terms=state.terms))
+        fitted = fit_poses(data, fitted)
+    linear = Linearised(data, fitted, ())
     return _figures(linear, linear.residual)
 
 
@@ -146,19 +150,24 @@ def _refitted(
 
 
 def frames_in_turn(
-    evidence: Evidence, without: Collection[str] = (), local: bool = False,
+    evidence: Evidence, without: Collection[str] = (), local: Local | None = None,
     held: Collection[str] = (),
 ) -> HeldOut:
     """Predict frames left out in turn by a fit to the others (linear in all parameters).
 
-    without: causes that are left out; held: causes that are not fitted anew.
+    without: causes that are left out; local: offsets to predict, each frame's from the others;
+    held: causes that are not fitted anew.
     """
     linear, even = evidence.linear, _evenly(evidence.linear)
     residual = np.zeros_like(linear.residual)
+    repeated = np.zeros_like(residual)
+    if local is not None and local.views is not None:
+        repeated = linear.data.blocks(local.views.own * linear.data.views.weight[..., None])
     for frame, information in enumerate(evidence.in_turn):
         _, _, way = _refitted(evidence, information, without, held)
-        rows = evidence.left_out.rows if local else evidence.border
+        rows = evidence.border if local is None else evidence.left_out.rows
         left, poses = rows[frame] @ way * even[frame], linear.frame_columns[frame]
+        left -= repeated[frame]
         poses = poses * even[frame][:, None]
         residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)
     return _figures(linear, residual / even)

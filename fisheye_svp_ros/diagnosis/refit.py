@@ -33,6 +33,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     design,
 )
 from fisheye_svp_ros.diagnosis.reml import Variances
+from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
 _PARTS = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step
@@ -54,14 +55,21 @@ class Fitted(NamedTuple):
 
 
 class Local(NamedTuple):
-    """Predicted local offsets: of landmarks (L, 3), m, and of the image (grids, (K, 2) px)."""
+    """Predicted local offsets: of landmarks (L, 3), m, of the image (grids, (K, 2) px), of views.
+
+    views: what landmarks err by alike in similar views, where they do.
+    """
 
     landmark: Index
     offset: Array
     grids: tuple[tuple[Grid, Array], ...]
+    views: SimilarViews | None = None
 
     def applied(self, data: Data) -> Data:
-        """Return data with landmarks where they are predicted and the image field taken out."""
+        """Return data with landmarks where they are predicted and the image field taken out.
+
+        What hangs on the views is left to `without_repeated`: it takes poses.
+        """
         views = data.views
         points = views.points + at_landmarks(views, self.landmark, self.offset)
         uv = views.uv.copy()
@@ -69,6 +77,13 @@ class Local(NamedTuple):
             mine = views.used & (data.camera_of[:, None] == grid.camera)
             uv -= bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
         return replace(data, views=views._replace(points=points, uv=uv))
+
+    def without_repeated(self, data: Data, state: State) -> Data:
+        """Return data that `applied` has returned without what other views predict of them."""
+        if self.views is None:
+            return data
+        uv = data.views.uv - self.views.at(Linearised(data, state, ()))
+        return replace(data, views=data.views._replace(uv=uv))
 
 
 def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> State:

@@ -69,7 +69,7 @@ COMPONENTS = {
     'frame_linear': 'linear field of each frame',
     'frame_quadratic': 'quadratic field of each frame',
     'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
-    'noise': 'noise of image points',
+    'frame_similar': 'landmarks in similar views', 'noise': 'noise of image points',
 }
 STAGE_WORDS = {
     'lens': 'lens (stays in the image)', 'target': 'target (stays with the board)',

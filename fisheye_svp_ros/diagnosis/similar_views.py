@@ -1,0 +1,195 @@
+"""What a landmark errs by alike in similar views: paper that lies anew, light, a detector.
+
+What everything else leaves of the residuals, as a Gaussian process over how a landmark is seen,
+and when; each landmark has one for itself, the parameters are those of all.
+
+Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), eq. 2.23
+(prediction), 2.30 (likelihood), 5.12 (each value predicted from the others).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from scipy import optimize, special
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.model import Linearised
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
+
+_RATIOS = (0.3, 3.0)  # to the noise's variance: where the search starts
+_REACHES = (0.1, 0.4)  # the same, of what separates views
+_LASTING = (0.02, 1.0)  # the same, of the time that the data span
+_BOUND = 30.0  # times a start: as far as the search goes
+
+
+class Grouped(NamedTuple):
+    """The views of each landmark by each camera, padded.
+
+    key (L, 2): camera and landmark; row (L, V): of the points (S N), -1 where there is none;
+    seen (L, V, 7): how it is seen, by direction and logarithm of what a step of it in space does
+    to the image; t (L, V), s.
+    """
+
+    key: Index
+    row: Index
+    seen: Array
+    t: Array
+
+    @property
+    def there(self) -> Mask:
+        """Which places (L, V) hold a view."""
+        return self.row >= 0
+
+    @classmethod
+    def of(cls, linear: Linearised) -> Grouped:
+        """Gather the views of a linearisation."""
+        views = linear.data.views
+        used = np.flatnonzero(views.used)
+        camera = np.broadcast_to(linear.data.camera_of[:, None], views.used.shape)
+        label = np.stack([camera.ravel()[used], views.landmark.ravel()[used]], axis=1)
+        key, group = np.unique(label, axis=0, return_inverse=True)
+        order, counts = np.argsort(group.ravel(), kind='stable'), np.bincount(group.ravel())
+        place = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+        row = np.full((len(key), int(counts.max())), -1)
+        row[group.ravel()[order], place] = used[order]
+        columns = np.nan_to_num(linear.linear.d_target).reshape(-1, 6)
+        size = np.maximum(np.linalg.norm(columns, axis=1, keepdims=True), 1e-300)
+        seen = np.concatenate([columns / size, np.log(size)], axis=1)
+        return cls(key, row, seen[row], views.t.ravel()[row])
+
+
+class SimilarViews(NamedTuple):
+    """A fitted process of known views, in units of the noise of each point.
+
+    ratio: of its variance to that of the noise; reach, in units of `Grouped.seen`; lasting, s,
+    infinite where times are not known; weights (L, V, 2): of known views in predictions; own
+    (S, N, 2): what the others of its landmark predict of each view, px; share: of what noise
+    seemed to be; p_value.
+    """
+
+    known: Grouped
+    ratio: float
+    reach: float
+    lasting: float
+    weights: Array
+    own: Array
+    share: float
+    p_value: float
+
+    def at(self, linear: Linearised) -> Array:
+        """Return what is predicted of other views (S, N, 2), px, zero where none is like them."""
+        other, known = Grouped.of(linear), self.known
+        _, label = np.unique(
+            np.concatenate([other.key, known.key]), axis=0, return_inverse=True)
+        mine, theirs = np.split(label.ravel(), [len(other.key)])
+        _, here, there = np.intersect1d(mine, theirs, return_indices=True)
+        between = _Between.of(
+            other.seen[here], other.t[here], known.seen[there], known.t[there])
+        predicted = self.ratio * between.kernel(self.reach, self.lasting) @ self.weights[there]
+        return _in_px(linear, other.row[here], predicted)
+
+
+class _Between(NamedTuple):
+    """What separates views: squares (L, V, W) of how they are seen, and times (L, V, W), s."""
+
+    squares: Array
+    times: Array
+
+    @classmethod
+    def of(cls, seen: Array, t: Array, other: Array, other_t: Array) -> _Between:
+        squares = (seen**2).sum(axis=-1)[..., None] + (other**2).sum(axis=-1)[:, None]
+        squares -= 2 * seen @ np.swapaxes(other, -1, -2)
+        return cls(np.maximum(squares, 0.0), np.abs(t[..., None] - other_t[:, None]))
+
+    def kernel(self, reach: float, lasting: float) -> Array:
+        """Return the correlations (L, V, W)."""
+        exponent = self.squares / (2 * reach**2)
+        if np.isfinite(lasting):
+            # A view whose time nobody knows is like none.
+            exponent = exponent + np.nan_to_num(self.times / lasting, nan=np.inf)
+        return np.asarray(np.exp(-exponent))
+
+
+@dataclass(frozen=True)
+class _Process:
+    """What the likelihood is made of: residual (L, V, 2), whitened, zero for padding."""
+
+    between: _Between
+    there: Mask
+    residual: Array
+
+    def precision(self, ratio: float, reach: float, lasting: float) -> tuple[Array, float]:
+        """Return the inverse (L, V, V) of the covariance over that of the noise, and its log det.
+
+        ratio: of the process's variance to that of the noise.
+        """
+        both = self.there[:, :, None] & self.there[:, None]
+        covariance = np.where(both, ratio * self.between.kernel(reach, lasting), 0.0)
+        covariance += np.eye(both.shape[1])
+        root = np.linalg.cholesky(covariance)
+        log_det = 2 * float(np.log(np.einsum('lvv->lv', root)).sum())
+        return np.linalg.inv(covariance), log_det
+
+    def log_likelihood(self, ratio: float, reach: float, lasting: float) -> float:
+        """Return the log likelihood but for a constant, the noise's variance at its best."""
+        inverse, log_det = self.precision(ratio, reach, lasting)
+        squares = float((self.residual * (inverse @ self.residual)).sum())
+        return float(-log_det - self.there.sum() * np.log(max(squares, 1e-300)))
+
+    def best(self, starts: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
+        """Return ratio, reach and lasting of the highest likelihood."""
+
+        def lost(logarithms: Array) -> float:
+            return -self.log_likelihood(*_three(logarithms))
+
+        start = min(np.log(starts), key=lost)
+        around = [(x - np.log(_BOUND), x + np.log(_BOUND)) for x in start]
+        return _three(optimize.minimize(lost, start, method='L-BFGS-B', bounds=around).x)
+
+
+def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
+    """Fit the process to residuals (F, M) from which all that was predicted is taken out.
+
+    None where no landmark is seen twice, or nothing repeats beyond chance.
+    """
+    data, known = linear.data, Grouped.of(linear)
+    there = known.there
+    if there.shape[1] < 2:
+        return None
+    by_view = whitened.reshape(data.frames, data.cameras, -1, 2)[data.frame_of, data.camera_of]
+    residual = np.where(there[..., None], by_view.reshape(-1, 2)[known.row], 0.0)
+    process = _Process(_Between.of(known.seen, known.t, known.seen, known.t), there, residual)
+    span = float(np.ptp(known.t[there]))
+    lasting = [(span * part,) for part in _LASTING] if span > 0 else [()]
+    starts = [(ratio, reach, *lasts)
+              for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)]
+    ratio, reach, lasts = process.best(starts)
+    gain = process.log_likelihood(ratio, reach, lasts) - process.log_likelihood(0.0, reach, lasts)
+    p = float(special.chdtrc(len(starts[0]), max(2 * gain, 0.0)))
+    if p * len(NAMES) > SIGNIFICANCE:
+        return None
+    inverse, _ = process.precision(ratio, reach, lasts)
+    weights = inverse @ residual
+    own = residual - weights / np.einsum('lvv->lv', inverse)[..., None]
+    return SimilarViews(known, ratio, reach, lasts, weights, _in_px(linear, known.row, own),
+                        ratio / (1 + ratio), p)
+
+
+def _three(logarithms: Array) -> tuple[float, float, float]:
+    """Return ratio, reach and lasting; without times, a process that lasts."""
+    ratio, reach, lasting = [*np.exp(logarithms), np.inf][:3]
+    return float(ratio), float(reach), float(lasting)
+
+
+def _in_px(linear: Linearised, row: Index, whitened: Array) -> Array:
+    """Return whitened values (L, V, 2) of rows (L, V) as (S, N, 2), px, zero elsewhere."""
+    placed = np.zeros((linear.weight.size, 2))
+    there = row >= 0
+    placed[row[there]] = whitened[there] / linear.weight.ravel()[row[there], None]
+    return placed.reshape(*linear.weight.shape, 2)
