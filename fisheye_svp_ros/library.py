@@ -68,7 +68,7 @@ class Localized(Result):
 
 @dataclass(frozen=True)
 class Calibrated(Result):
-    """A fitted lens: names (K,) of what was fitted, covariance (K, K) in their own units.
+    """A fitted lens: names (K,) of what was fitted, covariance (K, K), with any target.
 
     sigma_px, left_out: as in `Localized`; converged: whether the adjustment came to its end.
     """
@@ -261,16 +261,17 @@ def calibrate(
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
-    Gross errors are set aside, as the command does.
+    Gross errors are set aside, and standard errors are honest, as those of the command.
     """
-    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
+    from fisheye_svp_ros.diagnosis import calibration
 
-    found, _, _ = calibrated_without_gross_errors(
+    found, kept, _ = calibration.calibrated_without_gross_errors(
         _table(observations),
         lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
     adjusted = found.adjusted
-    return Calibrated(adjusted.lens, tuple(adjusted.names), adjusted.covariance, found.sigma,
-                      found.left_out, bool(adjusted.converged))
+    trusted = calibration.trust(kept, adjusted.lens, adjusted.names)
+    return Calibrated(calibration.with_stderr(adjusted.lens, trusted), tuple(adjusted.names),
+                      trusted.covariance, found.sigma, found.left_out, bool(adjusted.converged))
 
 
 def calibrate_stereo(

@@ -126,6 +126,20 @@ def test_localize_says_what_the_command_says(seen: library.Simulated, tmp_path: 
     assert np.nanmax(np.abs(found.residual)) < 1.0
 
 
+def test_calibrate_writes_the_lens_of_the_command(
+    seen: library.Simulated, tmp_path: Path
+) -> None:
+    table = tmp_path / 'observations.csv'
+    fsvp.write_observations(table, seen.observations)
+    said = ['--model', 'equidistant', '--image-size', '1536x1536', '-o', str(tmp_path / 'a.yaml')]
+    assert main(['calibrate', str(table), *said]) == 0
+    found = fsvp.calibrate(table, 'equidistant', (1536, 1536), name='a')
+    fsvp.save_lens(found.lens, tmp_path / 'b.yaml')
+    assert (tmp_path / 'b.yaml').read_text() == (tmp_path / 'a.yaml').read_text()
+    errors = (found.lens.calibration or {})['stderr']
+    assert list(found.table()['standard_error']) == pytest.approx([*errors.values()])
+
+
 def test_an_unknown_parameter_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"'noise' is no .*noise_px"):
         fsvp.simulate_scenario(noise=0.1)
