@@ -1,4 +1,4 @@
-"""A plane window in front of the lens, with air or another medium behind it."""
+"""The lens looks through a plane window, with air or another medium behind it."""
 
 from __future__ import annotations
 

@@ -191,6 +191,9 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
     if best < 0.99 * named:
         local = (f'; with the local offsets of single landmarks and of the image, which have no '
                  f'name, to {best:.3g} px')
+    elif best > 1.01 * named:
+        local = (f'; the local offsets of single landmarks and of the image do not hold there: '
+                 f'with them {best:.3g} px')
     if not moving:
         why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
         if d.causes:
@@ -200,8 +203,10 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
         return (f'Held-out data do not bear it out: {named:.3g} px rms instead of {before:.3g}; '
                 f'the causes are no correction{local}.')
     text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
-            f'{before:.3g}{local}, which takes away {percent(d.gain.value)} (95 % interval '
-            f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
+            f'{before:.3g}{local}')
+    if d.gain.value > 0:
+        text += (f', which takes away {percent(d.gain.value)} (95 % interval '
+                 f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
     lens = d.lens_only.heldout_rms_px
     if 'target' in {stage_of(c.effect) for c in moving}:
         better = lens < before

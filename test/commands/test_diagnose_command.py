@@ -250,6 +250,13 @@ class TestWords:
         assert 'of the error above the noise' in gained
         assert following.startswith('Solve with extended_lens.yaml')
 
+    def test_local_offsets_that_held_out_data_refute_gain_nothing(self, found):
+        worse = replace(found.extended, heldout_rms_px=2 * found.base.heldout_rms_px)
+        refuted = replace(found, extended=worse, gain=found.gain._replace(value=-1.0, low=-1.0))
+        _, gained, _ = verdict_sentences(refuted)
+        assert 'takes away' not in gained and '-100 %' not in gained
+        assert f'do not hold there: with them {worse.heldout_rms_px:.3g} px' in gained
+
     def test_a_class_is_named_with_what_would_separate_it(self, found):
         cause = replace(found.causes[0], indistinguishable_from=['flat_port', 'radial_profile'],
                         to_separate='go nearer; or farther')
