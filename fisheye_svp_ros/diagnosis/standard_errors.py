@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,10 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import candidates
 from fisheye_svp_ros.diagnosis.evidence import Evidence
+from fisheye_svp_ros.effects.base import Effect
 
 _MOST = 40  # models
+_WINDOW = 6.0  # of merit: odds of 20, beyond which a model counts for nothing (Occam's window)
 
 
 def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
@@ -49,21 +52,24 @@ def _estimates(information: Array, included: Index) -> tuple[Array, Array, Array
 
 
 def model_uncertainty(evidence: Evidence) -> Array:
-    """Return what effects that may be there, too, add to standard errors (K,) of what is shared.
+    """Return what other models, likely too, add to standard errors (K,) of what is shared.
 
-    Each model with more effects is as probable as its evidence says (BIC; Raftery 1995, eq. 35),
-    and adds so much of the variance that it brings and of the square of the change.  Beside a
-    further form of an effect its parameters mean something else: for them that model does not
-    count.
+    Each model with more effects, or with another effect in the place of one, is as probable as its
+    evidence says (BIC; Raftery 1995, eq. 35), and adds so much of the variance that it brings and
+    of the square of the change.  Beside a further form of an effect, or without it, its parameters
+    mean something else: for them that model does not count.
     """
     own, information = evidence.own, evidence.information
     estimate, variance, _ = _estimates(information, np.arange(own))
-    models = _larger_models(evidence)
+    models = _likely_models(evidence)
     weights = special.softmax([one.merit / 2 for one in models])
     added = np.zeros(own)
     for weight, one in zip(weights, models, strict=True):
-        other, wider, _ = _estimates(information, one.included)
-        more = np.maximum(wider[:own] - variance, 0.0) + (other[:own] - estimate) ** 2
+        there = one.included < own
+        at, more = one.included[there], np.zeros(own)
+        other, wider, _ = _estimates(evidence.restored(information, at), one.included)
+        change = other[there] - estimate[at]
+        more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
         for effect, columns, _ in evidence.terms:
             if one.kinds & set(effect.kinds):
                 more[columns] = 0.0
@@ -72,20 +78,21 @@ def model_uncertainty(evidence: Evidence) -> Array:
 
 
 class _Model(NamedTuple):
-    """A model: its merit beside the one that was chosen, its columns, and what more is in it."""
+    """A model: its merit beside the one that was chosen, its columns, kinds of what differs."""
 
     merit: float
     included: Index
     kinds: frozenset[str]
 
 
-def _larger_models(evidence: Evidence) -> list[_Model]:
-    """Return the chosen model and larger ones, each likelier than one that it extends.
+def _likely_models(evidence: Evidence) -> list[_Model]:
+    """Return the chosen model, those with an effect exchanged, and larger, likelier ones of each.
 
     The likeliest of those at hand is extended first, and so many are enough.
     """
     found: dict[frozenset[int], _Model] = {}
     waiting = {frozenset[int](): _Model(0.0, np.arange(evidence.own), frozenset())}
+    waiting |= dict(_exchanged(evidence))
     while waiting and len(found) < _MOST:
         forms, model = max(waiting.items(), key=lambda item: item[1].merit)
         found[forms] = waiting.pop(forms)
@@ -97,3 +104,26 @@ def _larger_models(evidence: Evidence) -> list[_Model]:
                 columns = np.concatenate([model.included, evidence.columns_of(one.form)])
                 waiting[larger] = _Model(model.merit + one.merit, columns, model.kinds | kinds)
     return [*found.values()]
+
+
+def _exchanged(evidence: Evidence) -> Iterator[tuple[frozenset[int], _Model]]:
+    """Yield models with another effect in the place of one, by what is gone (~i) and the form.
+
+    Beside other effects of the recording intrinsics mean something else: those stay as they are.
+    """
+    for i, (effect, columns, _) in enumerate(evidence.terms):
+        if not _lasts(effect):
+            continue
+        rest = np.setdiff1d(np.arange(evidence.own), columns)
+        score = evidence.score(evidence.remaining(evidence.information, rest), columns)
+        lost = score.statistic - score.rank * np.log(evidence.full.rows)
+        for one in candidates(evidence, rest):
+            kinds = frozenset(one.effect.kinds)
+            if one.merit > lost - _WINDOW and _lasts(one.effect) and not evidence.kinds & kinds:
+                included = np.concatenate([rest, evidence.columns_of(one.form)])
+                yield frozenset({~i, one.form}), _Model(
+                    one.merit - lost, included, kinds | set(effect.kinds))
+
+
+def _lasts(effect: Effect) -> bool:
+    return not (effect.per_frame or effect.of_recording)

@@ -61,6 +61,22 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
         assert not more.any()
 
 
+def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_change():
+    """Tilt named where there is decentering, which hardly differs: the centre is elsewhere."""
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, frames=16)
+    tilt, decentering = CATALOGUE['sensor_tilt'](), CATALOGUE['decentering']()
+    data = prepare(observe(
+        lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng))
+    begin = replace(start(data, lens()), terms=((tilt, np.zeros(2)),))
+    state = fit(data, begin, ('cx', 'cy'))
+    evidence = gather_evidence(data, state, ('cx', 'cy'))
+    errors, more = standard_errors(evidence), model_uncertainty(evidence)
+    off = abs(state.lens.cy - lens().cy)
+    assert off > 4 * errors[1]
+    assert off < 2 * np.hypot(errors, more)[1]
+
+
 @pytest.mark.filterwarnings('error')
 def test_what_no_frame_tells_of_has_no_error():
     information = np.diag([0.0, 4.0, 1.0])
