@@ -28,6 +28,7 @@ _KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after 
 _PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
 _TOUCHED = 0.02  # of a smoothed pixel
 _SIGHT = 4  # px that smoothing sees
+_ROUNDING = 1 / 12  # variance of a whole number
 _RIM = 2  # px along the border, where smoothing has seen the image's mirror image
 
 
@@ -35,7 +36,8 @@ class Windows(NamedTuple):
     """Round windows (N, P) of a smoothed image: data; offset (2, P), px, from place (N, 2).
 
     inside (N, P): the image but for its rim; clipped (N, P): light at the end of the scale is in
-    it; side, px, of the square around, and which of its pixels are in a window, (P,).
+    it; side, px, of the square around, and which of its pixels are in a window, (P,); rounding:
+    variance of a pixel from that alone.
     """
 
     data: Array
@@ -45,6 +47,7 @@ class Windows(NamedTuple):
     clipped: Mask
     side: int
     round: Index
+    rounding: float
 
 
 class Judged(NamedTuple):
@@ -91,7 +94,8 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
     around, at = pixels[top:bottom, left:right], (rows - top, columns - left)
     smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), SMOOTHING)
     return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,
-                   inside & _clipped(around)[at], 2 * half + 1, round_)
+                   inside & _clipped(around)[at], 2 * half + 1, round_,
+                   _ROUNDING if pixels.dtype.kind == 'u' else 0.0)
 
 
 def _seen(at: Index) -> tuple[int, int]:
@@ -180,7 +184,8 @@ class WindowProblem(ABC):
         products = (share * left) @ np.swapaxes(left, -1, -2)
         squares = np.einsum('nkk->nk', products)
         usual = squares[:, 1:].mean(axis=1)
-        noise2 = squares[:, 0] / np.maximum(usual, 1e-9)
+        # No pixel is surer than its last bit, though drawn boards are without noise, and even.
+        noise2 = np.maximum(squares[:, 0] / np.maximum(usual, 1e-9), cut.rounding)
         # Of correlated pixels as many are independent as the squared trace of their covariance
         # over the trace of its square, which is what products of two noises are on average.
         other = products[:, 1:, 1:][:, ~np.eye(_EACH, dtype=bool)]

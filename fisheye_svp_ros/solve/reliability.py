@@ -187,7 +187,7 @@ def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) 
     allowed: variance of a row.
     """
     with np.errstate(divide='ignore', invalid='ignore'):  # where no view has a pose
-        largest = np.nanmax(np.where(
+        largest = np.fmax.reduce(np.where(
             views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0), axis=1)
         mean = found.cost / np.maximum(freedom, 1)
         stands_out = largest > 2 * _STANDS_OUT**2 * mean

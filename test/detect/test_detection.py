@@ -151,6 +151,19 @@ class TestCorners:
         assert np.mean(ratio) == pytest.approx(1.0, abs=0.2)
         assert np.abs(uv.mean(axis=(0, 1)) - true_corners(pose).mean(axis=0)).max() < 0.01
 
+    def test_a_board_that_is_drawn_straight_and_without_noise(self) -> None:
+        drawn = np.full((340, 380), 230, np.uint8)
+        for row in range(6):
+            for column in range(row % 2, 7, 2):
+                v, u = 20 + 50 * row, 15 + 50 * column
+                drawn[v:v + 50, u:u + 50] = 25
+        points = find_points(cv2.GaussianBlur(drawn, (0, 0), 1.0), PATTERN, 'saddle')
+        assert not isinstance(points, str), points
+        v, u = np.mgrid[:5, :6].reshape(2, -1) * 50.0
+        assert np.abs(points.uv - np.stack([u + 64.5, v + 69.5], axis=-1)[points.ids]).max() < 1e-3
+        # Grey levels are whole numbers: what rounding them may move a corner by.
+        assert points.sigma == pytest.approx(1e-3, rel=0.2)
+
     def test_uneven_light_and_defocus_do_not_move_corners(self) -> None:
         pose = poses(3, 1).take(1)
         exposure = Exposure(blur=1.8, slope=(0.6, -0.4))

@@ -126,6 +126,16 @@ def test_another_lens_without_sigma_is_no_warning_of_numpy():
         localize_measured(model, table.take(some))
 
 
+@pytest.mark.filterwarnings('error')
+def test_a_view_without_a_single_residual_is_no_warning_of_numpy():
+    model, views, _ = spoilt('clean', 'room', 2, np.random.default_rng(3))
+    found = localize(model, views)
+    residual = found.residual.copy()
+    residual[1] = np.nan
+    found = found._replace(residual=residual, cost=np.array([found.cost[0], np.nan]))
+    assert examine(model, views, found).reasons[0] == ''
+
+
 @pytest.mark.parametrize('count', [4, 5])
 def test_few_points_start_from_evenly_spread_turns(count):
     rng = np.random.default_rng(0)
