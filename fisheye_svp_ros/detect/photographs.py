@@ -179,7 +179,7 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
     kind, channels, grey = _ENCODINGS[message.encoding]
     dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
     width = message.width * channels * dtype.itemsize
-    if message.step < width or len(data) < message.step * message.height or not data:
+    if not 0 < width <= message.step or not 0 < message.step * message.height <= len(data):
         raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
                                f'{message.width}x{message.height} {message.encoding}')
     rows = np.frombuffer(data, np.uint8)[:message.step * message.height]

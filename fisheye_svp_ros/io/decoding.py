@@ -114,8 +114,9 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
     k, d = [float(value) for value in message.k], tuple(float(value) for value in message.d)
     if not k[0]:
         raise ObservationError(f'{topic}: k is 0, as of a camera that is not calibrated')
-    if not np.isfinite([*k, *d]).all():
-        raise ObservationError(f'{topic}: k or d holds a value that is not a finite number')
+    if not (np.abs([*k, *d]) <= LARGEST).all():  # not so for NaN
+        raise ObservationError(f'{topic}: k or d holds a value that is not a finite number, or '
+                               f'beyond {LARGEST:g}')
     size, roi = (int(message.width), int(message.height)), message.roi
     part = roi.x_offset or roi.y_offset or (roi.width or size[0], roi.height or size[1]) != size
     if part or max(message.binning_x, message.binning_y) > 1:

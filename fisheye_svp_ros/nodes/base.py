@@ -14,6 +14,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
@@ -200,7 +201,10 @@ class BaseNode(Node):  # type: ignore[misc]
             return
         # Only what is latched comes late; only a volatile subscription hears what is not.
         latched, volatile = twins(receive)
-        self.subscribe(functools.partial(create, latched, qos=qos, raw=True))
+        # The other one warns of whom neither hears.
+        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
+        self.subscribe(functools.partial(
+            create, latched, qos=qos, raw=True, event_callbacks=silent))
         self.subscribe(functools.partial(
             create, volatile, qos=volatile_qos, entity='volatile', raw=True))
 

@@ -23,6 +23,7 @@ _MODULES = {
     'rclpy.clock': 'clock',
     'rclpy.context': 'context',
     'rclpy.duration': 'clock',
+    'rclpy.event_handler': 'qos',
     'rclpy.exceptions': 'exceptions',
     'rclpy.executors': 'executor',
     'rclpy.lifecycle': 'lifecycle',

@@ -27,6 +27,7 @@ from fisheye_svp_ros.standalone.parameters import Parameter, ParameterHolder
 from fisheye_svp_ros.standalone.qos import (
     QoSOverridingOptions,
     QoSProfile,
+    SubscriptionEventCallbacks,
     TopicEndpointInfo,
     policy_text,
     policy_value,
@@ -170,6 +171,7 @@ class Node(ParameterHolder):
         *,
         raw: bool = False,
         qos_overriding_options: QoSOverridingOptions | None = None,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
     ) -> Subscription:
         """Have a function called with each message on a topic; raw: with its bytes as CDR."""
         name = self.resolve_topic_name(topic)

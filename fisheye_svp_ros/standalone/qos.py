@@ -103,6 +103,12 @@ class QoSOverridingOptions(NamedTuple):
     entity_id: str | None = None
 
 
+class SubscriptionEventCallbacks(NamedTuple):
+    """Whether rclpy tells of its own accord what a subscription cannot hear; here nobody does."""
+
+    use_default_callbacks: bool = True
+
+
 class TopicEndpointInfo(NamedTuple):
     """Who publishes on a topic: type and profile."""
 

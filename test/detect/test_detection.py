@@ -466,6 +466,11 @@ class TestPhotographs:
         pixels = message_pixels(message, 'sensor_msgs/msg/Image', 'one')
         assert pixels.shape == (4, 6)
         assert np.abs(pixels.astype(int) - 100).max() <= 16
+        for empty in ('width', 'height'):
+            setattr(message, empty, 0)
+            with pytest.raises(ObservationError, match='do not hold'):
+                message_pixels(message, 'sensor_msgs/msg/Image', 'one')
+            delattr(message, empty)
         message.data = message.data[:-8]
         with pytest.raises(FisheyeSvpError, match='do not hold'):
             message_pixels(message, 'sensor_msgs/msg/Image', 'one')

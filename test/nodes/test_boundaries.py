@@ -231,10 +231,13 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
     assert 'cannot keep up' not in texts[-1]
 
 
-def test_landmarks_that_are_not_latched_are_heard(graph: Callable[..., Graph]) -> None:
+def test_landmarks_that_are_not_latched_are_heard(
+    graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
+) -> None:
     attack = Attack(graph('patience:=0.3', 'lens:=fish214', 'svp:=true'), landmarks=RELIABLE)
     attack.solves(3)
     assert attack.counts()['landmarks: received'] == '1'
+    assert 'No messages will be received from it' not in capfd.readouterr().err
 
 
 def test_landmarks_that_are_latched_are_heard_late_and_once(graph: Callable[..., Graph]) -> None:

@@ -146,6 +146,7 @@ def test_what_a_camera_info_says() -> None:
 
 @pytest.mark.parametrize(('changes', 'reason'), [
     ({'k': [0.0] * 9}, 'not calibrated'), ({'d': [np.nan] * 4}, 'not a finite number'),
+    ({'k': [1e300, 0.0, 320.0, 0.0, 1e300, 240.0, 0.0, 0.0, 1.0]}, r'beyond 1e\+12'),
     ({'binning_x': 2}, 'binned'), ({'roi': RegionOfInterest(x_offset=4)}, 'a part of the image'),
 ])
 def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
