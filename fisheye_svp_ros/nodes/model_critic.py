@@ -59,10 +59,11 @@ class ModelCriticSettings(SolverSettings):
 
 
 class _Running(NamedTuple):
-    """A diagnosis under way, and the stamp of its last frame."""
+    """A diagnosis under way, the stamp of its last frame, and the scenario of all of them."""
 
     future: Future[Diagnosis]
     stamp: int
+    scenario: frozenset[tuple[str, str]]
 
 
 class ModelCritic(SolverNode):
@@ -116,7 +117,7 @@ class ModelCritic(SolverNode):
         lens, scenario = self.lens(stamp, items), scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._judged = scenario, {}, False
-            self._running = self._verdict = None
+            self._verdict = None
         self._simulation = lens
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
@@ -127,7 +128,8 @@ class ModelCritic(SolverNode):
         if self._running is not None:
             if self._running.future.done():
                 done, self._running = self._running, None
-                self._finish(done)
+                if done.scenario is self._scenario:
+                    self._finish(done)
             return
         wanted = self.settings.every_frames if self._judged else 0
         if len(self._frames) >= self.settings.min_frames and self._new >= wanted:
@@ -135,7 +137,7 @@ class ModelCritic(SolverNode):
             table, lens = self._table(), self._simulation
             free = self.settings.free_intrinsics or lens.calibration is not None
             work = in_background(lambda: judge(table, lens, free))
-            self._running = _Running(work, next(reversed(self._frames)))
+            self._running = _Running(work, next(reversed(self._frames)), self._scenario)
 
     def _table(self) -> Observations:
         table = table_of(list(self._frames.values()), self.cameras)

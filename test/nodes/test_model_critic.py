@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +30,7 @@ from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.nodes import model_critic
 from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -116,6 +119,27 @@ def test_a_right_lens_is_adequate_and_another_scenario_starts_anew(
     assert set_parameter(camera, 'lens', f'{scene}/hidden.yaml').successful
     g.until(lambda: numbers(results[-1])['verdict'] in EXPLAINED)
     assert set_parameter(critic, 'min_frames', 300).successful is False
+
+
+def test_one_diagnosis_is_at_work_at_a_time_however_soon_scenarios_change(
+    graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_work, seen = threading.Semaphore(1), list[bool]()
+
+    def judge(*_: object) -> None:
+        seen.append(at_work.acquire(blocking=False))
+        time.sleep(1.0)
+        if seen[-1]:
+            at_work.release()
+        raise GeometryError('of a scenario that is over')
+
+    monkeypatch.setattr(model_critic, 'judge', judge)
+    g = graph('rate:=50.0', 'min_frames:=5', 'sweep.seed:=[1, 2, 3]')
+    results = g.hear(DiagnosticArray, 'model_critic/result')
+    g.start(ModelCritic)
+    g.start(SyntheticCamera)
+    g.until(lambda: len(seen) > 2)
+    assert all(seen) and not results
 
 
 def test_a_rig_is_judged_as_one(graph: Callable[..., Graph], scene: Path) -> None:
