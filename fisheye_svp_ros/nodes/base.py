@@ -297,6 +297,7 @@ class BaseNode(Node):  # type: ignore[misc]
 
 def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
     """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
+    signal.signal(signal.SIGINT, _interrupting_once())
     try:
         try:
             rclpy.init(args=args)
@@ -304,8 +305,22 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
             return _refuse(kind, f'ROS arguments or environment: {error}')
         return _run(kind)
     except KeyboardInterrupt:
-        # Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
         return 0
+
+
+def _interrupting_once() -> Callable[..., None]:
+    """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
+
+    The second one would end what the first one has begun to put away.
+    """
+    heard: list[bool] = []
+
+    def interrupt(*_: Any) -> None:
+        heard.append(True)
+        if len(heard) == 1:
+            raise KeyboardInterrupt
+
+    return interrupt
 
 
 def _run(kind: type[BaseNode]) -> int:

@@ -113,6 +113,30 @@ def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
     assert capfd.readouterr().err == ''
 
 
+@pytest.mark.filterwarnings('error::pytest.PytestUnraisableExceptionWarning')
+def test_a_second_interrupt_does_not_disturb_what_the_first_one_ends(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    class Held:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+
+    def interrupt(*_: object, **__: object) -> None:
+        held = Held()  # until the exception is dealt with
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(1.0)
+        raise AssertionError(held)
+
+    monkeypatch.setattr(base.BaseNode, 'announce', interrupt)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert executables.run('localizer', []) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capfd.readouterr().err == ''
+
+
 @pytest.mark.parametrize('ended', [True, False])
 def test_what_fails_once_a_signal_has_ended_the_context_is_no_failure(
     ended: bool, ros_domain: int, monkeypatch: pytest.MonkeyPatch
