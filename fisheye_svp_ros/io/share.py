@@ -45,7 +45,7 @@ def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Pat
     if given.suffix in ('.yaml', '.yml') or _is_file(Path(name.partition('#')[0])):
         return given
     if not _is_file(named):
-        known = ', '.join(sorted(path.stem for path in named.parent.glob('*.yaml')))
+        known = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
         raise error(f'{name!r} is neither a file nor among the {folder} of this package: {known}')
     return named
 

@@ -64,7 +64,10 @@ class BaseNode(Node):  # type: ignore[misc]
     SETTINGS: ClassVar[type[Settings]]
 
     def __init__(self) -> None:
-        super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+        try:
+            super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+        except ValueError as cause:  # an empty list has no type, and rclpy does not say which
+            raise ParameterError(f'parameters: {cause}; a list must not be empty') from cause
         # The public way to learn what was given; what is known is declared anew, with its type.
         self.given = {name: parameter.value
                       for name, parameter in self.get_parameters_by_prefix('').items()

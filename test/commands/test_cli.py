@@ -324,6 +324,8 @@ def test_measured_data(tmp_path):
 @pytest.mark.parametrize(('words', 'said'), [
     (['localize', 'o.csv', '--lens', 'fish21'],
      "'fish21' is neither a file nor among the lenses of this package: fish180, fish214"),
+    (['localize', 'o.csv', '--lens', '/dev/zero'],
+     "'/dev/zero' is neither a file nor among the lenses of this package: fish180, fish214"),
     (['sweep', 'nois'], "'nois' is neither a file nor among the sweeps of this package: env"),
     (['diagnose', 'o.csv', '--lens', 'fish214', '--held_out', 'x'],
      'unknown argument --held_out; --held-out? (see fisheye-svp diagnose --help)'),

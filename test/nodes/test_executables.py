@@ -54,6 +54,7 @@ def start(
     ['-r', '__node:=9x'],
     ['--nosuch'],
     ['-p', 'lens:=nothere'],
+    ['-p', 'lens:=[]'],
     ['-p', 'patience:=-1.0'],
     ['-p', 'qos_overrides./image_points.subscription.reliability:=sometimes'],
 ])
