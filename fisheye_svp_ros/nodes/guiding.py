@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,10 +58,12 @@ class Guiding:
         """Announce the topics; raise ParameterError for a lens or folder that cannot be used."""
         self._node, self._settings, self._pattern = node, settings, pattern
         self._folder = Path(settings.guide_output).absolute()
-        if self._folder.exists() and not (self._folder.is_dir() and not any(
-                self._folder.iterdir())):
-            raise ParameterError(f'guide_output: {self._folder} is not an empty folder; choose '
-                                 'another for these photographs')
+        with suppress(OSError):
+            self._folder.mkdir(parents=True, exist_ok=True)
+        if not (self._folder.is_dir() and os.access(self._folder, os.W_OK)) or any(
+                self._folder.iterdir()):
+            raise ParameterError(f'guide_output: {self._folder} is not an empty folder that can '
+                                 'be written; choose another for these photographs')
         self._infos = CameraInfos(node.get_logger().info)
         self._lens: Lens | None = None
         if settings.lens == CAMERA_INFO:

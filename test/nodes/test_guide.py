@@ -78,14 +78,15 @@ def test_an_image_that_the_lens_is_not_for_is_named(
 @pytest.mark.parametrize(('arguments', 'reason'), [
     (('near:=0.5', 'far:=0.4'), 'near is not below far'),
     (('detections:=true',), 'must be an aprilgrid|cannot be used with detections'),
-    ((), 'not an empty folder'),
+    ((), 'not an empty folder'), (('guide_output:=notes.txt/guided',), 'can be written'),
 ])
 def test_a_guide_that_cannot_work_is_refused(
     graph: Callable[..., Graph], tmp_path: Path, arguments: tuple[str, ...], reason: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr('fisheye_svp_ros.nodes.detector._tag_array', lambda: DiagnosticArray)
-    (tmp_path / 'notes.txt').write_text('mine')
+    monkeypatch.chdir(tmp_path)
+    Path('notes.txt').write_text('mine')
     g = graph('guide:=e0', f'guide_output:={tmp_path}', *arguments)
     with pytest.raises(ParameterError, match=reason):
         g.start(Detector)
