@@ -9,7 +9,7 @@ Source: Rasmussen and Williams, Gaussian Processes for Machine Learning (2006), 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -26,6 +26,9 @@ _RATIOS = (0.3, 3.0)  # to the noise's variance: where the search starts
 _REACHES = (0.1, 0.4)  # the same, of what separates views
 _LASTING = (0.02, 1.0)  # the same, of the time that the data span
 _BOUND = 30.0  # times a start: as far as the search goes
+_PRECISE = 1e-7  # of the log likelihood
+_MOST_VIEWS, _MOST_CUBES = 150, 3e8  # of a landmark, and of all: what the parameters are read from
+_ROOM = 4e6  # numbers in one kernel
 
 
 class Grouped(NamedTuple):
@@ -45,6 +48,11 @@ class Grouped(NamedTuple):
     def there(self) -> Mask:
         """Which places (L, V) hold a view."""
         return self.row >= 0
+
+    def take(self, landmarks: Index | slice, views: slice = slice(None)) -> Grouped:
+        """Return some of the landmarks, and so many views of each."""
+        at = landmarks, views
+        return Grouped(self.key[landmarks], self.row[at], self.seen[at], self.t[at])
 
     @classmethod
     def of(cls, linear: Linearised) -> Grouped:
@@ -89,9 +97,11 @@ class SimilarViews(NamedTuple):
             np.concatenate([other.key, known.key]), axis=0, return_inverse=True)
         mine, theirs = np.split(label.ravel(), [len(other.key)])
         _, here, there = np.intersect1d(mine, theirs, return_indices=True)
-        between = _Between.of(
-            other.seen[here], other.t[here], known.seen[there], known.t[there])
-        predicted = self.ratio * between.kernel(self.reach, self.lasting) @ self.weights[there]
+        predicted = np.zeros((*other.row[here].shape, 2))
+        for some in _batches(len(here), predicted.shape[1] * known.row.shape[1]):
+            between = _Between.of(other.take(here[some]), known.take(there[some]))
+            predicted[some] = self.ratio * between.kernel(
+                self.reach, self.lasting) @ self.weights[there[some]]
         return _in_px(linear, other.row[here], predicted)
 
 
@@ -102,10 +112,10 @@ class _Between(NamedTuple):
     times: Array
 
     @classmethod
-    def of(cls, seen: Array, t: Array, other: Array, other_t: Array) -> _Between:
-        squares = (seen**2).sum(axis=-1)[..., None] + (other**2).sum(axis=-1)[:, None]
-        squares -= 2 * seen @ np.swapaxes(other, -1, -2)
-        return cls(np.maximum(squares, 0.0), np.abs(t[..., None] - other_t[:, None]))
+    def of(cls, some: Grouped, other: Grouped) -> _Between:
+        squares = (some.seen**2).sum(axis=-1)[..., None] + (other.seen**2).sum(axis=-1)[:, None]
+        squares -= 2 * some.seen @ np.swapaxes(other.seen, -1, -2)
+        return cls(np.maximum(squares, 0.0), np.abs(some.t[..., None] - other.t[:, None]))
 
     def kernel(self, reach: float, lasting: float) -> Array:
         """Return the correlations (L, V, W)."""
@@ -124,22 +134,25 @@ class _Process:
     there: Mask
     residual: Array
 
-    def precision(self, ratio: float, reach: float, lasting: float) -> tuple[Array, float]:
-        """Return the inverse (L, V, V) of the covariance over that of the noise, and its log det.
+    @classmethod
+    def of(cls, known: Grouped, residual: Array) -> _Process:
+        return cls(_Between.of(known, known), known.there, residual)
+
+    def covariance(self, ratio: float, reach: float, lasting: float) -> Array:
+        """Return the covariance (L, V, V) over the variance of the noise, 1 for padding.
 
         ratio: of the process's variance to that of the noise.
         """
         both = self.there[:, :, None] & self.there[:, None]
-        covariance = np.where(both, ratio * self.between.kernel(reach, lasting), 0.0)
-        covariance += np.eye(both.shape[1])
-        root = np.linalg.cholesky(covariance)
-        log_det = 2 * float(np.log(np.einsum('lvv->lv', root)).sum())
-        return np.linalg.inv(covariance), log_det
+        process = np.where(both, ratio * self.between.kernel(reach, lasting), 0.0)
+        return np.asarray(process + np.eye(both.shape[1]))
 
     def log_likelihood(self, ratio: float, reach: float, lasting: float) -> float:
         """Return the log likelihood but for a constant, the noise's variance at its best."""
-        inverse, log_det = self.precision(ratio, reach, lasting)
-        squares = float((self.residual * (inverse @ self.residual)).sum())
+        covariance = self.covariance(ratio, reach, lasting)
+        root = np.linalg.cholesky(covariance)
+        log_det = 2 * float(np.log(np.einsum('lvv->lv', root)).sum())
+        squares = float((self.residual * np.linalg.solve(covariance, self.residual)).sum())
         return float(-log_det - self.there.sum() * np.log(max(squares, 1e-300)))
 
     def best(self, starts: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
@@ -150,35 +163,48 @@ class _Process:
 
         start = min(np.log(starts), key=lost)
         around = [(x - np.log(_BOUND), x + np.log(_BOUND)) for x in start]
-        return _three(optimize.minimize(lost, start, method='L-BFGS-B', bounds=around).x)
+        return _three(optimize.minimize(
+            lost, start, method='L-BFGS-B', bounds=around, options={'ftol': _PRECISE}).x)
 
 
 def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
     """Fit the process to residuals (F, M) from which all that was predicted is taken out.
 
-    None where no landmark is seen twice, or nothing repeats beyond chance.
+    None where no landmark is seen twice, or nothing repeats beyond chance.  Of many landmarks and
+    views some say what the parameters are; what is predicted rests on all.
     """
     data, known = linear.data, Grouped.of(linear)
-    there = known.there
-    if there.shape[1] < 2:
+    count, views = known.row.shape
+    if views < 2:
         return None
     by_view = whitened.reshape(data.frames, data.cameras, -1, 2)[data.frame_of, data.camera_of]
-    residual = np.where(there[..., None], by_view.reshape(-1, 2)[known.row], 0.0)
-    process = _Process(_Between.of(known.seen, known.t, known.seen, known.t), there, residual)
-    span = float(np.ptp(known.t[there]))
+    residual = np.where(known.there[..., None], by_view.reshape(-1, 2)[known.row], 0.0)
+    few = slice(min(views, _MOST_VIEWS))
+    every = int(np.ceil(count * float(few.stop) ** 3 / _MOST_CUBES))
+    process = _Process.of(known.take(slice(None, None, every), few), residual[::every, few])
+    span = float(np.ptp(known.t[known.there]))
     lasting = [(span * part,) for part in _LASTING] if span > 0 else [()]
     starts = [(ratio, reach, *lasts)
               for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)]
-    ratio, reach, lasts = process.best(starts)
-    gain = process.log_likelihood(ratio, reach, lasts) - process.log_likelihood(0.0, reach, lasts)
+    found = process.best(starts)
+    gain = process.log_likelihood(*found) - process.log_likelihood(0.0, *found[1:])
     p = float(special.chdtrc(len(starts[0]), max(2 * gain, 0.0)))
     if p * len(NAMES) > SIGNIFICANCE:
         return None
-    inverse, _ = process.precision(ratio, reach, lasts)
-    weights = inverse @ residual
-    own = residual - weights / np.einsum('lvv->lv', inverse)[..., None]
-    return SimilarViews(known, ratio, reach, lasts, weights, _in_px(linear, known.row, own),
-                        ratio / (1 + ratio), p)
+    weights, own = np.zeros((2, *residual.shape))
+    for some in _batches(count, views**2):
+        one = _Process.of(known.take(some), residual[some])
+        inverse = np.linalg.inv(one.covariance(*found))
+        weights[some] = inverse @ one.residual
+        own[some] = one.residual - weights[some] / np.einsum('lvv->lv', inverse)[..., None]
+    return SimilarViews(known, *found, weights, _in_px(linear, known.row, own),
+                        found[0] / (1 + found[0]), p)
+
+
+def _batches(landmarks: int, size: int) -> Iterator[slice]:
+    """Yield landmarks in parts whose kernels, of such a size each, there is room for."""
+    step = max(int(_ROOM // max(size, 1)), 1)
+    return (slice(start, start + step) for start in range(0, landmarks, step))
 
 
 def _three(logarithms: Array) -> tuple[float, float, float]:

@@ -115,6 +115,7 @@ def test_views_of_unknown_time_are_like_none():
 
 def test_landmarks_that_were_never_seen_are_left_alone():
     table = photographed(0.1)
-    process = similar_views(*(lambda one: (one, one.residual))(linearised(table)))
+    linear = linearised(table)
+    process = similar_views(linear, linear.residual)
     other = linearised(replace(table, landmark=table.landmark + 1000))
     assert not process.at(other).any()
