@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.advice import Advice, advise
-from fisheye_svp_ros.diagnosis.budget import Component, found_components
+from fisheye_svp_ros.diagnosis.budget import REPEATED, Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
 from fisheye_svp_ros.diagnosis.inputs import (
@@ -91,6 +91,12 @@ class Diagnosis:
     def lens(self) -> Lens:
         """The extended lens, of the first camera of a rig."""
         return next(iter(self.lenses.values()))
+
+    @property
+    def scatter_px(self) -> float:
+        """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
+        found = [part.sd_px for part in self.components if part.name in ('noise', REPEATED)]
+        return float(np.hypot.reduce(found))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""

@@ -42,7 +42,7 @@ class Shown(NamedTuple):
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)
-        return cls(shown, diagnosis.after.state.lens, diagnosis.noise_px)
+        return cls(shown, diagnosis.after.state.lens, diagnosis.scatter_px)
 
 
 def draw_field(path: Path, shown: Shown) -> None:

@@ -48,6 +48,7 @@ def test_what_repeats_is_found_predicted_and_told_of():
     assert part.sd_px == pytest.approx(0.1, rel=0.3)
     assert noise.sd_px == pytest.approx(NOISE, rel=0.3)
     assert found.noise_px == pytest.approx(NOISE, rel=0.3)
+    assert found.scatter_px == pytest.approx(np.hypot(part.sd_px, noise.sd_px))
     assert found.extended.heldout_rms_px < 0.75 * found.base.heldout_rms_px
     assert found.verdict == 'unexplained'
     assert any('differ from each other' in advice.what for advice in found.advice)
