@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -29,6 +30,7 @@ from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
 _QUICK = {'saddle': 'quick'}  # a live camera has another image soon
+_LATEST = 100  # images of which one topic may be ahead of the other
 _LOOK = 0.005  # s, how often what a search found is looked for
 
 
@@ -94,6 +96,7 @@ class Detector(BaseNode):
         self._pattern: Pattern
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
+        self._taken: deque[tuple[int, str]] = deque(maxlen=_LATEST)
         self._waiting: tuple[int, Unread] | None = None
         self._searched: tuple[int, str, Pixels] | None = None
         self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
@@ -154,6 +157,10 @@ class Detector(BaseNode):
         heard = looked_at or self._points.get_subscription_count()
         if not heard or not self.has_listeners():
             return
+        # image_transport sends each image on both topics.
+        if any(at == stamp and topic != image.topic for at, topic in self._taken):
+            return
+        self._taken.append((stamp, image.topic))
         if self._waiting is not None:
             self._counts['images overtaken'] += 1
             if self._waiting[0] > stamp:

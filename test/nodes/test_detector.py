@@ -101,6 +101,22 @@ def test_compressed_and_bad_images(detecting: Graph) -> None:
                          any(p.header.stamp.nanosec == 8 for p in points))[1])
 
 
+def test_an_image_that_comes_raw_and_compressed_is_searched_once(detecting: Graph) -> None:
+    points = detecting.hear(PointCloud2, 'image_points')
+    image = photograph(poses(1, 4).take(0))
+    images = detecting.tell(Image, 'image', SENSOR)
+    tell = detecting.tell(CompressedImage, 'image/compressed', SENSOR)
+    data = array('B', cv2.imencode('.png', image)[1].tobytes())
+    detecting.until(lambda: (images.publish(raw(image, 5)), points)[1])
+    detecting.idle(0.5)
+    heard = len(points)
+    detecting.until(lambda: (
+        tell.publish(CompressedImage(header=header(5), format='png', data=data)),
+        detecting.detector._inputs['image/compressed'].received > 2)[1])
+    detecting.until(lambda: (images.publish(raw(image, 6)), stamp_of(points[-1]) == 6)[1])
+    assert [stamp_of(one) for one in points[heard:]].count(5) == 0
+
+
 def test_a_search_is_bounded_and_the_next_image_is_searched(
     graph: Callable[..., Graph]
 ) -> None:
