@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple
 
@@ -44,7 +45,8 @@ class _Worker:
 
     def give(self, number: int, item: Any, seconds: float) -> None:
         self.number, self.deadline = number, time.monotonic() + seconds
-        self.pipe.send(item)
+        with suppress(ConnectionError):  # of a process that has died; whoever listens hears so
+            self.pipe.send(item)
 
     def stop(self) -> None:
         self.pipe.close()

@@ -37,7 +37,7 @@ from fisheye_svp_ros.detect.photographs import (
     message_pixels,
 )
 from fisheye_svp_ros.detect.points import _least_square, find_points
-from fisheye_svp_ros.detect.workers import Late, bounded_map
+from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.optics.camera import project
@@ -598,6 +598,25 @@ def test_work_is_bounded_in_time() -> None:
     results = dict(bounded_map(sleep, [0.0, 0.0, 0.0, 120.0, 0.0, 0.0], 1.0))
     assert results[3] == Late(True)
     assert [results[i] for i in (0, 1, 2, 4, 5)] == [None] * 5
+
+
+def test_a_process_that_dies_between_two_calls_is_replaced() -> None:
+    calls = BoundedCalls(abs, 0)
+
+    def called(item: int) -> Any:
+        while calls.busy:
+            calls.result()
+        calls.start(item, 60.0)
+        while (result := calls.result()) is None:
+            sleep(0.01)
+        return result
+
+    assert called(-1) == 1
+    calls._worker.process.kill()
+    calls._worker.process.wait()
+    assert called(-2) == Late(False)
+    assert called(-3) == 3
+    calls.stop()
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='of glibc alone')
