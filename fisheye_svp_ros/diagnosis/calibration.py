@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.noise import NO_GROSS, Gross, find_gross_errors
-from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
+from fisheye_svp_ros.diagnosis.standard_errors import honest_errors
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
@@ -85,7 +85,7 @@ def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust
     """
     data = prepare(observations)
     evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
-    errors = standard_errors(evidence)
+    errors = honest_errors(evidence)
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
     moved, covariance = _any_target(evidence)
     values = parameter_values(lens, names)

@@ -36,7 +36,7 @@ from fisheye_svp_ros.diagnosis.refit import Local, local_offsets
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, rms_px
 from fisheye_svp_ros.diagnosis.search import Found, drop_test
 from fisheye_svp_ros.diagnosis.similar_views import similar_views
-from fisheye_svp_ros.diagnosis.standard_errors import model_uncertainty, standard_errors
+from fisheye_svp_ros.diagnosis.standard_errors import honest_errors, standard_errors
 from fisheye_svp_ros.scene.observations import Observations
 
 
@@ -96,9 +96,11 @@ class Measured:
     @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
-        if self.quick:
-            return standard_errors(self.evidence, jackknife=False)
-        return np.hypot(standard_errors(self.evidence), model_uncertainty(self.evidence))
+        return self._errors_of(self.evidence)
+
+    def _errors_of(self, evidence: Evidence) -> Array:
+        return (standard_errors(evidence, jackknife=False) if self.quick
+                else honest_errors(evidence))
 
     def _there(self, test: Data, state: State) -> State:
         """Return the state without what other frames had that the test has not."""
@@ -256,7 +258,7 @@ class Measured:
         if self.medium is not None:
             return {}
         base, after = self.found.base, self._free_errors()
-        before = standard_errors(base, jackknife=False)
+        before = self._errors_of(base)
         rig = _rig_columns(base, self.free)
         was, now = base.linear.state.parameters, self.found.state.parameters
         return {

@@ -17,6 +17,11 @@ _MOST = 40  # models
 _WINDOW = 6.0  # of merit: odds of 20, beyond which a model counts for nothing (Occam's window)
 
 
+def honest_errors(evidence: Evidence) -> Array:
+    """Return the standard errors (K,) of all that is shared, other likely models allowed for."""
+    return np.hypot(standard_errors(evidence), model_uncertainty(evidence))
+
+
 def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     """Return the standard errors (K,) of all that is shared: rig, intrinsics, effects.
 

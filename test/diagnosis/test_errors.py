@@ -117,6 +117,19 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     assert found.admissible['e0'].low < 0 < found.admissible['e0'].high
 
 
+def test_a_calibration_says_how_far_off_an_effect_that_it_leaves_out_may_bring_it():
+    """A lens without the viewpoint shift that is there: fx is as far off as is said."""
+    rng = np.random.default_rng(7)
+    pose, views = scene(rng, frames=16)
+    shift = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
+    table = observe(lens(), shift, pose, views, SIGMA, rng)
+    data, names = prepare(table), ('fx', 'fy')
+    state = fit(data, start(data, lens()), names)
+    off = abs(state.lens.fx - lens().fx)
+    assert off > 5 * standard_errors(gather_evidence(data, state, names))[0]
+    assert off < 2 * trust(table, state.lens, names).stderr['fx'] < 4 * off
+
+
 def test_ranges_over_targets_hold_the_one_that_was_believed():
     rng = np.random.default_rng(6)
     pose, views = scene(rng, frames=16)
