@@ -78,15 +78,15 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
     drawn = axis.tricontourf(x, y, height, levels, cmap='RdBu_r', extend='both')
     axis.plot(x, y, '.', color=INK, ms=2)
     figure.colorbar(drawn, ax=axis, label='height / mm', shrink=0.9, format='%.2f')
-    longest = 1e3 * float(np.linalg.norm(board.slide, axis=1).max())
+    label, longest = 'x on the board / mm', 1e3 * float(np.linalg.norm(board.slide, axis=1).max())
     if longest > 0.02 * limit:
         typical = 1e3 * float(np.quantile(np.linalg.norm(board.slide, axis=1), 0.9))
-        scale = typical / (0.06 * float(np.ptp(x)))
-        key = axis.quiver(x, y, *(1e3 * board.slide.T), angles='xy', scale_units='xy',
-                          scale=scale, width=0.003, color=INK)
-        length = round_number(typical)
-        axis.quiverkey(key, 0.3, -0.15, length, f'{length:g} mm along the board', labelpos='E',
-                       fontproperties={'size': 8})
+        larger = round_number(0.06 * float(np.ptp(x)) / typical)
+        axis.quiver(x, y, *(1e3 * board.slide.T), angles='xy', scale_units='xy',
+                    scale=1 / larger, width=0.003, color=INK)
+        label += f'\narrows: along the board, {larger:g} times as large'
+    axis.use_sticky_edges = False  # landmarks at the edge, and their arrows, whole
+    axis.margins(0.08)
     axis.set_aspect('equal')
     axis.grid(visible=False)
-    axis.set(xlabel='x on the board / mm\n', ylabel='y / mm')
+    axis.set(xlabel=label, ylabel='y / mm')

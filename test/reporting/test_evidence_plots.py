@@ -8,25 +8,52 @@ from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from fisheye_svp_ros.diagnosis.target_map import BoardMap
 from fisheye_svp_ros.reporting import evidence_plots
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """Figures as they are drawn, kept in place of files."""
+    kept: list[Figure] = []
+
+    @contextmanager
+    def picture(_: Path, width: float, height: float) -> Iterator[Figure]:
+        kept.append(Figure(figsize=(width, height), layout='constrained'))
+        yield kept[-1]
+
+    monkeypatch.setattr(evidence_plots, 'picture', picture)
+    return kept
+
+
+@pytest.mark.parametrize(('across', 'along'), [(10, 7), (6, 9), (5, 5)])
+def test_the_map_of_a_target_shows_all_of_it_and_says_how_large_arrows_are(
+    across: int, along: int, figures: list[Figure]
+) -> None:
+    grid = np.meshgrid(np.arange(across), np.arange(along))
+    place = 0.03 * np.stack(grid, axis=-1).reshape(-1, 2)
+    offset = np.random.default_rng(1).normal(size=(len(place), 3)) * 1e-4
+    board = BoardMap(0, place, offset[:, 2], offset[:, :2])
+    evidence_plots.draw_target(Path(), [('found', board)])
+    FigureCanvasAgg(figures[0]).draw()
+    axis = figures[0].axes[0]
+    assert 'times as large' in axis.get_xlabel()
+    ends = axis.transData.transform(1e3 * place)
+    inside = [axis.bbox.x0, axis.bbox.y0], [axis.bbox.x1, axis.bbox.y1]
+    assert (ends > inside[0]).all() and (ends < inside[1]).all()
+    label, ticks = axis.xaxis.label.get_window_extent(), axis.get_xticklabels()
+    assert all(label.y1 < tick.get_window_extent().y0 for tick in ticks)
 
 
 @pytest.mark.parametrize('statistics', [(3.6e6, 2.2e5), (40.0, 15.0), (1e4, 1e4), (700.0,)])
 def test_no_tick_label_of_the_evidence_covers_another(
-    statistics: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+    statistics: tuple[float, ...], figures: list[Figure]
 ) -> None:
-    figures: list[Figure] = []
-
-    @contextmanager
-    def picture(_: Path, width: float, height: float) -> Iterator[Figure]:
-        figures.append(Figure(figsize=(width, height), layout='constrained'))
-        yield figures[0]
-
-    monkeypatch.setattr(evidence_plots, 'picture', picture)
     fit = SimpleNamespace(heldout_rms_px=0.5)
     evidence_plots.draw_evidence(Path(), SimpleNamespace(  # type: ignore[arg-type]
         causes=[], base=fit, extended=fit, noise_px=0.1,
