@@ -38,8 +38,8 @@ class Row(NamedTuple):
 
     @property
     def takes_booleans(self) -> bool:
-        """Whether a boolean, as YAML reads true and false, stands for one of the choices."""
-        return {'true', 'false'} <= set(self.choices)
+        """Whether a boolean, as YAML reads true and false, stands for one of the words."""
+        return 'true' in (*self.choices, self.default)
 
     def check(self, value: Any) -> Any:
         """Return the value in the type of the default; raise ParameterError if not allowed."""

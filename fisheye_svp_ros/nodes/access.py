@@ -16,7 +16,7 @@ def allowed(name: str, folder: str, what: str) -> str:
 
     folder: below which a file must lie, symbolic links followed; empty: no file at all.
     """
-    if _NAME.fullmatch(name):
+    if _NAME.fullmatch(name) and not Path(name).is_file():
         return name
     if not folder:
         raise ParameterError(f'{what}: {name[:100]!r} is a file, and only names in config/ are '

@@ -285,12 +285,14 @@ def test_refused_observations_take_no_effect(graph: Callable[..., Graph], tmp_pa
 
 
 def test_files_are_named_below_the_folder_alone(
-    graph: Callable[..., Graph], tmp_path: Path
+    graph: Callable[..., Graph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tmp_path)
     inside, outside = tmp_path / 'mine' / 'a.yaml', tmp_path / 'b.yaml'
     inside.parent.mkdir()
     for path in (inside, outside):
         save_lens(load_lens(lens_path('fish180')), path)
+    Path('plain').write_bytes(outside.read_bytes())
     (inside.parent / 'link.yaml').symlink_to(outside)
     os.mkfifo(inside.parent / 'fifo.yaml')
     with (inside.parent / 'huge.yaml').open('wb') as file:
@@ -299,7 +301,7 @@ def test_files_are_named_below_the_folder_alone(
     assert set_parameter(node, 'lens', str(inside)).successful
     for name, reason in ((outside, 'is not below'), (inside.parent / 'link.yaml', 'is not below'),
                          (inside.parent / 'fifo.yaml', 'is no file'), ('/dev/zero', 'not below'),
-                         (inside.parent / 'huge.yaml', 'above 64 MB')):
+                         (inside.parent / 'huge.yaml', 'above 64 MB'), ('plain', 'not below')):
         result = set_parameter(node, 'lens', str(name))
         assert not result.successful and reason in result.reason, name
     assert node.settings.lens == str(inside)

@@ -183,6 +183,14 @@ def test_svp_is_one_of_three_words(start: Callable[..., Any]) -> None:
         changed(table, {'lens': True})
 
 
+def test_the_true_rig_may_be_named_without_quotes(start: Callable[..., Any]) -> None:
+    node = start('stereo_depth', '-p', 'rig:=true')
+    assert node.settings.rig == 'true'
+    assert set_parameter(node, 'rig', 'topic').successful
+    assert set_parameter(node, 'rig', True).successful and node.settings.rig == 'true'
+    assert not set_parameter(node, 'rig', False).successful
+
+
 def test_an_empty_list_to_sweep_is_refused() -> None:
     with pytest.raises(ParameterError, match=r'sweep.radius is \[\]; a list of at least one'):
         sweep_of(Scenario, {'sweep.radius': []})
