@@ -18,6 +18,7 @@ from fisheye_svp_ros.scene.observations import Views
 
 _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
 _GATE = 6.0  # and within which it belongs to another one
+_CHANCE = 0.01  # that so many do by chance
 _SUSPECT = 6.0  # below this no point is worth a robust fit
 SWAPPED = 'it lies where another landmark is predicted'
 FAR = 'far from its prediction'
@@ -272,10 +273,13 @@ def with_noise_growth(state: State, growth: float) -> State:
 def _fits_another(
     model: Cameras, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
-    """Which far points (S, N) lie where another landmark of the table is predicted."""
+    """Which far points (S, N) lie where another landmark of the table is predicted.
+
+    None where so many would by chance, as dense as landmarks are predicted around their own place.
+    """
     ids, first = np.unique(views.landmark[views.used], return_index=True)
     points = views.points[views.used][first]
-    swapped = np.zeros_like(far)
+    swapped, by_chance = np.zeros_like(far), 0.0
     for view in np.flatnonzero(far.any(axis=1)):
         single = views.take(slice(view, view + 1))._replace(
             points=points[None], board=np.zeros((1, len(ids)), dtype=np.int64),
@@ -288,4 +292,7 @@ def _fits_another(
             other = ids != views.landmark[view, point]
             off = np.linalg.norm(seen - views.uv[view, point], axis=-1)
             swapped[view, point] = bool(np.nanmin(np.where(other, off, np.inf)) < gate)
-    return swapped
+            reach = 2 * off[~other]
+            around = other & (np.linalg.norm(seen - seen[~other], axis=-1) < reach)
+            by_chance += float(np.nan_to_num(around.sum() * (gate / reach) ** 2).sum())
+    return np.asarray(swapped & (special.pdtrc(swapped.sum() - 1, by_chance) < _CHANCE))

@@ -16,7 +16,7 @@ def table_causes(observations: Observations, gross: Gross, step: float) -> list[
     """Return causes in the table: wrong ids, and rounding to a step (px; 0 for none)."""
     causes = []
     swapped = gross.swapped
-    # A point lies on another landmark's prediction by chance once in thousands.
+    # One of many gross errors is chance.
     if swapped > 1 or 2 * swapped >= len(gross.rows) > 0:
         fraction = swapped / len(observations)
         value = {'value': fraction, 'stderr': fraction / np.sqrt(swapped), 'unit': '1'}

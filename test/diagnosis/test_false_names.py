@@ -51,6 +51,20 @@ def test_a_smooth_image_field_is_not_named_after_the_effect_that_it_resembles(se
     assert [cause.effect for cause in found.causes] == []
 
 
+def test_gross_errors_that_hit_another_landmark_by_chance_are_no_wrong_ids():
+    """Far points on a target whose landmarks are a few standard deviations apart."""
+    rng = np.random.default_rng(17)
+    pose, views = scene(rng)
+    table = observe(lens(), (), pose, views, 5 * SIGMA, rng)
+    rows = rng.random(len(table)) < 0.05
+    thrown = rng.normal(size=(rows.sum(), 2)) * 50
+    uv = table.uv.copy()
+    uv[rows] += thrown
+    found = diagnose(replace(table, uv=uv), lens())
+    assert len(found.gross) > 40
+    assert 'wrong_ids' not in {cause.effect for cause in found.causes}
+
+
 def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves():
     rng = np.random.default_rng(12)
     pose, views = scene(rng, cameras=2)
