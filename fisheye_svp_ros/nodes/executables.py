@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.io.parameters import Row, rows
 from fisheye_svp_ros.nodes import NODES
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.io.parameters import Row
 
 
 @contextmanager
@@ -37,6 +40,8 @@ def run(name: str, args: list[str] | None = None) -> int:
 
 def parameters(name: str) -> list[Row]:
     """Return the parameters of a node, its own before those of every node; rclpy must be there."""
+    from fisheye_svp_ros.io.parameters import rows
+
     module = import_module(f'fisheye_svp_ros.nodes.{name}')
     kind = getattr(module, name.title().replace('_', ''))
     return sorted(rows(kind.SETTINGS), key=lambda row: row.name == 'wait_for_subscribers')

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -99,6 +100,15 @@ def test_a_signal_while_a_node_starts_ends_it_quietly(
     status = node.finish(number)
     assert 'Traceback' not in '\n'.join(node.lines), node.lines
     assert status in (0, 130, -number)
+
+
+def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
+    code = ('import sys; before = {*sys.modules}; import fisheye_svp_ros.nodes.executables; '
+            "print(*sorted(name for name in {*sys.modules} - before if 'fisheye' in name))")
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
+                          env=os.environ | {'PYTHONPATH': str(ROOT)})
+    assert done.stdout.split() == [
+        'fisheye_svp_ros', 'fisheye_svp_ros.nodes', 'fisheye_svp_ros.nodes.executables']
 
 
 @pytest.mark.parametrize('name', NODES)
