@@ -22,7 +22,7 @@ from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 
-_RATIOS = (0.3, 3.0)  # to the noise's variance: where the search starts
+_RATIOS = (0.3, 3.0)  # of the noise's variance: where the search starts
 _REACHES = (0.1, 0.4)  # the same, of what separates views
 _LASTING = (0.02, 1.0)  # the same, of the time that the data span
 _BOUND = 30.0  # times a start: as far as the search goes
@@ -73,16 +73,16 @@ class Grouped(NamedTuple):
 
 
 class SimilarViews(NamedTuple):
-    """A fitted process of known views, in units of the noise of each point.
+    """A fitted process of known views.
 
-    ratio: of its variance to that of the noise; reach, in units of `Grouped.seen`; lasting, s,
-    infinite where times are not known; weights (L, V, 2): of known views in predictions; own
-    (S, N, 2): what the others of its landmark predict of each view, px; share: of what noise
-    seemed to be; p_value.
+    variance, px^2 on the axis: it grows with the angle as the noise does; reach, in units of
+    `Grouped.seen`; lasting, s, infinite where times are not known; weights (L, V, 2): of known
+    views in predictions; own (S, N, 2): what the others of its landmark predict of each view, px;
+    share: of what noise seemed to be; p_value.
     """
 
     known: Grouped
-    ratio: float
+    variance: float
     reach: float
     lasting: float
     weights: Array
@@ -100,7 +100,7 @@ class SimilarViews(NamedTuple):
         predicted = np.zeros((*other.row[here].shape, 2))
         for some in _batches(len(here), predicted.shape[1] * known.row.shape[1]):
             between = _Between.of(other.take(here[some]), known.take(there[some]))
-            predicted[some] = self.ratio * between.kernel(
+            predicted[some] = self.variance * between.kernel(
                 self.reach, self.lasting) @ self.weights[there[some]]
         return _in_px(linear, other.row[here], predicted)
 
@@ -128,35 +128,36 @@ class _Between(NamedTuple):
 
 @dataclass(frozen=True)
 class _Process:
-    """What the likelihood is made of: residual (L, V, 2), whitened, zero for padding."""
+    """What the likelihood is made of: residual (L, V, 2), zero for padding, and noise (L, V).
+
+    The noise is its variance, 1 for padding; both px on the axis.
+    """
 
     between: _Between
     there: Mask
     residual: Array
+    noise: Array
 
     @classmethod
-    def of(cls, known: Grouped, residual: Array) -> _Process:
-        return cls(_Between.of(known, known), known.there, residual)
+    def of(cls, known: Grouped, residual: Array, noise: Array) -> _Process:
+        return cls(_Between.of(known, known), known.there, residual, noise)
 
-    def covariance(self, ratio: float, reach: float, lasting: float) -> Array:
-        """Return the covariance (L, V, V) over the variance of the noise, 1 for padding.
-
-        ratio: of the process's variance to that of the noise.
-        """
+    def covariance(self, variance: float, reach: float, lasting: float) -> Array:
+        """Return the covariance (L, V, V)."""
         both = self.there[:, :, None] & self.there[:, None]
-        process = np.where(both, ratio * self.between.kernel(reach, lasting), 0.0)
-        return np.asarray(process + np.eye(both.shape[1]))
+        process = np.where(both, variance * self.between.kernel(reach, lasting), 0.0)
+        return np.asarray(process + self.noise[..., None] * np.eye(both.shape[1]))
 
-    def log_likelihood(self, ratio: float, reach: float, lasting: float) -> float:
-        """Return the log likelihood but for a constant, the noise's variance at its best."""
-        covariance = self.covariance(ratio, reach, lasting)
+    def log_likelihood(self, variance: float, reach: float, lasting: float) -> float:
+        """Return the log likelihood but for a constant, the scale of all variances at its best."""
+        covariance = self.covariance(variance, reach, lasting)
         root = np.linalg.cholesky(covariance)
         log_det = 2 * float(np.log(np.einsum('lvv->lv', root)).sum())
         squares = float((self.residual * np.linalg.solve(covariance, self.residual)).sum())
         return float(-log_det - self.there.sum() * np.log(max(squares, 1e-300)))
 
     def best(self, starts: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
-        """Return ratio, reach and lasting of the highest likelihood."""
+        """Return variance, reach and lasting of the highest likelihood."""
 
         def lost(logarithms: Array) -> float:
             return -self.log_likelihood(*_three(logarithms))
@@ -178,13 +179,19 @@ def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
     if views < 2:
         return None
     by_view = whitened.reshape(data.frames, data.cameras, -1, 2)[data.frame_of, data.camera_of]
-    residual = np.where(known.there[..., None], by_view.reshape(-1, 2)[known.row], 0.0)
+    # A detector's sigma is of its noise, and not of what comes again.
+    sigma = 1 / np.where(data.views.used, data.views.weight, 1.0)
+    residual = np.where(
+        known.there[..., None], (by_view * sigma[..., None]).reshape(-1, 2)[known.row], 0.0)
+    noise = np.where(known.there, (sigma**2).ravel()[known.row], 1.0)
+    typical = float(noise[known.there].mean())
     few = slice(min(views, _MOST_VIEWS))
     every = int(np.ceil(count * float(few.stop) ** 3 / _MOST_CUBES))
-    process = _Process.of(known.take(slice(None, None, every), few), residual[::every, few])
+    process = _Process.of(
+        known.take(slice(None, None, every), few), residual[::every, few], noise[::every, few])
     span = float(np.ptp(known.t[known.there]))
     lasting = [(span * part,) for part in _LASTING] if span > 0 else [()]
-    starts = [(ratio, reach, *lasts)
+    starts = [(ratio * typical, reach, *lasts)
               for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)]
     found = process.best(starts)
     gain = process.log_likelihood(*found) - process.log_likelihood(0.0, *found[1:])
@@ -193,12 +200,12 @@ def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
         return None
     weights, own = np.zeros((2, *residual.shape))
     for some in _batches(count, views**2):
-        one = _Process.of(known.take(some), residual[some])
+        one = _Process.of(known.take(some), residual[some], noise[some])
         inverse = np.linalg.inv(one.covariance(*found))
         weights[some] = inverse @ one.residual
         own[some] = one.residual - weights[some] / np.einsum('lvv->lv', inverse)[..., None]
     return SimilarViews(known, *found, weights, _in_px(linear, known.row, own),
-                        found[0] / (1 + found[0]), p)
+                        found[0] / (typical + found[0]), p)
 
 
 def _batches(landmarks: int, size: int) -> Iterator[slice]:
@@ -208,14 +215,14 @@ def _batches(landmarks: int, size: int) -> Iterator[slice]:
 
 
 def _three(logarithms: Array) -> tuple[float, float, float]:
-    """Return ratio, reach and lasting; without times, a process that lasts."""
-    ratio, reach, lasting = [*np.exp(logarithms), np.inf][:3]
-    return float(ratio), float(reach), float(lasting)
+    """Return variance, reach and lasting; without times, a process that lasts."""
+    variance, reach, lasting = [*np.exp(logarithms), np.inf][:3]
+    return float(variance), float(reach), float(lasting)
 
 
-def _in_px(linear: Linearised, row: Index, whitened: Array) -> Array:
-    """Return whitened values (L, V, 2) of rows (L, V) as (S, N, 2), px, zero elsewhere."""
-    placed = np.zeros((linear.weight.size, 2))
-    there = row >= 0
-    placed[row[there]] = whitened[there] / linear.weight.ravel()[row[there], None]
-    return placed.reshape(*linear.weight.shape, 2)
+def _in_px(linear: Linearised, row: Index, values: Array) -> Array:
+    """Return values (L, V, 2), on the axis, of rows (L, V) as (S, N, 2), px, zero elsewhere."""
+    placed, there = np.zeros((linear.weight.size, 2)), row >= 0
+    placed[row[there]] = values[there]
+    grown = linear.data.views.weight / np.where(linear.weight > 0, linear.weight, 1.0)
+    return placed.reshape(*linear.weight.shape, 2) * grown[..., None]

@@ -89,9 +89,9 @@ def test_each_view_is_predicted_from_the_others_of_its_landmark():
     for landmark in (0, 11, 40):
         mine = view[landmark] == left
         others = known.there[landmark] & ~mine
-        covariance = process.ratio * kernel[landmark] + np.eye(len(mine))
+        covariance = process.variance * kernel[landmark] + np.eye(len(mine))
         told = rows[view[landmark][others], int(known.key[landmark, 1])]
-        expected = process.ratio * kernel[landmark][np.ix_(mine, others)] @ np.linalg.solve(
+        expected = process.variance * kernel[landmark][np.ix_(mine, others)] @ np.linalg.solve(
             covariance[np.ix_(others, others)], told)
         np.testing.assert_allclose(
             process.own[left, int(known.key[landmark, 1])], expected[0], rtol=1e-6, atol=1e-9)
@@ -112,6 +112,17 @@ def test_views_of_unknown_time_are_like_none():
     timeless = linearised(replace(table, t=np.full(len(table), np.nan)))
     assert not process.at(timeless).any()
     assert similar_views(timeless, timeless.residual).lasting == np.inf
+
+
+def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
+    """In px: the scale of sigma is no part of what comes again."""
+    table = photographed(0.1)
+    stated = replace(table, sigma=np.full(len(table), NOISE))
+    linear, plain = linearised(stated), linearised(table)
+    process = similar_views(linear, linear.residual)
+    np.testing.assert_allclose(process.at(plain), process.at(linear), atol=1e-6)
+    np.testing.assert_allclose(
+        process.at(plain), similar_views(plain, plain.residual).at(plain), rtol=0.02, atol=2e-3)
 
 
 def test_landmarks_that_were_never_seen_are_left_alone():
