@@ -72,9 +72,9 @@ class Measured:
         self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
         self.evidence = found.evidence
         self.names = [effect.name for effect, _, _ in found.causes]
-        self.local: Local = local_offsets(found.fitted)._replace(
-            views=similar_views(found.fitted.linear, conditional_residuals(found.fitted)))
-        views = self.local.views
+        self.remaining = conditional_residuals(found.fitted)
+        views = similar_views(found.fitted.linear, self.remaining)
+        self.local: Local = local_offsets(found.fitted)._replace(views=views)
         self.noise = noise_px(found.evidence)
         if views is not None:
             self.noise *= float(np.sqrt(1 - views.share))
@@ -197,9 +197,8 @@ class Measured:
     @property
     def extended(self) -> FitQuality:
         """Causes and predicted local offsets."""
-        remaining = conditional_residuals(self.found.fitted)
-        chi2 = float((remaining**2).sum()) / self._noise_square / self.evidence.full.rows
-        return FitQuality(rms_px(self.evidence.linear, remaining), self._best.rms, chi2)
+        chi2 = float((self.remaining**2).sum()) / self._noise_square / self.evidence.full.rows
+        return FitQuality(rms_px(self.evidence.linear, self.remaining), self._best.rms, chi2)
 
     @property
     def gain(self) -> Gain:

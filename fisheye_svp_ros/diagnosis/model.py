@@ -47,6 +47,10 @@ class Data:
         rows = self.cameras * values.shape[1] * values.shape[2]
         return blocks.reshape(self.frames, rows, *values.shape[3:])
 
+    def by_view(self, blocks: Array) -> Array:
+        """Return blocks (F, C * N * 2) by view and point, (S, N, 2)."""
+        return blocks.reshape(self.frames, self.cameras, -1, 2)[self.frame_of, self.camera_of]
+
 
 @dataclass(frozen=True)
 class State:

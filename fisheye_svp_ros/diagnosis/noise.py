@@ -177,8 +177,7 @@ def outlying(
     squares: of the standardised residuals (F, M).
     """
     views = data.views
-    pairs = squares.reshape(data.frames, data.cameras, -1, 2).sum(axis=-1)
-    pairs = pairs[data.frame_of, data.camera_of]
+    pairs = data.by_view(squares).sum(axis=-1)
     limit = -2 * np.log(_OUTLYING / max(int(views.used.sum()), 1))
     mask = views.used & (pairs > limit)
     mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]

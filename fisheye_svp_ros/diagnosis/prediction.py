@@ -104,8 +104,9 @@ def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldO
     plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
     data = test if local is None else local.applied(test)
     fitted = fit_poses(data, plain)
-    if local is not None:
-        data = local.without_repeated(data, replace(fitted, terms=state.terms))
+    if local is not None and local.views is not None:
+        repeated = local.views.at(Linearised(data, replace(fitted, terms=state.terms), ()))
+        data = replace(data, views=data.views._replace(uv=data.views.uv - repeated))
         fitted = fit_poses(data, fitted)
     linear = Linearised(data, fitted, ())
     return _figures(linear, linear.residual)

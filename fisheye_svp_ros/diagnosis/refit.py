@@ -68,7 +68,7 @@ class Local(NamedTuple):
     def applied(self, data: Data) -> Data:
         """Return data with landmarks where they are predicted and the image field taken out.
 
-        What hangs on the views is left to `without_repeated`: it takes poses.
+        What hangs on the views takes poses, and stays.
         """
         views = data.views
         points = views.points + at_landmarks(views, self.landmark, self.offset)
@@ -77,13 +77,6 @@ class Local(NamedTuple):
             mine = views.used & (data.camera_of[:, None] == grid.camera)
             uv -= bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
         return replace(data, views=views._replace(points=points, uv=uv))
-
-    def without_repeated(self, data: Data, state: State) -> Data:
-        """Return data that `applied` has returned without what other views predict of them."""
-        if self.views is None:
-            return data
-        uv = data.views.uv - self.views.at(Linearised(data, state, ()))
-        return replace(data, views=data.views._replace(uv=uv))
 
 
 def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> State:

@@ -178,11 +178,11 @@ def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
     count, views = known.row.shape
     if views < 2:
         return None
-    by_view = whitened.reshape(data.frames, data.cameras, -1, 2)[data.frame_of, data.camera_of]
     # A detector's sigma is of its noise, and not of what comes again.
     sigma = 1 / np.where(data.views.used, data.views.weight, 1.0)
     residual = np.where(
-        known.there[..., None], (by_view * sigma[..., None]).reshape(-1, 2)[known.row], 0.0)
+        known.there[..., None],
+        (data.by_view(whitened) * sigma[..., None]).reshape(-1, 2)[known.row], 0.0)
     noise = np.where(known.there, (sigma**2).ravel()[known.row], 1.0)
     typical = float(noise[known.there].mean())
     few = slice(min(views, _MOST_VIEWS))
