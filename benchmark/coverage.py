@@ -1,12 +1,13 @@
 """Do 95 % intervals cover?  `python -m benchmark.coverage DATA.csv... --image-size 1280x800`.
 
-A lens is calibrated and diagnosed on half of the frames.  In each frame of the other half the
-camera is posed from the left and from the right half of the points, and from the upper and the
-lower one: the differences should lie within their intervals in 95 of 100 cases, by noise alone,
-with the lens's parameters, and with the misfit that remains (`diagnosis.uncertainty`).  Without a
-table: simulated cameras with displaced landmarks and an image field that no catalogue holds, of
-which the truth is known: poses of the other half, and points that two of the cameras see as a rig,
-by what the lens files carry (`diagnosis.lens_errors`).  Writes docs/coverage.json.
+A lens is calibrated and diagnosed on half of the frames, every other one, or dealt at random
+several times (`--deals`).  In each frame of the other half the camera is posed from the left and
+from the right half of the points, and from the upper and the lower one: the differences should lie
+within their intervals in 95 of 100 cases, by noise alone, with the lens's parameters, and with the
+misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with displaced
+landmarks and an image field that no catalogue holds, of which the truth is known: poses of the
+other half, and points that two of the cameras see as a rig, by what the lens files carry
+(`diagnosis.lens_errors`).  Writes docs/coverage.json.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -68,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('tables', type=Path, nargs='*', help='of one camera and board')
     parser.add_argument('--image-size', default='1280x800')
     parser.add_argument('--name', help='of the data in the output')
+    parser.add_argument('--deals', type=int, default=0, help='random ones, to halves')
     parser.add_argument('--cameras', type=int, default=20, help='simulated ones')
     parser.add_argument('-o', '--output', type=Path, default=Path('docs/coverage.json'))
     asked = parser.parse_args(arguments)
@@ -78,9 +81,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     halves: list[Array] = []
     poses: list[Array] = []
     lenses: list[Lens] = []
-    with progress('halves', 2 * len(sets)) as advance:
-        for one in sets:
+    deals = max(asked.deals, 1)
+    with progress('halves', 2 * len(sets) * deals) as advance:
+        for one, deal in product(sets, range(deals)):
             frames = one.table.frames
+            if asked.deals:
+                frames = np.random.default_rng([6, deal]).permutation(frames)
             for half in (0, 1):
                 mine = np.isin(one.table.frame, frames[half::2])
                 test = one.table.take(~mine)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.components import component_traces
-from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, swept
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse, swept
 from fisheye_svp_ros.diagnosis.mixed import factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE
@@ -48,20 +51,43 @@ def stage_of(effect: str) -> str:
 def cause_squares(evidence: Evidence, causes: Sequence[Placed]) -> dict[str, float]:
     """Return the mean squared displacement of each cause, px^2, poses and intrinsics taken out.
 
-    What two causes do together is shared between them, so that the sum is what all of them do.
+    What causes do together is shared between them by Shapley's value: the mean, over all orders,
+    of what each adds to those before it.  None is negative, even where two undo each other, and
+    the sum is what all of them do.
+
+    Source: Lindeman, Merenda and Gold, Introduction to Bivariate and Multivariate Analysis (1980),
+    section 4.3.
     """
     nothing = np.full(len(NAMES), GONE)
     f = factored(
         evidence.full.trimmed(nothing < GONE), nothing, evidence.variances.weight
     )
     every = np.zeros(evidence.own)
-    named = [np.zeros(0, dtype=np.int64), *(columns for _, columns, _ in causes)]
-    rest = np.setdiff1d(np.arange(evidence.own), np.concatenate(named))
-    remaining = swept(f.information, rest)[: evidence.own, : evidence.own]
+    named = [columns for _, columns, _ in causes]
     for _, columns, values in causes:
         every[columns] = values * evidence.scale[columns]
-    parts = every * (remaining @ every) * _px2(evidence)
-    return {e.name: max(float(parts[columns].sum()), 0.0) for e, columns, _ in causes}
+    rest = np.setdiff1d(np.arange(evidence.own), _joined(named))
+    remaining = swept(f.information, rest)[: evidence.own, : evidence.own]
+    signal = remaining @ every
+
+    @cache
+    def explained(some: tuple[int, ...]) -> float:
+        mine = _joined([named[one] for one in some])
+        inverse, _ = pseudo_inverse(remaining[np.ix_(mine, mine)])
+        return float(signal[mine] @ inverse @ signal[mine])
+
+    px2, count = _px2(evidence), len(causes)
+    squares = {}
+    for one, (effect, _, _) in enumerate(causes):
+        others = [other for other in range(count) if other != one]
+        added = [np.mean([explained(tuple(sorted((*some, one)))) - explained(some)
+                          for some in combinations(others, size)]) for size in range(count)]
+        squares[effect.name] = max(float(np.mean(added)), 0.0) * px2
+    return squares
+
+
+def _joined(columns: Sequence[Index]) -> Index:
+    return np.concatenate([np.zeros(0, dtype=np.int64), *columns])
 
 
 def _px2(evidence: Evidence) -> float:
@@ -71,17 +97,17 @@ def _px2(evidence: Evidence) -> float:
 
 
 def budget(
-    evidence: Evidence, named: Sequence[Placed], p_values: Mapping[str, float],
+    evidence: Evidence, squares: Mapping[str, float], p_values: Mapping[str, float],
     causes: Mapping[str, float], repeated: SimilarViews | None = None,
 ) -> list[Component]:
     """Return all parts: of the catalogue (p-values by name), random components, noise.
 
-    named: the effects that were found; causes: their p-values; p_values: of the random components
-    that are there; repeated: what of the noise comes again in similar views.
+    squares: of the effects that were found (`cause_squares`); causes: their p-values; p_values:
+    of the random components that are there; repeated: what of the noise comes again in similar
+    views.
     """
     px, variances = _px2(evidence), evidence.variances
     traces = component_traces(evidence.full, evidence.variances)
-    squares = cause_squares(evidence, named)
     parts: list[tuple[str, str, float, bool, float]] = []
     for stage in STAGES[:3]:
         there = [name for name in squares if stage_of(name) == stage]

@@ -218,7 +218,7 @@ class Measured:
 
     def causes(self, components: Sequence[Component]) -> list[Cause]:
         """Return the causes that move predictions, with what each adds."""
-        squares = cause_squares(self.evidence, self.found.causes)
+        squares = self._squares
         named = sum(c.share for c in components if c.named_share)
         total = sum(squares.values())
         shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
@@ -243,8 +243,12 @@ class Measured:
         found = {effect.name: drop_test(evidence, own, columns).p_value
                  for effect, columns, _ in self.found.causes}
         parts = budget(
-            evidence, self.found.causes, p_values, found | dict(noise_causes), self.local.views)
+            evidence, self._squares, p_values, found | dict(noise_causes), self.local.views)
         return parts if self.medium is None else self.medium.budget(parts)
+
+    @cached_property
+    def _squares(self) -> dict[str, float]:
+        return cause_squares(self.evidence, self.found.causes)
 
     def _free_errors(self) -> dict[str, float]:
         """Return the standard errors of what was free from the start."""

@@ -1,0 +1,53 @@
+"""The variance budget: what several causes do together, shared between them."""
+
+import numpy as np
+import pytest
+from helpers.scenes import lens, observe, scene
+
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.budget import cause_squares
+from fisheye_svp_ros.diagnosis.evidence import bare_evidence
+from fisheye_svp_ros.diagnosis.model import prepare
+from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+
+
+@pytest.fixture
+def state():
+    """Return data and a fit that holds three causes, two of which undo most of each other."""
+    rng = np.random.default_rng(4)
+    pose, views = scene(rng, 1, 12)
+    terms = [(CATALOGUE['decentering'](), np.array([0.004, 0.002])),
+             (CATALOGUE['skew'](), np.array([3e-4]))]
+    data = prepare(observe(lens(), tuple(terms), pose, views, 0.1, rng))
+    found = with_effect(start(data, lens()), *terms[0])
+    for name in ('sensor_tilt', 'skew'):
+        found = with_effect(found, CATALOGUE[name]())
+    return data, fit(data, found, ('cx', 'cy'))
+
+
+def displacement(evidence, names):
+    """Return the mean squared displacement by some causes, px^2, beside poses and intrinsics."""
+    linear = evidence.linear
+    shared = linear.shared_columns
+    signal = np.zeros(linear.residual.shape)
+    for effect, columns, values in evidence.terms:
+        if effect.name in names:
+            signal += shared[..., columns] @ values
+    frames, rows, _ = linear.frame_columns.shape
+    poses = np.zeros((frames, rows, frames, 6))
+    poses[np.arange(frames), :, np.arange(frames)] = linear.frame_columns
+    taken = np.concatenate([poses.reshape(frames * rows, -1),
+                            shared[..., :2].reshape(frames * rows, -1)], axis=1)
+    apart = signal.ravel() - taken @ np.linalg.lstsq(taken, signal.ravel(), rcond=None)[0]
+    weight = linear.row_weight[linear.used]
+    return 2 * float(np.mean((apart[linear.used.ravel()] / weight) ** 2))
+
+
+def test_shares_add_up_to_what_all_causes_do_together(state):
+    """Two that undo each other are worth little, not one a lot and the other nothing."""
+    evidence = bare_evidence(*state, ('cx', 'cy'))
+    squares = cause_squares(evidence, evidence.terms)
+    assert list(squares) == ['decentering', 'sensor_tilt', 'skew']
+    assert min(squares.values()) > 0
+    assert sum(squares.values()) == pytest.approx(displacement(evidence, squares), rel=1e-6)
