@@ -75,7 +75,7 @@ def read(path):
 
 READER = Reader('a .semicolon file', lambda path: path.suffix == '.semicolon', __name__)
 '''
-ENTRY_POINTS = '''
+ENTRY_POINTS = """
 [fisheye_svp_ros.image_heights]
 rational = my_optics:Rational
 [fisheye_svp_ros.viewpoint_shifts]
@@ -84,14 +84,14 @@ squared = my_optics:Squared
 trefoil = my_optics:Trefoil
 [fisheye_svp_ros.readers]
 semicolon = my_optics:READER
-'''
-LENS = '''
+"""
+LENS = """
 image: {width: 1280, height: 960}
 projection: {model: rational, f: 400.0, cx: 640.0, cy: 480.0, a: 0.05}
 viewpoint_shift: {model: squared, b: 0.004}
 corrections: {trefoil: {parameters: {cosine: 1.5, sine: -0.8}}}
-'''
-USE = '''
+"""
+USE = """
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -141,7 +141,7 @@ if sys.argv[1] == 'numpy':
     assert named.table()['effect'] == ['trefoil'], named.document['causes']
     assert abs(named.lens.corrections['trefoil']['parameters']['cosine'] - 1.5) < 0.2
 print('done')
-'''
+"""
 
 
 def run(folder, *arguments):

@@ -327,7 +327,7 @@ def _foreign(folder: Path) -> Trial:
                        b'</image_width><image_height>480</image_height></opencv_storage>\n',
         'cahvore.cameramodel': b"{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0.37', 'imagersize': "
                                b"[800, 800], 'intrinsics': [300.0, 300.0, 400.0, 400.0, 0, 0, "
-                               b"0.01, -0.02, 0.003, 0.004, 0.001, 0]}",
+                               b'0.01, -0.02, 0.003, 0.004, 0.001, 0]}',
         'boofcv.yaml': b'model: omnidirectional_universal\npinhole: {width: 640, height: 720, fx: '
                        b'400.0, fy: 400.0, cx: 320.0, cy: 360.0}\nmirror_offset: 0.9\n'
                        b'radial_tangential: {radial: [-0.1, 0.01], t1: 0.0, t2: 0.0}\n',

@@ -258,7 +258,7 @@ def _refuse_made_up(file: Path) -> None:
     address = f'file:{quote(str(file.absolute()))}?mode=ro'
     with closing(sqlite3.connect(address, uri=True)) as database:
         made_up = database.execute(
-            "SELECT 1 FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE c.hidden "
+            'SELECT 1 FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE c.hidden '
             "OR m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL %' LIMIT 1").fetchone()
         if made_up or database.execute(
                 "SELECT 1 FROM messages WHERE typeof(data) <> 'blob' LIMIT 1").fetchone():

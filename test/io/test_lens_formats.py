@@ -184,7 +184,7 @@ def test_boofcv() -> None:
      'a matrix of 3 x 3'),
     (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
     (CAMCHAIN.replace('158.0', '0', 1), 'no numbers of a lens'),
-    (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r"camera_model is"),
+    (CAMCHAIN.replace('camera_model: ds', 'camera_model: [ds]'), r'camera_model is'),
     (CAMCHAIN.replace('0.00020293673', '1e300'), 'must be a list of 4 finite numbers'),
     (CAMCHAIN.replace('T_cn_cnm1:\n  - [ 0.99998854, 0.00216014, 0.00427195,-0.11003785]',
                       'T_cn_cnm1:\n  - [{}, 0.00216014, 0.00427195,-0.11003785]'),
