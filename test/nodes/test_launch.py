@@ -183,6 +183,9 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
     os.kill(pid, signal.SIGKILL)
     again = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
     assert again != pid
+    # Interrupted while it starts a process, launch loses the task that waits for its end (its
+    # KeyboardInterrupt is raised there), and never ends.
+    mono.wait_for(r'\[localizer-\d\] .*solving with the lens')
 
 
 def test_a_rig_and_its_points_resolve(
