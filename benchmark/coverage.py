@@ -7,7 +7,7 @@ within their intervals in 95 of 100 cases, by noise alone, with the lens's param
 misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with displaced
 landmarks and an image field that no catalogue holds, of which the truth is known: poses of the
 other half, and points that two of the cameras see as a rig, by what the lens files carry
-(`diagnosis.lens_errors`).  Writes docs/coverage.json.
+(`diagnosis.lens_errors`); how often each cause was named.  Writes docs/coverage.json.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import product
@@ -81,6 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     halves: list[Array] = []
     poses: list[Array] = []
     lenses: list[Lens] = []
+    named: Counter[str] = Counter()
     deals = max(asked.deals, 1)
     with progress('halves', 2 * len(sets) * deals) as advance:
         for one, deal in product(sets, range(deals)):
@@ -92,12 +94,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 test = one.table.take(~mine)
                 found = diagnosed(one.table.take(mine), one.size)
                 halves.append(pulls_of(found, test))
+                named.update(cause.effect for cause in found.causes)
                 if one.poses is not None:
                     poses.append(against_truth(found.lens, test, one.poses))
                 if not half:
                     lenses.append(found.lens)
                 advance()
-    told = coverage(halves)
+    told = coverage(halves) | {'halves': len(halves), 'named': dict(named.most_common())}
     if not asked.tables:
         told |= {'poses': coverage(poses), 'stereo points': coverage(
             of_a_rig(sets[i:i + 2], lenses[i:i + 2]) for i in range(0, len(sets) - 1, 2))}

@@ -15,6 +15,8 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, PlaneEffect, Scene, 
 class FocalDriftEffect(PlaneEffect):
     """A relative change of the focal length as a polynomial of time, constant left out.
 
+    Before and after the frames that it was found on it stays as it was at their ends, since a
+    polynomial says nothing of other times.
     means (degree,): what of each Legendre polynomial is a constant, its mean over the frames where
     they are known: the lens's own focal length is then that of the whole recording, and not that
     of a time in a pause.
@@ -49,6 +51,6 @@ class FocalDriftEffect(PlaneEffect):
         return np.asarray(scene.normalised()[..., None] * powers[:, None, None, :])
 
     def _polynomials(self, t: Array) -> Array:
-        x = 2 * (t - self.start) / self.duration - 1
+        x = np.clip(2 * (t - self.start) / self.duration - 1, -1, 1)
         powers = np.polynomial.legendre.legvander(x, self.degree)[..., 1:]
         return np.asarray(powers - (self.means or 0.0))
