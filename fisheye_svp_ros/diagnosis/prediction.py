@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.adjustment import fit_poses, moved
+from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, moved
 from fisheye_svp_ros.diagnosis.evidence import Evidence, pseudo_inverse
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
-from fisheye_svp_ros.diagnosis.refit import Local
+from fisheye_svp_ros.diagnosis.refit import Local, refit
 
 _RESAMPLES = 2000
 _FAR = 5.0  # times the median frame
+_LINEAR = 3.0  # px rms: how far a step that is taken to be linear may move image points
 
 
 class HeldOut(NamedTuple):
@@ -113,14 +114,23 @@ def on_other_data(test: Data, state: State, local: Local | None = None) -> HeldO
 
 
 def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]) -> State:
-    """Return the state without some of its effects, the rest fitted anew (one linear step)."""
+    """Return the state without some of its effects, the rest fitted anew.
+
+    By one linear step; where that is too long to be linear, step by step.
+    """
     linear = evidence.linear
     kept, change, _ = _refitted(evidence, evidence.information, names, ())
     shared = np.zeros(evidence.own)
     shared[kept] = change
-    state = linear.state
+    moves = (linear.shared_columns @ shared)[linear.used] / linear.row_weight[linear.used]
+    if np.sqrt(2 * np.mean(moves**2)) > _LINEAR:
+        state = fit(linear.data, _without(linear.state, names), free)
+        return refit(linear.data, state, free, evidence.variances)
     frame = np.zeros((linear.data.frames, 6))
-    state = moved(linear.data, state, free, frame, shared)
+    return _without(moved(linear.data, linear.state, free, frame, shared), names)
+
+
+def _without(state: State, names: Collection[str]) -> State:
     return replace(state, terms=tuple(t for t in state.terms if t[0].name not in names))
 
 
