@@ -69,14 +69,16 @@ class TraceStep:
     why: str
 
 
-def candidates(evidence: Evidence, included: Index) -> list[Candidate]:
-    """Return all forms, best merit first."""
+def candidates(
+    evidence: Evidence, included: Index, per_frame: bool = True
+) -> list[Candidate]:
+    """Return all forms, best merit first; per_frame: also those that differ in each frame."""
     remaining = evidence.remaining(evidence.information, included)
     found = []
     for form, effect in enumerate(evidence.forms.effects):
         columns = evidence.columns_of(form)
         score = evidence.score(remaining, columns)
-        if not score.rank or _impossible(effect, score):
+        if not score.rank or _impossible(effect, score) or effect.per_frame > per_frame:
             continue
         gain, count = score.statistic, score.rank
         if effect.per_frame:  # what it is in single frames is one variance, as in its twins

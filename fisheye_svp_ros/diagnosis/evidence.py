@@ -36,6 +36,7 @@ _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them field
 _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
 _FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
 _TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # the same, of one coefficient of an effect
+_ANEW = 6  # steps: the likelihood is flat around the best variances
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
 Placed = tuple[Effect, Index, Array]  # an effect, its columns among what is shared, its values
@@ -193,7 +194,7 @@ class Evidence:
         fields = self.with_field
         if varying and self.linear.data.cameras > 1:
             fields = [*fields, *((f.log_determinant, f.information) for f in (
-                self.without_frames, self._frames_anew(included)))]
+                self.without_frames, self._frames_anew))]
         for logs, information in fields:
             rest = self.remaining(information, included)
             remaining = rest[-1, -1]
@@ -233,7 +234,7 @@ class Evidence:
             rest = self.remaining(information, included)
             return logs + count * float(np.log(rest[-1, -1]))
 
-        parts = [self.factored, self.without_frames, self._frames_anew(included)]
+        parts = [self.factored, self.without_frames, self._frames_anew]
         return min(cost(f.log_determinant, f.information) for f in parts) - min(
             cost(*_integrated(f, columns, 1 / size)) for f in parts for size in _TURNS)
 
@@ -243,22 +244,16 @@ class Evidence:
         return self._factored_by(
             replace(self.variances, lam=np.where(_OF_FRAMES, GONE, self.variances.lam)))
 
-    def _frames_anew(self, included: Index) -> Factored:
-        """Return the equations with all that single frames have of their own, factored.
+    @cached_property
+    def _frames_anew(self) -> Factored:
+        """The equations with all that single frames have of their own found anew, factored.
 
         Beside the whole catalogue its effects that change with time take a part of that.
         """
-        key = included.tobytes()
-        if key not in self._anew:
-            eq = self.beside(included)
-            start = np.where(_OF_FRAMES, start_variances(eq).lam, self.variances.lam)
-            self._anew[key] = self._factored_by(
-                estimate(eq, replace(self.variances, lam=start))[0])
-        return self._anew[key]
-
-    @cached_property
-    def _anew(self) -> dict[bytes, Factored]:
-        return {}
+        eq = self.beside(np.arange(self.own))
+        start = np.where(_OF_FRAMES, start_variances(eq).lam, self.variances.lam)
+        found, _ = estimate(eq, replace(self.variances, lam=start), _ANEW)
+        return self._factored_by(found)
 
     def _factored_by(self, variances: Variances) -> Factored:
         return factored(self.full.trimmed(variances.alive), variances.lam, variances.weight)

@@ -101,9 +101,9 @@ def _likely_models(evidence: Evidence) -> list[_Model]:
     while waiting and len(found) < _MOST:
         forms, model = max(waiting.items(), key=lambda item: item[1].merit)
         found[forms] = waiting.pop(forms)
-        for one in candidates(evidence, model.included):
+        for one in candidates(evidence, model.included, per_frame=False):
             kinds = set(one.effect.kinds)
-            if one.merit <= 0 or one.effect.per_frame or model.kinds & kinds:
+            if one.merit <= 0 or model.kinds & kinds:
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, evidence.columns_of(one.form)])
@@ -122,7 +122,7 @@ def _exchanged(evidence: Evidence) -> Iterator[tuple[frozenset[int], _Model]]:
         rest = np.setdiff1d(np.arange(evidence.own), columns)
         score = evidence.score(evidence.remaining(evidence.information, rest), columns)
         lost = score.statistic - score.rank * np.log(evidence.full.rows)
-        for one in candidates(evidence, rest):
+        for one in candidates(evidence, rest, per_frame=False):
             kinds = frozenset(one.effect.kinds)
             if one.merit > lost - _WINDOW and _lasts(one.effect) and not evidence.kinds & kinds:
                 included = np.concatenate([rest, evidence.columns_of(one.form)])
