@@ -1,4 +1,7 @@
-"""CSV tables with a header: columns as numbers, with errors that name file, line and column."""
+"""CSV tables with a header: columns as numbers, with errors that name file, line and column.
+
+Cells are separated by commas, or by semicolons or tabs, as spreadsheets write them.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +31,8 @@ class CsvTable:
         self._lines: list[int] = []
         rows = []
         try:
-            reader = csv.reader(io.StringIO(read_text(path, ObservationError), newline=''))
+            text = read_text(path, ObservationError)
+            reader = csv.reader(io.StringIO(text, newline=''), delimiter=_separator(text))
             self._header = [name.strip() for name in next(reader, [])]
             self._check_header(required)
             for row in reader:
@@ -114,10 +118,17 @@ class CsvTable:
         try:
             values = np.array(cells, dtype=float)
         except ValueError:
-            self.refuse([not _is_number(cell) for cell in cells], name, 'a number')
+            comma = ', with a decimal point,' if any(',' in cell for cell in cells) else ''
+            self.refuse([not _is_number(cell) for cell in cells], name, f'a number{comma}')
             raise
         self.refuse(~np.isfinite(values), name, 'a finite number')
         return values
+
+
+def _separator(text: str) -> str:
+    """Return what separates the cells: a semicolon or tab where the header has no comma."""
+    header = text.partition('\n')[0]
+    return next((one for one in ';\t' if one in header and ',' not in header), ',')
 
 
 def _is_number(cell: str) -> bool:

@@ -38,7 +38,8 @@ def _holds(pattern: str) -> Callable[[Path], bool]:
 _HERE = 'fisheye_svp_ros.io'
 READERS: Registry[Reader] = Registry('readers', {
     reader.form: reader for reader in (
-        Reader('a .csv file', lambda path: path.suffix == '.csv', f'{_HERE}.observations_csv'),
+        Reader('a .csv file', lambda path: path.suffix.lower() == '.csv',
+               f'{_HERE}.observations_csv'),
         Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_HERE}.orpc'),
         Reader('a folder of .orpc files', _holds('*.orpc'), f'{_HERE}.orpc'),
         Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap',

@@ -79,6 +79,12 @@ class TestObservationsCsv:
         np.testing.assert_array_equal(table.xyz, [[0.1, 0.2, 0.3]] * 2)
         assert table.source == str(path)
 
+    @pytest.mark.parametrize('separator', [';', '\t'])
+    def test_semicolons_and_tabs(self, csv, separator):
+        text = f'{HEADER}\r\n{ROWS}'.replace(',', separator)
+        path = csv(f'\ufeff{text}', 'OBSERVATIONS.CSV')
+        assert same(read_observations(path), read_observations(csv(f'{HEADER}\n{ROWS}')))
+
     def test_written_tables_read_back_to_the_same_bits(self, tmp_path):
         rng = np.random.default_rng(1)
         table = make_observations(
@@ -162,7 +168,10 @@ class TestObservationsCsv:
         (HEADER, 'no row below the header'),
         (f'{HEADER}\n\n', 'no row below the header'),
         (f'{HEADER},u\n{ROWS}', "its header has 'u' twice"),
-        (HEADER.replace(',', ';'), "column 'frame' is missing"),
+        (HEADER.replace(',', ';'), 'no row below the header'),
+        (HEADER.replace(',', ' '), "column 'frame' is missing"),
+        (f'{HEADER}\n{ROWS}'.replace(',', ';').replace('.', ','),
+         "line 2: u is '10,5'; a number, with a decimal point, is needed"),
         (b'\xff\xfe\x00\x01', 'not a text file'),
         (f'{HEADER}\n0,"4,1,2,3,4,5\n', 'fields where the header has 7'),
     ])
