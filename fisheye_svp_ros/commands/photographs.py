@@ -90,7 +90,11 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     from fisheye_svp_ros.detect.detection import detect
     from fisheye_svp_ros.detect.finders import DETECTORS
     from fisheye_svp_ros.detect.patterns import parse_pattern
-    from fisheye_svp_ros.detect.photographs import count_photographs, find_photographs
+    from fisheye_svp_ros.detect.photographs import (
+        count_photographs,
+        find_photographs,
+        passed_over,
+    )
     from fisheye_svp_ros.reporting.progress import progress
 
     pattern = parse_pattern(args.board)
@@ -99,6 +103,9 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     with progress('searching', count_photographs(paths, args.every)) as done:
         detection = detect(find_photographs(paths, args.every), pattern, args.detector,
                            progress=done, source=', '.join(paths))
+    for folder, count in passed_over(paths).items():
+        say(f'{folder}: its {count} images are passed over, since the folder above has images of '
+            'its own; give it by itself, or move those into a subfolder, too')
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
            for one in detection.searched if one.reason or one.notes]
     for line in odd[:_SHOWN]:

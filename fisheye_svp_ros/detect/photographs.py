@@ -99,6 +99,18 @@ def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
     return count
 
 
+def passed_over(paths: Sequence[str]) -> dict[Path, int]:
+    """Return the subfolders that `find_photographs` leaves, and how many images each holds.
+
+    Beside images of the folder itself those of its subfolders may be anything, pictures of results
+    say.
+    """
+    given = {*map(Path, paths)}
+    folders = [p for p in given if p.is_dir() and not _is_recording(p) and _images(p)]
+    return {sub: count for folder in folders for sub in sorted(folder.iterdir())
+            if sub.is_dir() and sub not in given and (count := len(_images(sub)))}
+
+
 def is_photographs(path: Path) -> bool:
     """Say whether a path is taken for photographs rather than for observations."""
     if path.is_dir():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -76,6 +77,21 @@ def test_detect_then_calibrate(
     assert (lens.width, lens.calibration['frames']) == (424, 10)
     assert lens.calibration['rms_px'] < 0.1
     assert lens.parameters['e0'] == pytest.approx(0.003, abs=5e-4)
+
+
+def test_images_in_a_subfolder_beside_photographs_are_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(folder, tmp_path / 'photographs')
+    shutil.copytree(folder, tmp_path / 'photographs' / 'second')
+    (tmp_path / 'photographs' / 'empty').mkdir()
+    command = ['detect', '--board', BOARD, '-o', str(tmp_path / 'out.csv')]
+    for paths, told in (['photographs'], ['second: its 11 images are passed over']), (
+            ['photographs', 'photographs/second'], []):
+        assert cli.main([*command, *(str(tmp_path / path) for path in paths)]) == 0
+        lines = [x for x in capsys.readouterr().err.splitlines() if 'passed over' in x]
+        assert len(lines) == len(told)
+        assert all(text in line for text, line in zip(told, lines, strict=True))
 
 
 def test_localize_photographs(
