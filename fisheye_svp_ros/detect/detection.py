@@ -159,15 +159,14 @@ def _bright(pixels: Pixels, points: Points) -> float:
 
 
 def _one_size(searched: list[Searched]) -> list[Searched]:
-    """Leave out photographs of another size than the others of their camera."""
+    """Leave out boards in photographs of another size than most with a board of their camera."""
     sizes = {
-        camera: Counter(one.size for one in searched if one.camera == camera and one.size[0])
+        camera: Counter(one.size for one in searched if one.camera == camera and one.points)
         for camera in {one.camera for one in searched}
     }
-    usual = {camera: count.most_common(1)[0][0] if count else (0, 0)
-             for camera, count in sizes.items()}
+    usual = {camera: count.most_common(1)[0][0] for camera, count in sizes.items() if count}
     return [
-        one if not one.size[0] or one.size == usual[one.camera] else replace(
+        one if not one.points or one.size == usual[one.camera] else replace(
             one, points=None,
             reason='is {}x{} px; the others are {}x{}'.format(*one.size, *usual[one.camera]))
         for one in searched

@@ -421,6 +421,14 @@ class TestPhotographs:
         with pytest.raises(ObservationError, match='no such file'):
             found(tmp_path / 'nowhere')
 
+    def test_the_size_is_that_of_images_with_a_board(self, tmp_path: Path) -> None:
+        images = [photograph(poses(4, 2).take(i)) for i in (0, 1)]
+        write(tmp_path, [*images, images[0][:-10], *(np.full((50, 60), 9, np.uint8),) * 4])
+        detection = found(tmp_path)
+        assert detection.image_size == (424, 400)
+        assert [*reasons(detection).values()] == [
+            '', '', 'is 424x390 px; the others are 424x400', *('no board found',) * 4]
+
     def test_a_rig_by_its_folders(self, tmp_path: Path) -> None:
         images = [photograph(poses(2, 4).take(i)) for i in range(2)]
         write(tmp_path / 'left', images)
