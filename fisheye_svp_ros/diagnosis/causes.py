@@ -51,7 +51,8 @@ def mean_causes(
         name = effect.name
         parameters = {
             p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
-            for p, v, e in zip(effect.parameters, values, errors[columns], strict=True)
+            for p, v, e in zip(
+                effect.parameters, effect.reported(values), errors[columns], strict=True)
         }
         included = np.arange(evidence.own)
         causes.append(Cause(

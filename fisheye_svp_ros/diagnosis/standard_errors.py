@@ -30,12 +30,12 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     much depends may change much).
     NaN where the data leave a parameter open.
     """
-    own = np.arange(evidence.own)
-    estimate, variance, open_ = _estimates(evidence.information, own)
+    own, reported = np.arange(evidence.own), _reported(evidence)
+    estimate, variance, open_ = _estimates(evidence.information, own, reported)
     if jackknife and evidence.linear.data.frames > 2:
         changed, allowed = np.zeros(evidence.own), np.zeros(evidence.own)
         for part in evidence.in_turn:
-            without, wider, lost = _estimates(part, own)
+            without, wider, lost = _estimates(part, own, reported)
             changed += np.where(lost, 0.0, (without - estimate) ** 2)
             allowed += np.where(lost, 0.0, wider - variance)
         least = np.maximum(1e-9 * variance, 1e-300)  # nothing is known of what the data leave open
@@ -44,16 +44,28 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     return np.where(open_, np.nan, errors)
 
 
-def _estimates(information: Array, included: Index) -> tuple[Array, Array, Array]:
+def _reported(evidence: Evidence) -> Array:
+    """Return what makes coefficients (X,), normalised, those that are reported: (X, X)."""
+    found = np.eye(len(evidence.scale))
+    for effect, columns, _ in evidence.terms:
+        scale = evidence.scale[columns]
+        own = effect.reported(np.eye(len(columns)))
+        found[np.ix_(columns, columns)] = scale[:, None] * own / scale
+    return found
+
+
+def _estimates(
+    information: Array, included: Index, reported: Array
+) -> tuple[Array, Array, Array]:
     """Return estimates (K,) and variances of what is included, normalised, and what is open."""
     if not len(included):
         return np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool)
     values, vectors = np.linalg.eigh(information[np.ix_(included, included)])
     kept = values > 1e-12 * max(float(values[-1]), 1e-300)
-    among = vectors[:, kept]
-    estimate = among @ (among.T @ information[included, -1] / values[kept])
-    variance = (among**2 / values[kept]).sum(axis=1)
-    return estimate, variance, np.asarray((vectors[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+    seen = reported[np.ix_(included, included)] @ vectors
+    estimate = seen[:, kept] @ (vectors[:, kept].T @ information[included, -1] / values[kept])
+    variance = (seen[:, kept]**2 / values[kept]).sum(axis=1)
+    return estimate, variance, np.asarray((seen[:, ~kept] ** 2).sum(axis=1) > 1e-6)
 
 
 def model_uncertainty(evidence: Evidence) -> Array:
@@ -64,15 +76,16 @@ def model_uncertainty(evidence: Evidence) -> Array:
     of the square of the change.  Beside a further form of an effect, or without it, its parameters
     mean something else: for them that model does not count.
     """
-    own, information = evidence.own, evidence.information
-    estimate, variance, _ = _estimates(information, np.arange(own))
+    own, information, reported = evidence.own, evidence.information, _reported(evidence)
+    estimate, variance, _ = _estimates(information, np.arange(own), reported)
     models = _likely_models(evidence)
     weights = special.softmax([one.merit / 2 for one in models])
     added = np.zeros(own)
     for weight, one in zip(weights, models, strict=True):
         there = one.included < own
         at, more = one.included[there], np.zeros(own)
-        other, wider, _ = _estimates(evidence.restored(information, at), one.included)
+        other, wider, _ = _estimates(
+            evidence.restored(information, at), one.included, reported)
         change = other[there] - estimate[at]
         more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
         for effect, columns, _ in evidence.terms:

@@ -139,6 +139,10 @@ class Effect(ABC):
         """Return the lens with what this effect adds to its curves; others leave them alone."""
         return lens
 
+    def reported(self, values: Array) -> Array:
+        """Return values (P, ...) without what something else that is free takes up."""
+        return values
+
     @property
     def place(self) -> str:
         """The field of a lens that holds this effect where nothing else in the lens can."""

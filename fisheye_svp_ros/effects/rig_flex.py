@@ -13,7 +13,10 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_camer
 
 @dataclass(frozen=True)
 class RigFlexEffect(Effect):
-    """The turn of the second camera in the rig: a polynomial of time, or one for each frame."""
+    """The turn of the second camera in the rig: a polynomial of time, or one for each frame.
+
+    degree: of the polynomial, 0 for a turn of its own in each frame, the mean of them taken away.
+    """
 
     degree: int = 1
     frames: tuple[int, ...] = field(default=(), metadata={'key': False})
@@ -26,8 +29,10 @@ class RigFlexEffect(Effect):
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         require_cameras(scene)
-        frames = tuple(int(frame) for frame in np.unique(scene.views.frame))
-        return [cls(degree, frames) for degree in (1, 2, 0) if degree < len(frames)]
+        seen, count = np.unique(scene.views.frame, return_counts=True)
+        frames, both = (tuple(map(int, part)) for part in (seen, seen[count > 1]))
+        forms = [cls(1, frames), cls(2, frames), cls(0, both)]
+        return [form for form in forms if form.degree < len(form.frames)]
 
     def holds_for(self, t: Array, known: Array) -> bool:
         return False  # the frames of another table have numbers of their own
@@ -46,13 +51,20 @@ class RigFlexEffect(Effect):
         labels = [f't{i + 1}' for i in range(self.degree)] or [f'f{f}' for f in self.frames]
         return tuple(Parameter(f'{a}_{label}', 'rad', 0.01) for label in labels for a in 'xyz')
 
+    def reported(self, values: Array) -> Array:
+        """Take the mean of single frames away: that is how the rig stands."""
+        if self.degree:
+            return values
+        turns = values.reshape(len(self.frames), 3, *values.shape[1:])
+        return np.asarray(turns - turns.mean(axis=0)).reshape(values.shape)
+
     def columns(self, scene: Scene) -> Array:
         order = np.searchsorted(self.frames, scene.views.frame)
         if self.degree:
             x = 2 * order / max(len(self.frames) - 1, 1) - 1
             amounts = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
         else:
-            amounts = (order[:, None] == np.arange(len(self.frames))).astype(float)
+            amounts = (scene.views.frame[:, None] == np.array(self.frames)).astype(float)
         turn = scene.pose.rotation * (scene.views.camera > 0)[:, None, None]
         turns = amounts[:, None, :, None] * turn[:, :, None, :]
         turns = turns.reshape(len(order), 3, len(self.parameters))
