@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 
+_MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
+
 # Matrices are small for BLAS: more threads than one wait for each other.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
 
@@ -151,6 +153,13 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
+    lens, views = result.adjusted.lens, result.views
+    out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
+    edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
+    if out < _MIDDLE * edge:
+        say(f'image points lie within {out:.0f} px of the centre, the nearest edge is at '
+            f'{edge:.0f} px: past {np.degrees(result.reached):.0f} deg nothing holds the curve; '
+            'photograph the target near the edges of the image, too')
 
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:
@@ -277,12 +286,15 @@ def _print(result: Calibration, trust: Trust) -> None:
     if open_ones:
         print('  with any target: 95 %, its shape, scale and boards as the data have them and as '
               'they are said to be')
-    print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}; {noise_text(result.sigma)}')
+    print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
+          f'{np.degrees(result.reached):.2f}; {noise_text(result.sigma)}')
 
 
 def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself."""
     from dataclasses import asdict
+
+    import numpy as np
 
     from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
@@ -291,6 +303,7 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
         **(adjusted.lens.calibration or {}),
         'left_out': result.left_out,
         'beyond': result.beyond,
+        'reached_deg': float(np.degrees(result.reached)),
         'sigma_px': result.sigma,
         'parameters': dict(
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)

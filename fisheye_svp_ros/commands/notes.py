@@ -31,10 +31,8 @@ def note_formats() -> None:
 def note_left_out(frames: Sequence[int]) -> None:
     """Name the frames that could not be posed, if there are any."""
     if frames:
-        names = ', '.join(map(str, frames[:_SHOWN]))
-        more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
         say(f'left out, since their points do not fix a pose (all near one line, or of '
-            f'another lens?): frames {names}{more}')
+            f'another lens?): {_frames(frames)}')
 
 
 def note_huge(table: Observations) -> None:
@@ -56,8 +54,18 @@ def note_gross_errors(table: Observations, gross: Gross) -> None:
 
 def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
     """Name the frames whose poses should not be relied on as they are, and why."""
-    doubtful = [(frame, reason) for frame, reason in zip(frames, reasons, strict=True) if reason]
-    for frame, reason in doubtful[:_SHOWN]:
-        say(f'frame {frame}: {reason}')
-    if len(doubtful) > _SHOWN:
-        say(f'and {len(doubtful) - _SHOWN} more frames like these')
+    by_reason: dict[str, list[int]] = {}
+    for frame, reason in zip(frames, reasons, strict=True):
+        if reason:
+            by_reason.setdefault(reason, []).append(frame)
+    doubtful = [*by_reason.items()]
+    for reason, said in doubtful[:_SHOWN]:
+        say(f'{_frames(said)}: {reason}')
+    if rest := sum(len(said) for _, said in doubtful[_SHOWN:]):
+        say(f'and {rest} more frames like these')
+
+
+def _frames(frames: Sequence[int]) -> str:
+    names = ', '.join(map(str, frames[:_SHOWN]))
+    more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
+    return f'frame{"s" if len(frames) > 1 else ""} {names}{more}'

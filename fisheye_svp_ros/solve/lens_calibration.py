@@ -49,7 +49,8 @@ class Calibration(NamedTuple):
     adjusted: the lens with its `calibration` block and its views, covariances for the noise of
     the data; sigma: noise of u and of v, px, estimated, None where the observations bring their
     own; views: the views used; left_out: frames that cannot be posed; beyond: how many
-    observations lie past `max_incidence`, where the fitted curve turns back.
+    observations lie past `max_incidence`, where the fitted curve turns back; reached: the largest
+    incidence angle of an observation, rad, past which the curve is extrapolated.
     """
 
     adjusted: Adjusted
@@ -57,6 +58,7 @@ class Calibration(NamedTuple):
     views: Views
     left_out: tuple[int, ...]
     beyond: int
+    reached: float
 
 
 def calibrate(
@@ -138,7 +140,9 @@ def _finished(
             pose_covariance=adjusted.pose_covariance * sigma**2,
         )
     _check_focal(adjusted, observations.source)
-    lens, beyond = _with_field(adjusted, views)
+    theta = incidence(
+        adjusted.lens, adjusted.pose.into_body(views.points), limited=False).theta[views.used]
+    lens = _with_field(adjusted, theta)
     block = {
         'rms_px': rms_px(adjusted.residual),
         'observations': rows // 2,
@@ -146,7 +150,9 @@ def _finished(
         'source': observations.source,
     }
     lens = check_lens(replace(lens, calibration=block, uncertainty=None), observations.source)
-    return Calibration(adjusted._replace(lens=lens), sigma, views, left_out, beyond)
+    beyond = int((theta > lens.max_incidence).sum())
+    adjusted = adjusted._replace(lens=lens)
+    return Calibration(adjusted, sigma, views, left_out, beyond, float(theta.max()))
 
 
 def _start_lens(model: str, image_size: tuple[int, int], free: Sequence[str], name: str) -> Lens:
@@ -267,15 +273,12 @@ def _with_corner(lens: Lens) -> Lens:
     return replace(lens, max_incidence=field_of_view(lens))
 
 
-def _with_field(adjusted: Adjusted, views: Views) -> tuple[Lens, int]:
-    """Return the lens with its `max_incidence` and the number of observations beyond it."""
+def _with_field(adjusted: Adjusted, theta: Array) -> Lens:
+    """Return the lens with its `max_incidence`; theta: of the observations, rad."""
     held = set(adjusted.names) <= set(adjusted.lens.port_names)
     lens = adjusted.lens if held else _with_corner(adjusted.lens)
-    points = adjusted.pose.into_body(views.points)
-    theta = incidence(lens, points, limited=False).theta[views.used]
     seen = min(float(theta.max()), monotone_limit(lens))
-    lens = replace(lens, max_incidence=max(lens.max_incidence, seen))
-    return lens, int((theta > lens.max_incidence).sum())
+    return replace(lens, max_incidence=max(lens.max_incidence, seen))
 
 
 def _check_focal(adjusted: Adjusted, source: str) -> None:

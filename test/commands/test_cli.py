@@ -14,6 +14,7 @@ from helpers.nodes import hears_sigint, until
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
+from fisheye_svp_ros.commands.notes import note_doubtful
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -179,6 +180,12 @@ class TestLocalize:
         assert 'cannot be written' in capsys.readouterr().err
 
 
+def test_frames_that_are_doubtful_alike_are_one_line(capsys):
+    note_doubtful([3, 4, 7, 9], ['noisy', '', 'far', 'noisy'])
+    said = capsys.readouterr().err.splitlines()
+    assert [line.partition('note: ')[2] for line in said] == ['frames 3, 9: noisy', 'frame 7: far']
+
+
 class TestCalibrate:
     def test_writes_the_lens_and_its_covariance(self, scene, capsys, tmp_path):
         folder, _, table = scene
@@ -206,6 +213,23 @@ class TestCalibrate:
         assert list(document['parameters']) == ['f', 'cx', 'cy']
         off = found - (LENS.fx, LENS.cx, LENS.cy)
         assert off @ np.linalg.solve(document['covariance'], off) < 30
+
+    def test_a_lens_of_the_middle_of_the_image_is_called_so(self, scene, capsys, tmp_path):
+        folder, _, table = scene
+        out = tmp_path / 'lens.yaml'
+        middle = np.linalg.norm(table.uv - (LENS.cx, LENS.cy), axis=1) < 250
+        write_observations(tmp_path / 'middle.csv', table.take(middle))
+        said = {}
+        for path in (folder / 'observations.csv', tmp_path / 'middle.csv'):
+            assert cli.main(['calibrate', str(path), '--model', 'equidistant', '--image-size',
+                             '1280x960', '-o', str(out)]) == 0
+            said[path.stem] = capsys.readouterr()
+        assert said['observations'].err == ''
+        assert 'photograph the target near the edges of the image' in said['middle'].err
+        reached = json.loads(out.with_suffix('.calibrate.json').read_text())['reached_deg']
+        assert reached == pytest.approx(np.degrees(250 / 700), abs=0.6)
+        assert f'past {reached:.0f} deg nothing holds the curve' in said['middle'].err
+        assert f'image points up to {reached:.2f}' in said['middle'].out
 
     def test_prints_without_writing(self, scene, capsys, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
