@@ -112,7 +112,8 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     """
     lens = setup.lens
     if lens.viewpoint_shift is None and lens.port is None:
-        raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it')
+        raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it; '
+                        'whether the camera has one is found by `fisheye-svp diagnose`')
     if not (np.isfinite(setup.noise) and setup.noise > 0):
         raise ParameterError(f'noise is {setup.noise} px; it must be above 0')
     baseline = float(np.linalg.norm(setup.rig.position))
