@@ -189,7 +189,8 @@ def diagnose(
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data', 0.8)
     return _judged(
-        observations, lenses, found, Measured(found, free, held_out, wanted.quick, medium),
+        observations, lenses, found,
+        Measured(found, free, held_out, wanted.quick, simulated.parameters, medium),
         noise_causes, cameras, held_out,
     )
 

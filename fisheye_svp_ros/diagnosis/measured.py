@@ -51,8 +51,12 @@ class FitQuality:
 
 @dataclass(frozen=True)
 class Intrinsic:
-    """One intrinsic before and after, each with its standard error under the null model."""
+    """One intrinsic before and after, each with its standard error under the null model.
 
+    given: as the lens had it; before: fitted to these data; after: with the causes.
+    """
+
+    given: float
     before: float
     before_stderr: float
     after: float
@@ -62,15 +66,16 @@ class Intrinsic:
 class Measured:
     """Figures of what was found; held_out: other frames, None for frames left out in turn.
 
-    medium: the cause that was found before the search, if there is one.
+    given: parameters of the lenses as they were given; medium: the cause that was found before
+    the search, if there is one.
     """
 
     def __init__(
         self, found: Found, free: Sequence[str], held_out: Observations | None, quick: bool,
-        medium: Medium | None = None,
+        given: Mapping[str, float], medium: Medium | None = None,
     ) -> None:
         self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
-        self.evidence = found.evidence
+        self.evidence, self.given = found.evidence, given
         self.names = [effect.name for effect, _, _ in found.causes]
         self.remaining = conditional_residuals(found.fitted)
         views = similar_views(found.fitted.linear, self.remaining)
@@ -266,7 +271,7 @@ class Measured:
         was, now = base.linear.state.parameters, self.found.state.parameters
         return {
             name: Intrinsic(
-                was[name], float(before[rig + i]), now[name], after[name]
+                self.given[name], was[name], float(before[rig + i]), now[name], after[name]
             )
             for i, name in enumerate(self.free)
         }

@@ -79,6 +79,7 @@ _NAMED = 3  # causes that one sentence can bear
 _UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
 _NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
 _MOST = 6  # names in one sentence
+_ELSEWHERE = 6.0  # standard errors by which the intrinsics given are not those of the data
 _FEW = 4  # parameters that are read one by one
 
 
@@ -165,7 +166,8 @@ def verdict_sentences(
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if d.verdict == 'adequate':
-        return (f'Nothing is wrong that these data can show: in {d.observations} points of '
+        nothing = 'Nothing but the intrinsics as given' if _elsewhere(d) else 'Nothing'
+        return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
         return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms that are not all '
@@ -198,7 +200,8 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
         why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
         if d.causes:
             why = 'the cause is in the table of image points, not in the lens'
-        return (f'The lens as it is predicts held-out data to {before:.3g} px rms; {why}{local}.')
+        which = 'The lens, fitted to these data,' if _elsewhere(d) else 'The lens as it is'
+        return f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}.'
     if named >= before:
         return (f'Held-out data do not bear it out: {named:.3g} px rms instead of {before:.3g}; '
                 f'the causes are no correction{local}.')
@@ -221,11 +224,24 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
     return text + '.'
 
 
+def _elsewhere(d: Diagnosis) -> str:
+    """Return that the lens was given other intrinsics than the data have; empty if it was not."""
+    off = {name: abs(value.given - value.before) / value.before_stderr
+           for name, value in d.intrinsics.items() if value.before_stderr > 0}
+    names = [name for name in off if off[name] > _ELSEWHERE]
+    if not names:
+        return ''
+    return (f'Take {EXTENDED}, not the lens as given: {listed(names[:_MOST])} there '
+            f'{"are" if len(names) > 1 else "is"} up to {max(off.values()):.0f} standard errors '
+            'off what these data say (another focus, day or camera?)')
+
+
 def _next(d: Diagnosis) -> str:
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
-        return f'Keep the lens as it is{blind}.'
-    steps = [
+        return f'{_elsewhere(d) or "Keep the lens as it is"}{blind}.'
+    steps = [_elsewhere(d)] if _elsewhere(d) else []
+    steps += [
         f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
         'it until then' for pair in d.cameras if pair.verdict == 'contradict'

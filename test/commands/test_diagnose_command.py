@@ -219,10 +219,24 @@ class TestTerminal:
         assert out.startswith('Adequate')
         assert 'Keep the lens as it is; these data could not test' in out
 
+    def test_intrinsics_of_another_day_are_told(self, scene, capsys, tmp_path):
+        """They are fitted to these data, which must not hide that the lens has others."""
+        lens = load_lens(scene / 'lens.yaml')
+        for name, scale in (('same.yaml', 1.0), ('other.yaml', 1.01)):
+            save_lens(replace(lens, fx=scale * lens.fx, fy=scale * lens.fy), tmp_path / name)
+            assert cli.main(['diagnose', str(scene / 'clean.csv'), '--lens', str(tmp_path / name),
+                             '--free', 'intrinsics', '--quick', '-o', str(tmp_path)]) == 0
+            out = ' '.join(capsys.readouterr().out.split())
+            told = 'Take extended_lens.yaml, not the lens as given: fx and fy there are' in out
+            assert told == (scale != 1)
+            assert ('Keep the lens as it is' in out) == (scale == 1)
+        given = json.loads((tmp_path / 'diagnosis.json').read_text())['intrinsics']['fx']['given']
+        assert given == pytest.approx(1.01 * lens.fx)
+
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
         assert run('poor.csv', scene) == 0
         out, err = capsys.readouterr()
-        assert 'left out' in err and 'frames 2' in err
+        assert 'left out' in err and 'frame 2' in err
         assert f'in {FRAMES - 1} frames' in out
 
     @pytest.mark.parametrize(('more', 'said'), [
