@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -11,6 +12,8 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.scene.observations import Observations
 
 _SHOWN = 10
+_ALIKE = 3  # frames whose reasons differ by numbers alone; of more the first speaks for all
+_DIGITS = re.compile(r'\d')
 _HUGE = 20.0  # m; a target larger than this was measured in other units
 
 
@@ -54,15 +57,16 @@ def note_gross_errors(table: Observations, gross: Gross) -> None:
 
 def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
     """Name the frames whose poses should not be relied on as they are, and why."""
-    by_reason: dict[str, list[int]] = {}
+    alike: dict[str, list[tuple[int, str]]] = {}
     for frame, reason in zip(frames, reasons, strict=True):
         if reason:
-            by_reason.setdefault(reason, []).append(frame)
-    doubtful = [*by_reason.items()]
-    for reason, said in doubtful[:_SHOWN]:
-        say(f'{_frames(said)}: {reason}')
-    if rest := sum(len(said) for _, said in doubtful[_SHOWN:]):
-        say(f'and {rest} more frames like these')
+            alike.setdefault(_DIGITS.sub('', reason), []).append((frame, reason))
+    for doubtful in alike.values():
+        shown = len(doubtful) if len(doubtful) <= _ALIKE else 1
+        for frame, reason in doubtful[:shown]:
+            say(f'frame {frame}: {reason}')
+        if rest := [frame for frame, _ in doubtful[shown:]]:
+            say(f'{_frames(rest)}: likewise')
 
 
 def _frames(frames: Sequence[int]) -> str:

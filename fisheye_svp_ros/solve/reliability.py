@@ -274,10 +274,8 @@ def _noisy_reason(sigma: float) -> str:
 def _far_reasons(views: Views, found: Localization) -> list[str]:
     away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
-    return [
-        f'landmarks lie up to {far:.0f} m away: are they in metres?' if far > _FARTHEST else ''
-        for far in farthest
-    ]
+    why = f'landmarks lie up to {farthest.max():.0f} m away: are they in metres?'
+    return [why if far > _FARTHEST else '' for far in farthest]
 
 
 def _joined(*reasons: str) -> str:

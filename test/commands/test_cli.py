@@ -181,9 +181,10 @@ class TestLocalize:
 
 
 def test_frames_that_are_doubtful_alike_are_one_line(capsys):
-    note_doubtful([3, 4, 7, 9], ['noisy', '', 'far', 'noisy'])
+    note_doubtful(range(7), ['off by 2 px', '', 'far', *(f'off by {i} px' for i in range(4))])
     said = capsys.readouterr().err.splitlines()
-    assert [line.partition('note: ')[2] for line in said] == ['frames 3, 9: noisy', 'frame 7: far']
+    assert [line.partition('note: ')[2] for line in said] == [
+        'frame 0: off by 2 px', 'frames 3, 4, 5, 6: likewise', 'frame 2: far']
 
 
 class TestCalibrate:
