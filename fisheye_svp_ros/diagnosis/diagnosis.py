@@ -209,6 +209,9 @@ def _judged(
         evidence, found.fitted, found_components(components), stated
     )
     remaining = with_outliers(remaining, found.gross, len(observations))
+    if 'quantisation' in {cause.effect for cause in noise_causes}:
+        # Values on a lattice depend on the place within a pixel by themselves.
+        remaining = [one for one in remaining if one.variable != 'pixel_phase']
     gross = gross_rows(observations, found.gross)
     if held_out is not None:
         gross += gross_rows(held_out, measured.test_gross, 'held out: ')

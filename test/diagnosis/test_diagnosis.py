@@ -194,6 +194,9 @@ def test_quantisation_is_read_off_the_numbers():
     assert quantisation_step(uv) == 0.0
     pose, views = scene(rng)
     table = observe(lens(), (), pose, views, SIGMA, rng)
+    rough = observe(lens(), (), pose, views, 0.1, rng)
+    found = diagnose(replace(rough, uv=np.round(rough.uv)), lens())
+    assert found.verdict == 'explained'  # that they depend on the place within a pixel, too
     cause, = diagnose(replace(table, uv=np.round(table.uv)), lens()).causes
     assert cause.effect == 'quantisation' and cause.parameters['step']['value'] == 1.0
     assert cause.parameters['step']['stderr'] == 0.0
