@@ -214,7 +214,7 @@ def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
     return {
         'remaining': [
             {
-                'words': text.remaining_text(s.variable),
+                'words': text.remaining_text(diagnosis, s.variable),
                 'link': _PICTURE_OF.get(s.variable),
                 'p': text.probability(s.p_value).removeprefix('p ').removeprefix('= '),
                 'share': text.percent(s.share) if s.variable in text.VARIABLES else '',

@@ -144,11 +144,20 @@ def remains(diagnosis: Diagnosis, most: int = 3) -> str:
     names = list(dict.fromkeys(structure.variable for structure in order))
     depends = [VARIABLES.get(name, name) for name in names if name not in _OTHERWISE]
     clauses = [f'they depend on {listed(depends[:most])}'] if depends else []
-    return '; '.join([*clauses, *(_OTHERWISE[name] for name in names if name in _OTHERWISE)])
+    others = (remaining_text(diagnosis, name) for name in names if name in _OTHERWISE)
+    return '; '.join([*clauses, *others])
 
 
-def remaining_text(variable: str) -> str:
+def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
     """Return one variable of what remains as a clause."""
+    if variable == 'outliers' and diagnosis.gross:
+        worst, count = diagnosis.gross[0], len(diagnosis.gross)
+        which = f'frame {worst["frame"]} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
+        return (f'{count} points lie far off, furthest {which}' if count > 1 else
+                f'a point lies far off, {which}')
+    if variable == 'size':
+        ratio = math.sqrt(diagnosis.extended.chi2_per_dof or math.nan)
+        return f'the residuals are {ratio:.2g} times as large as sigma says'
     depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
     return _OTHERWISE.get(variable, depends)
 
@@ -170,8 +179,8 @@ def _wrong(d: Diagnosis) -> str:
         return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
-        return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms that are not all '
-                f'noise, and no effect of the catalogue accounts for them: {remains(d, 7)}.')
+        return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms, and no effect of '
+                f'the catalogue accounts for what is odd about them: {remains(d, 7)}.')
     causes = '; because '.join(
         f'{what(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_NAMED]

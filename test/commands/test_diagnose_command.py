@@ -289,6 +289,16 @@ class TestWords:
         assert 'no extension improved on it' in gained
         assert following.startswith('Look for the reason')
 
+    def test_what_remains_is_told_in_numbers(self, found):
+        gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
+        left = [Structure('outliers', 0.0, 0.5), Structure('size', 0.0, 0.0)]
+        extended = replace(found.extended, chi2_per_dof=9.0)
+        wrong, _, _ = verdict_sentences(replace(
+            found, verdict='unexplained', causes=[], advice=[], remaining=left, gross=gross,
+            extended=extended))
+        assert '2 points lie far off, furthest frame 4 landmark 17 (12.3 px)' in wrong
+        assert 'the residuals are 3 times as large as sigma says' in wrong
+
     def test_errors_against_the_truth_go_or_stay(self, found):
         _, gained, _ = verdict_sentences(found, {
             'position_error_m': Compared(0.002, 0.001, 0.5, 0.3, 0.6),
