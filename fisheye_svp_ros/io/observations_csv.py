@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+_FEWEST_UNSEEN = 5
 
 REQUIRED = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
 
@@ -29,13 +32,15 @@ def read(path: str | Path) -> Observations:
     table.refuse_repeats(
         np.stack([frame, camera, landmark], axis=-1), 'frame, camera and landmark'
     )
+    uv = table.numbers('u', 'v')
+    _refuse_unseen(table, np.stack([frame, camera], axis=-1), uv)
     sigma = table.numbers('sigma')[:, 0] if 'sigma' in table else None
     if sigma is not None:
         table.refuse(sigma <= 0, 'sigma', 'a number above 0')
     return make_observations(
         frame,
         landmark,
-        table.numbers('u', 'v'),
+        uv,
         table.numbers('x', 'y', 'z'),
         camera=camera,
         board=table.whole('board') if 'board' in table else None,
@@ -44,6 +49,24 @@ def read(path: str | Path) -> Observations:
         cameras=cameras,
         source=str(path),
     )
+
+
+def _refuse_unseen(table: CsvTable, view: Index, uv: Array) -> None:
+    """Refuse what stands for points that were not seen, -1 -1 say; view (N, 2), uv (N, 2), px.
+
+    It is one place of the image for several landmarks of a view, and for one row of a hundred.
+    """
+    place, where, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
+    most = int(count.argmax())
+    rows = np.flatnonzero(where.reshape(-1) == most)
+    if len(rows) < max(_FEWEST_UNSEEN, len(uv) / 100):
+        return
+    if np.unique(view[rows], axis=0, return_counts=True)[1].max() > 2:
+        u, v = place[most]
+        raise ObservationError(
+            f'{table.path}, line {table.line(rows[0])}: u, v are {u:g}, {v:g} here and in '
+            f'{len(rows) - 1} more rows; leave out the rows of points that were not seen'
+        )
 
 
 def write_observations(path: str | Path, observations: Observations) -> None:

@@ -111,7 +111,7 @@ def test_a_lens_of_another_image_size_is_refused(
     save_lens(replace(LENS, width=848, height=800), tmp_path / 'large.yaml')
     table = tmp_path / 'observations.csv'
     write_observations(table, make_observations(
-        np.repeat(0, 8), np.arange(8), np.ones((8, 2)), PRINTED.corners[:8]))
+        np.repeat(0, 8), np.arange(8), np.arange(16.0).reshape(8, 2), PRINTED.corners[:8]))
     (tmp_path / 'observations.detect.json').write_text('{"image_sizes": {"": [424, 400]}}')
     photographs = str(folder), '--board', BOARD
     for command, *rest in (('localize', str(table)), ('diagnose', str(table)),

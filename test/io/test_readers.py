@@ -158,6 +158,19 @@ class TestObservationsCsv:
         text = f'{HEADER},{name}\n0,4,1,2,3,4,5,1\n0,5,1,2,3,4,5,{cell}\n'
         fails(csv(text), 'line 3', says)
 
+    @pytest.mark.parametrize('unseen', ['-1,-1', '0,0', '-9999,-9999'])
+    def test_rows_of_points_that_were_not_seen(self, csv, unseen):
+        rows = [f'{i // 9},{i % 9},{unseen if i % 4 == 1 else f"{i},{i + 0.5}"},{i % 9},0,0'
+                for i in range(27)]
+        place = unseen.replace(',', ', ')
+        fails(csv('\n'.join([HEADER, *rows])), 'line 3', f'u, v are {place} here and in 6 more',
+              'leave out the rows of points that were not seen')
+
+    def test_points_at_one_place_now_and_then(self, csv):
+        """A static scene, and neighbours in whole pixels."""
+        still = [f'{i // 4},{i % 4},{i % 4 // 2},7,{i % 4},0,0' for i in range(400)]
+        assert len(read_observations(csv('\n'.join([HEADER, *still])))) == 400
+
     def test_same_landmark_in_two_cameras_is_no_repeat(self, csv):
         text = f'{HEADER},camera\n0,4,1,2,3,4,5,left\n0,4,1,2,3,4,5,right\n'
         assert len(read_observations(csv(text))) == 2
