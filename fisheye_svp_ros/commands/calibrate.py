@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 
+_ASIDE = 0.1  # of the image, by which a principal point is seldom off its centre
 _MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
 
 # Matrices are small for BLAS: more threads than one wait for each other.
@@ -154,6 +155,10 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
     lens, views = result.adjusted.lens, result.views
+    off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
+    if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:
+        say(f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the centre of the image: '
+            'was it cropped, or is the image size another one?')
     out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
     edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
     if out < _MIDDLE * edge:

@@ -232,6 +232,12 @@ class TestCalibrate:
         assert f'past {reached:.0f} deg nothing holds the curve' in said['middle'].err
         assert f'image points up to {reached:.2f}' in said['middle'].out
 
+    def test_an_image_size_that_is_too_large_is_doubted(self, scene, capsys):
+        folder, _, _ = scene
+        assert cli.main(['calibrate', str(folder / 'observations.csv'), '--model', 'equidistant',
+                         '--image-size', '1920x1080']) == 0
+        assert 'the principal point lies -30' in capsys.readouterr().err  # 650 - 959.5
+
     def test_prints_without_writing(self, scene, capsys, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
         folder, _, _ = scene
