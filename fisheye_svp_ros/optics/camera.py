@@ -23,7 +23,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.engines import ported
 from fisheye_svp_ros.optics.engines.results import Incidence as Incidence
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, curve_limit
 from fisheye_svp_ros.optics.rays import caustic_range
 
 _EDGE_SLACK = 1e-9  # of h/f; keeps image points exactly at the edge of the field inside it
@@ -174,9 +174,11 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     mx = (np.asarray(uv[..., 0], dtype=float) - lens.cx) / lens.fx
     my = (np.asarray(uv[..., 1], dtype=float) - lens.cy) / lens.fy
     height = np.sqrt(mx * mx + my * my)
-    edge, _ = lens.image_height.value_and_slope(np.asarray(lens.max_incidence))
+    # A curve that a fit has on its way, or without some frames, may turn back earlier.
+    end = min(lens.max_incidence, curve_limit(lens))
+    edge, _ = lens.image_height.value_and_slope(np.asarray(end))
     valid = height <= edge + _EDGE_SLACK
-    angle = np.minimum(lens.image_height.angle(height), lens.max_incidence)
+    angle = np.minimum(lens.image_height.angle(height), end)
     theta = np.where(valid, angle, np.nan)
     inverse = 1 / np.where(height > 0, height, 1.0)
     sin = np.sin(theta)

@@ -26,7 +26,7 @@ from fisheye_svp_ros.optics.camera import (
     project_with_jacobian,
     unique_range,
 )
-from fisheye_svp_ros.optics.curves import FlatPort
+from fisheye_svp_ros.optics.curves import FlatPort, KannalaBrandt
 
 pytestmark = pytest.mark.usefixtures('engine')
 
@@ -152,6 +152,18 @@ def test_back_projection_round_trips_up_to_the_edge_of_the_field(lens):
     outside = back_project(lens, uv[-1:] + (uv[-1:] - [lens.cx, lens.cy]) * 1e-6)
     assert not outside.valid.any()
     assert all(np.isnan(field).all() for field in outside[:3])
+
+
+def test_a_curve_that_turns_back_within_the_field_still_has_rays_up_to_there():
+    """A fit to some of the frames may do that, while the field is that of all of them."""
+    lens = replace(KITA[1].svp(), max_incidence=2.4,
+                   image_height=KannalaBrandt(-0.02, 0.0015, 0.0003, -0.0008))
+    assert lens.image_height.limit < lens.max_incidence
+    theta = np.array([0.1, 0.7, 0.99 * lens.image_height.limit])
+    points = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
+    rays = back_project(lens, project(lens, points).uv)
+    assert rays.valid.all()
+    np.testing.assert_allclose(rays.theta, theta, rtol=0, atol=1e-9)
 
 
 BOTH = replace(KITA[1], viewpoint_shift=KITA[1].viewpoint_shift.plus(FlatPort(0.01, 1.5)),
