@@ -90,7 +90,8 @@ def run(args: argparse.Namespace) -> None:
     if args.output:
         with together():
             for camera, result in results.items():
-                path = args.output / f'{camera}.yaml' if camera else args.output
+                alone = not camera or (len(results) == 1 and args.output.suffix)
+                path = args.output if alone else args.output / f'{camera}.yaml'
                 _write(result, trusts[camera], path)
     for camera, result in results.items():
         _report(result, trusts[camera], args.model, tables[camera].sigma)
@@ -150,7 +151,7 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
     rms, sigma = (result.adjusted.lens.calibration or {})['rms_px'], float(np.median(sigmas))
     if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
         say(f'{model} leaves {rms:.1f} px: it does not fit this lens, or image points and '
-            'landmarks do not belong together (order, units, image size)')
+            'landmarks do not belong together (order, units, axes, image size)')
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')

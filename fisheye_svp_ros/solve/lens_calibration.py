@@ -289,5 +289,6 @@ def _check_focal(adjusted: Adjusted, source: str) -> None:
                 raise GeometryError(
                     f'{source}: {name} is known to {100 * relative:.0f} % only, rms '
                     f'{rms_px(adjusted.residual):.3g} px; add views in which the target is tilted '
-                    'and covers the image; check that image points and landmarks belong together'
+                    'and covers the image; check that image points and landmarks belong together '
+                    '(order, units, axes: u to the right, v down, x, y, z right-handed)'
                 )

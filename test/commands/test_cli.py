@@ -232,6 +232,14 @@ class TestCalibrate:
         assert f'past {reached:.0f} deg nothing holds the curve' in said['middle'].err
         assert f'image points up to {reached:.2f}' in said['middle'].out
 
+    def test_a_file_is_written_for_one_camera_with_a_name(self, scene, tmp_path):
+        _, _, table = scene
+        write_observations(tmp_path / 'left.csv', replace(table, cameras=('left',)))
+        for out, lens in (('lens.yaml', 'lens.yaml'), ('rig', 'rig/left.yaml')):
+            assert cli.main(['calibrate', str(tmp_path / 'left.csv'), '--model', 'equidistant',
+                             '--image-size', '1280x960', '-o', str(tmp_path / out)]) == 0
+            assert load_lens(tmp_path / lens).name == 'left'
+
     def test_an_image_size_that_is_too_large_is_doubted(self, scene, capsys):
         folder, _, _ = scene
         assert cli.main(['calibrate', str(folder / 'observations.csv'), '--model', 'equidistant',
