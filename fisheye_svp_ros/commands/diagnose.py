@@ -101,14 +101,16 @@ def run(args: argparse.Namespace) -> None:
                 diagnosis = diagnose(observations, lens, **settings)
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
+            progress('errors where the truth is known', 0.88)
+            known = known_errors(diagnosis.before, diagnosis.after, names)
         except (GeometryError, np.linalg.LinAlgError) as cause:
+            poses_too = (f' Or are the poses of {args.poses} not those of the camera in the world?'
+                         if args.poses else '')
             raise GeometryError(
                 f'{args.observations}: its views cannot be fitted with this lens: {cause}; is it '
                 'that of another camera, or of another image size? `localize` says how far each '
-                'is off'
+                f'is off.{poses_too}'
             ) from cause
-        progress('errors where the truth is known', 0.88)
-        known = known_errors(diagnosis.before, diagnosis.after, names)
         wanted = _wanted(args, diagnosis) if args.count else None
         if args.output:
             progress('report', 0.9)
