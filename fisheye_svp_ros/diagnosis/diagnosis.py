@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.budget import REPEATED, Component, found_components
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
+from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.inputs import (
     check_cameras,
     check_other,
@@ -190,7 +191,7 @@ def diagnose(
     progress('measuring the gain on held-out data', 0.8)
     return _judged(
         observations, lenses, found,
-        Measured(found, free, held_out, wanted.quick, simulated.parameters, medium),
+        Measured(found, free, held_out, wanted.quick, _stated(simulated), medium),
         noise_causes, cameras, held_out,
     )
 
@@ -243,6 +244,19 @@ def _judged(
         before=measured.before,
         after=evidence.linear,
     )
+
+
+def _stated(given: State) -> dict[str, tuple[float, float]]:
+    """Return the parameters of lenses as given, each with the error that its file states."""
+    found = {}
+    for label, lens in zip(given.labels, given.lenses, strict=True):
+        said = InAir.of(lens)
+        known = {} if said is None else dict(
+            zip(said.names, np.sqrt(np.diag(said.covariance)).tolist(), strict=True))
+        for name, value in lens.parameters.items():
+            error = known.get('f' if name in ('fx', 'fy') and 'f' in known else name, 0.0)
+            found[f'{label}.{name}' if label else name] = value, error
+    return found
 
 
 def _verdict(causes: Sequence[Cause], remaining: Sequence[Structure]) -> str:

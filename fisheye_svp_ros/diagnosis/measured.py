@@ -53,10 +53,12 @@ class FitQuality:
 class Intrinsic:
     """One intrinsic before and after, each with its standard error under the null model.
 
-    given: as the lens had it; before: fitted to these data; after: with the causes.
+    given: as the lens had it, with the error that its file states or 0; before: fitted to these
+    data; after: with the causes.
     """
 
     given: float
+    given_stderr: float
     before: float
     before_stderr: float
     after: float
@@ -66,13 +68,13 @@ class Intrinsic:
 class Measured:
     """Figures of what was found; held_out: other frames, None for frames left out in turn.
 
-    given: parameters of the lenses as they were given; medium: the cause that was found before
-    the search, if there is one.
+    given: parameters of the lenses as they were given, with stated errors; medium: the cause that
+    was found before the search, if there is one.
     """
 
     def __init__(
         self, found: Found, free: Sequence[str], held_out: Observations | None, quick: bool,
-        given: Mapping[str, float], medium: Medium | None = None,
+        given: Mapping[str, tuple[float, float]], medium: Medium | None = None,
     ) -> None:
         self.found, self.free, self.quick, self.medium = found, tuple(free), quick, medium
         self.evidence, self.given = found.evidence, given
@@ -271,7 +273,7 @@ class Measured:
         was, now = base.linear.state.parameters, self.found.state.parameters
         return {
             name: Intrinsic(
-                self.given[name], was[name], float(before[rig + i]), now[name], after[name]
+                *self.given[name], was[name], float(before[rig + i]), now[name], after[name]
             )
             for i, name in enumerate(self.free)
         }

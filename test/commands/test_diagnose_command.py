@@ -230,8 +230,17 @@ class TestTerminal:
             told = 'Take extended_lens.yaml, not the lens as given: fx and fy there are' in out
             assert told == (scale != 1)
             assert ('Keep the lens as it is' in out) == (scale == 1)
-        given = json.loads((tmp_path / 'diagnosis.json').read_text())['intrinsics']['fx']['given']
-        assert given == pytest.approx(1.01 * lens.fx)
+        fx = json.loads((tmp_path / 'diagnosis.json').read_text())['intrinsics']['fx']
+        assert (fx['given'], fx['given_stderr']) == (pytest.approx(1.01 * lens.fx), 0.0)
+
+    def test_intrinsics_that_are_no_better_known_are_not(self, scene, capsys, tmp_path):
+        lens, names = load_lens(scene / 'lens.yaml'), ('fx', 'fy')
+        known = {'stderr': dict.fromkeys(names, 3.0), 'covariance': [[9.0, 8.0], [8.0, 9.0]]}
+        save_lens(replace(lens.with_parameters(names, [1.01 * lens.fx, 1.01 * lens.fy]),
+                          calibration=known), tmp_path / 'rough.yaml')
+        assert cli.main(['diagnose', str(scene / 'clean.csv'), '--quick',
+                         '--lens', str(tmp_path / 'rough.yaml')]) == 0
+        assert 'Keep the lens as it is' in capsys.readouterr().out
 
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
         assert run('poor.csv', scene) == 0
@@ -335,6 +344,9 @@ def test_views_that_cannot_be_fitted_are_one_line(scene, without_solution, capsy
     assert run('shift.csv', scene) == 2
     said, = capsys.readouterr().err.strip().splitlines()
     assert 'shift.csv: its views cannot be fitted with this lens: ' in said
+    assert 'camera in the world' not in said
+    assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 2
+    assert 'poses.csv not those of the camera in the world?' in capsys.readouterr().err
 
 
 def test_landmarks_in_millimetres_are_asked_about(scene, without_solution, capsys):
