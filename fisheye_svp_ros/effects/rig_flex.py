@@ -64,7 +64,8 @@ class RigFlexEffect(Effect):
             x = 2 * order / max(len(self.frames) - 1, 1) - 1
             amounts = np.polynomial.legendre.legvander(x, self.degree)[:, 1:]
         else:
-            amounts = (scene.views.frame[:, None] == np.array(self.frames)).astype(float)
+            own = scene.views.frame[:, None] == np.array(self.frames)
+            amounts = np.where(own.any(axis=1, keepdims=True), own - 1 / len(self.frames), 0.0)
         turn = scene.pose.rotation * (scene.views.camera > 0)[:, None, None]
         turns = amounts[:, None, :, None] * turn[:, :, None, :]
         turns = turns.reshape(len(order), 3, len(self.parameters))
