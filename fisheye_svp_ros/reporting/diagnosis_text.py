@@ -235,9 +235,12 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
 
 def _elsewhere(d: Diagnosis) -> str:
     """Return that the lens was given other intrinsics than the data have; empty if it was not."""
-    off = {name: abs(value.given - value.before) / math.hypot(
-               value.given_stderr, value.before_stderr)
-           for name, value in d.intrinsics.items() if value.before_stderr > 0}
+    # What is wrong besides moves one of the two: the fit without causes, or the one with them.
+    off = {name: min(abs(value.given - found) / math.hypot(value.given_stderr, error)
+                     for found, error in ((value.before, value.before_stderr),
+                                          (value.after, value.after_stderr)))
+           for name, value in d.intrinsics.items()
+           if min(value.before_stderr, value.after_stderr) > 0}
     names = [name for name in off if off[name] > _ELSEWHERE]
     if not names:
         return ''
