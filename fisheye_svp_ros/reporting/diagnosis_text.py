@@ -175,7 +175,9 @@ def verdict_sentences(
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if d.verdict == 'adequate':
-        nothing = 'Nothing but the intrinsics as given' if _elsewhere(d) else 'Nothing'
+        but = [what for what, told in (('the intrinsics as given', _elsewhere(d)),
+                                       ('where the cameras stand', _loose(d))) if told]
+        nothing = f'Nothing but {listed(but)}' if but else 'Nothing'
         return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
@@ -249,11 +251,19 @@ def _elsewhere(d: Diagnosis) -> str:
             'off what these data say (another focus, day or camera?)')
 
 
+def _loose(d: Diagnosis) -> list[str]:
+    """Return what to find out of cameras that no rig holds together."""
+    return [f'find out why no rig holds {listed(pair.cameras)} together (frame numbers of other '
+            'moments, points numbered from the other end, exchanged cameras, a loose mount)'
+            for pair in d.cameras if pair.posed_alone and pair.rig]
+
+
 def _next(d: Diagnosis) -> str:
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
-        return f'{_elsewhere(d) or "Keep the lens as it is"}{blind}.'
+        return '; '.join([_elsewhere(d) or 'Keep the lens as it is', *_loose(d)]) + f'{blind}.'
     steps = [_elsewhere(d)] if _elsewhere(d) else []
+    steps += _loose(d)
     steps += [
         f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
@@ -261,6 +271,12 @@ def _next(d: Diagnosis) -> str:
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
+    steps += [
+        f'solve with {EXTENDED}, which holds {c.effect}' for c in d.causes
+        if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections
+    ]
+    steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
+              if stage_of(c.effect) == 'frame' and not c.indistinguishable_from]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from

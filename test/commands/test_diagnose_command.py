@@ -308,6 +308,14 @@ class TestWords:
         assert '2 points lie far off, furthest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma says' in wrong
 
+    def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
+        cause = replace(found.causes[0], effect='rolling_shutter', to_separate='use a tripod')
+        shutter = replace(found.lens, corrections={'rolling_shutter': {}})
+        told = [verdict_sentences(replace(found, causes=[cause], advice=[], lenses={'': lens}))[2]
+                for lens in (found.lens, shutter)]
+        assert told[0] == 'To confirm rolling_shutter: use a tripod.'
+        assert told[1].startswith('Solve with extended_lens.yaml, which holds rolling_shutter; to')
+
     def test_errors_against_the_truth_go_or_stay(self, found):
         _, gained, _ = verdict_sentences(found, {
             'position_error_m': Compared(0.002, 0.001, 0.5, 0.3, 0.6),

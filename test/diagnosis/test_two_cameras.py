@@ -164,6 +164,7 @@ def test_cameras_that_were_not_photographed_together(late):
     (said,) = found.cameras
     assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
     assert 'each view was posed by itself' in sections(found)[0].sentence
+    assert 'find out why no rig holds' in verdict_sentences(found)[2].lower()
     assert found.extended.heldout_rms_px < 0.15
 
 
