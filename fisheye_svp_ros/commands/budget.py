@@ -26,7 +26,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='nearest range of the landmarks or targets; default: 0.5')
     parser.add_argument('--spread', type=float, metavar='DEG',
                         help='largest angle of the landmarks from the axis; default: all of the '
-                        'field of view but 1 degree')
+                        'field of view but 1 degree, of a lens from `calibrate` as far as its '
+                        'image points reached')
     parser.add_argument('--noise', type=float, default=0.3, metavar='PX',
                         help='noise of u and of v; default: 0.3')
     parser.add_argument('--baseline', type=float, default=0.15, metavar='M',
@@ -58,10 +59,10 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.scene.rigs import rig
-    from fisheye_svp_ros.study.budget import Setup, at_point, make_budget, widest_spread
+    from fisheye_svp_ros.study.budget import Setup, at_point, make_budget, usual_spread
 
     lens = load_lens(lens_path(args.lens))
-    spread = widest_spread(lens) if args.spread is None else np.radians(args.spread).item()
+    spread = usual_spread(lens) if args.spread is None else np.radians(args.spread).item()
     limits = _limits(args)
     with progress('solving'):
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))

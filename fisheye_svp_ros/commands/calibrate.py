@@ -300,8 +300,6 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself."""
     from dataclasses import asdict
 
-    import numpy as np
-
     from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
     adjusted = result.adjusted
@@ -309,7 +307,6 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
         **(adjusted.lens.calibration or {}),
         'left_out': result.left_out,
         'beyond': result.beyond,
-        'reached_deg': float(np.degrees(result.reached)),
         'sigma_px': result.sigma,
         'parameters': dict(
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)

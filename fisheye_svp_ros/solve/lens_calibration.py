@@ -148,6 +148,7 @@ def _finished(
         'observations': rows // 2,
         'frames': len(views.frame),
         'source': observations.source,
+        'reached_deg': float(np.degrees(theta.max())),
     }
     lens = check_lens(replace(lens, calibration=block, uncertainty=None), observations.source)
     beyond = int((theta > lens.max_incidence).sum())

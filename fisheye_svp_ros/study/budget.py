@@ -99,6 +99,19 @@ def widest_spread(lens: Lens) -> float:
     return float(np.nanmax(seen, axis=1).min() - _EDGE)
 
 
+def usual_spread(lens: Lens) -> float:
+    """Return the spread to be asked about where none is named, rad.
+
+    It is the widest, but for a lens that was calibrated up to a smaller angle (`reached_deg`):
+    past that its curve is a guess, and where the image of the lens ends is not known.
+    """
+    widest = widest_spread(lens)
+    match (lens.calibration or {}).get('reached_deg'):
+        case float(reached) | int(reached) if lens.port is None:
+            return float(np.clip(np.radians(reached), _SMALLEST_SPREAD, widest))
+    return widest
+
+
 def nearest_range(lens: Lens) -> float:
     """Return the nearest range that a budget covers, m."""
     return max(_NEAREST, _CLEAR * unique_range(lens))

@@ -19,6 +19,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
+from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.simulate.simulation import simulate
@@ -207,6 +208,8 @@ class TestCalibrate:
         assert lens.calibration == {
             'rms_px': pytest.approx(0.1 * np.sqrt(2), rel=0.1), 'observations': len(table),
             'frames': 6, 'source': observations,
+            'reached_deg': pytest.approx(
+                np.degrees(back_project(LENS, table.uv).theta.max()), 0.01),
         }
         document = json.loads(out.with_suffix('.calibrate.json').read_text())
         assert document['sigma_px'] == pytest.approx(0.1, rel=0.1)

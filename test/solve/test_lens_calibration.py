@@ -78,6 +78,7 @@ def test_finds_the_lens_from_nothing(model, corner_deg, target):
         'observations': len(table),
         'frames': len(table.frames),
         'source': table.source,
+        'reached_deg': pytest.approx(np.degrees(back_project(lens, table.uv).theta.max()), abs=1),
     }
 
 

@@ -22,6 +22,7 @@ from fisheye_svp_ros.study.budget import (
     Setup,
     at_point,
     make_budget,
+    usual_spread,
     widest_spread,
 )
 
@@ -32,6 +33,13 @@ SPREAD = np.radians(80.0)
 @pytest.fixture(scope='module')
 def budget():
     return make_budget(Setup(LENS, rig('parallel'), 0.3), spreads=6, ranges=12)
+
+
+@pytest.mark.parametrize(('reached', 'spread'), [
+    (80.0, 80.0), (80, 80.0), (300.0, 106.0), ('far', 106.0), (None, 106.0)])
+def test_where_no_spread_is_named_a_calibration_says_how_far_it_reached(reached, spread):
+    calibrated = replace(LENS, calibration={'reached_deg': reached} if reached else None)
+    assert np.degrees(usual_spread(calibrated)) == pytest.approx(spread, abs=0.1)
 
 
 def point(budget, quantity, spread=SPREAD, working_range=0.5, **limits):
