@@ -19,6 +19,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_text, write_text
 
+_SHOWN = 60  # characters of a header
 _LARGEST = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
 
 
@@ -101,13 +102,14 @@ class CsvTable:
             )
 
     def _check_header(self, required: Sequence[str]) -> None:
-        wanted = ','.join(required)
+        wanted, there = ','.join(required), ','.join(self._header)
         if not any(self._header):
             raise ObservationError(f'{self.path}: it is empty; a header with {wanted} is needed')
         for name in required:
             if name not in self._header:
                 raise ObservationError(
-                    f'{self.path}: column {name!r} is missing from its header; needed are {wanted}'
+                    f'{self.path}: column {name!r} is missing from its header, '
+                    f'{there[:_SHOWN]!r}; needed are {wanted}'
                 )
         twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:
