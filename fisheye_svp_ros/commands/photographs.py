@@ -92,8 +92,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.detect.photographs import (
         count_photographs,
+        doubtful_folders,
         find_photographs,
-        passed_over,
     )
     from fisheye_svp_ros.reporting.progress import progress
 
@@ -103,9 +103,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     with progress('searching', count_photographs(paths, args.every)) as done:
         detection = detect(find_photographs(paths, args.every), pattern, args.detector,
                            progress=done, source=', '.join(paths))
-    for folder, count in passed_over(paths).items():
-        say(f'{folder}: its {count} images are passed over, since the folder above has images of '
-            'its own; give it by itself, or move those into a subfolder, too')
+    for line in doubtful_folders(paths):
+        say(line)
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
            for one in detection.searched if one.reason or one.notes]
     for line in odd[:_SHOWN]:

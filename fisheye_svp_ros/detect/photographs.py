@@ -86,7 +86,8 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
             if number % every == 0:
                 yield photograph
         if number < 0:
-            raise ObservationError(f'{path}: no photograph in it; images are {" ".join(IMAGES)}')
+            raise ObservationError(f'{path}: no photograph in it or a folder in it; images are '
+                                   f'{" ".join(IMAGES)}')
 
 
 def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
@@ -99,16 +100,25 @@ def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
     return count
 
 
-def passed_over(paths: Sequence[str]) -> dict[Path, int]:
-    """Return the subfolders that `find_photographs` leaves, and how many images each holds.
+def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
+    """Yield what `find_photographs` makes of folders and may not be meant: a line each.
 
     Beside images of the folder itself those of its subfolders may be anything, pictures of results
-    say.
+    say; and files called after cameras are those of one where others are called otherwise.
     """
-    given = {*map(Path, paths)}
-    folders = [p for p in given if p.is_dir() and not _is_recording(p) and _images(p)]
-    return {sub: count for folder in folders for sub in sorted(folder.iterdir())
-            if sub.is_dir() and sub not in given and (count := len(_images(sub)))}
+    given = [*map(Path, paths)]
+    for folder in given:
+        if not folder.is_dir() or _is_recording(folder) or not (files := _images(folder)):
+            continue
+        for sub in sorted(folder.iterdir()):
+            if sub.is_dir() and sub not in given and (count := len(_images(sub))):
+                yield (f'{sub}: images in it are passed over ({count}), since the folder above has '
+                       'some of its own; give it by itself, or move those into a subfolder, too')
+        named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
+        other = next((p.name for p in files if p.name not in named), '')
+        if other and len({*named.values()}) > 1:
+            yield (f'{folder}: all images are taken for those of one camera, since {other} is not '
+                   f'called after one as {next(iter(named))} is; rename or remove it')
 
 
 def is_photographs(path: Path) -> bool:

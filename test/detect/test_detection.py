@@ -32,6 +32,7 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
     decoded,
+    doubtful_folders,
     exif_turned,
     find_photographs,
     message_pixels,
@@ -503,6 +504,23 @@ class TestCameras:
             (tmp_path / name).parent.mkdir(exist_ok=True)
             (tmp_path / name).touch()
         assert self.cameras(tmp_path) == cameras
+
+    @pytest.mark.parametrize(('files', 'told'), [
+        (['left01.png', 'right01.png', 'notes.png'], 'those of one camera, since notes.png is'),
+        (['left01.png', 'right01.png'], ''),
+        (['left01.png', 'other.png'], ''),
+        (['1.png', 'results/1.png'], 'results: images in it are passed over (1)'),
+        (['1.png', 'results/1.txt'], ''),
+    ])
+    def test_what_may_not_be_meant_is_told(
+        self, tmp_path: Path, files: list[str], told: str
+    ) -> None:
+        for name in files:
+            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).touch()
+        lines = [*doubtful_folders([str(tmp_path)])]
+        assert len(lines) == bool(told)
+        assert all(told in line for line in lines)
 
     @pytest.mark.parametrize(('topics', 'cameras'), [
         (['/image_raw', '/image_raw/compressed'], ['']),
