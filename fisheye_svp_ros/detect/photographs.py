@@ -112,8 +112,8 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
             continue
         for sub in sorted(folder.iterdir()):
             if sub.is_dir() and sub not in given and (count := len(_images(sub))):
-                yield (f'{sub}: images in it are passed over ({count}), since the folder above has '
-                       'some of its own; give it by itself, or move those into a subfolder, too')
+                yield (f'{sub}: images in it are passed over ({count}), since the folder above '
+                       'has some, too; give it by itself, or move those into a subfolder')
         named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
         other = next((p.name for p in files if p.name not in named), '')
         if other and len({*named.values()}) > 1:
