@@ -182,7 +182,7 @@ def _wrong(d: Diagnosis) -> str:
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
         return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms, and no effect of '
-                f'the catalogue accounts for what is odd about them: {remains(d, 7)}.')
+                f'the catalogue accounts for what is odd about them: {remains(d, 7)}{_almost(d)}.')
     causes = '; because '.join(
         f'{what(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_NAMED]
@@ -190,6 +190,16 @@ def _wrong(d: Diagnosis) -> str:
     more = len(d.causes) - _NAMED
     rest = f'; and for {more} more reason{"s" * (more > 1)} in the table' if more > 0 else ''
     return f'Beyond {noise} the simulation is wrong because {causes}{rest}.'
+
+
+def _almost(d: Diagnosis) -> str:
+    """Return which effect would be named, had it predicted frames that were left out."""
+    for step in d.trace:
+        if not step.accepted and step.why.endswith('does not predict better'):
+            return (f'; {step.effect.partition("(")[0]} would ({probability(step.corrected)}), but '
+                    'with it frames left out in turn are predicted no better beyond chance: more '
+                    'photographs would tell')
+    return ''
 
 
 def _name(cause: Cause) -> str:

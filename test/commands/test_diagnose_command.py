@@ -298,6 +298,14 @@ class TestWords:
         assert 'no extension improved on it' in gained
         assert following.startswith('Look for the reason')
 
+    def test_what_was_almost_named_is_told(self, found):
+        step = replace(found.trace[0], accepted=False, corrected=3e-6,
+                       why='does not predict better')
+        left = [Structure('range', 1e-9, 0.3)]
+        wrong, _, _ = verdict_sentences(replace(
+            found, verdict='unexplained', causes=[], advice=[], remaining=left, trace=[step]))
+        assert '; viewpoint_shift would (p = 3e-06), but with it frames left out' in wrong
+
     def test_what_remains_is_told_in_numbers(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5), Structure('size', 0.0, 0.0)]
