@@ -196,9 +196,9 @@ def _almost(d: Diagnosis) -> str:
     """Return which effect would be named, had it predicted frames that were left out."""
     for step in d.trace:
         if not step.accepted and step.why.endswith('does not predict better'):
-            return (f'; {step.effect.partition("(")[0]} would ({probability(step.corrected)}), but '
-                    'with it frames left out in turn are predicted no better beyond chance: more '
-                    'photographs would tell')
+            name = step.effect.partition('(')[0]
+            return (f'; {name} would ({probability(step.corrected)}), but with it frames left out '
+                    'in turn are predicted no better beyond chance: more photographs would tell')
     return ''
 
 

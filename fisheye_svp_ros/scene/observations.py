@@ -162,7 +162,8 @@ def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tupl
     """
     pair_names = rig_cameras(observations.cameras)
     if pair_names is None or not len(observations):
-        held = ', '.join(observations.cameras) if len(observations) else 'no observation'
+        names = ', '.join(observations.cameras) or 'one camera, without a name'
+        held = names if len(observations) else 'no observation'
         raise ObservationError(
             f'{observations.source}: the cameras left and right are needed; it holds {held}'
         )
