@@ -206,7 +206,7 @@ def test_stereo_views_refuse_what_is_not_stereo():
     model = MODELS['fish180']
     mono = simulate(model, environment('inner', 0.5), calibration_poses(), 0.0,
                     np.random.default_rng(0))
-    with pytest.raises(ObservationError, match='left and right .* holds one camera, without a'):
+    with pytest.raises(ObservationError, match=r'left and right .* holds one camera, without a'):
         stereo_views(mono)
     table = simulate_stereo(model, model, environment('inner', 0.5), rig('parallel'),
                             calibration_poses(), 0.0, np.random.default_rng(0))
