@@ -133,9 +133,9 @@ def _read(
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.commands.lenses import lenses_of
-    from fisheye_svp_ros.commands.notes import note_huge, note_left_out
+    from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
     from fisheye_svp_ros.commands.photographs import check_sizes, measured
-    from fisheye_svp_ros.diagnosis.inputs import posable
+    from fisheye_svp_ros.diagnosis.inputs import posable, without_copies
 
     table, sizes = measured(path, args)
     note_huge(table)
@@ -148,6 +148,8 @@ def _read(
     lens = given[''] if one else lenses
     observations, left_out = posable(table, lens)
     note_left_out(left_out)
+    observations, again = without_copies(observations)
+    note_copies(again)
     return observations, lens
 
 

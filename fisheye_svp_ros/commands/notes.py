@@ -38,6 +38,12 @@ def note_left_out(frames: Sequence[int]) -> None:
             f'another lens?): {_frames(frames)}')
 
 
+def note_copies(frames: Sequence[int]) -> None:
+    """Name the frames that are other frames once more, if there are any."""
+    if frames:
+        say(f'left out, since their image points are those of an earlier frame: {_frames(frames)}')
+
+
 def note_huge(table: Observations) -> None:
     """Ask for the unit of a target that is larger than targets are."""
     across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())

@@ -21,6 +21,7 @@ from fisheye_svp_ros.diagnosis.inputs import (
     of_rig,
     rig_lenses,
     thinned,
+    without_copies,
 )
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
@@ -147,6 +148,7 @@ def diagnose(
     causes to take in or leave out; progress: told what is being done, and which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
+    observations, _ = without_copies(observations)
     observations.landmarks()  # each is in one place
     check_cameras(observations)
     lenses = rig_lenses(observations, lens)

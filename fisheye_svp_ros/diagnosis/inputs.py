@@ -59,6 +59,24 @@ def check_other(observations: Observations, other: Observations) -> None:
                                f'{observations.source}; other photographs are needed')
 
 
+def without_copies(observations: Observations) -> tuple[Observations, tuple[int, ...]]:
+    """Return the frames whose image points no earlier one has, to the last digit, and the others.
+
+    A copy knows nothing new, and what is noise in it seems to come again.
+    """
+    table = observations
+    order = np.lexsort((table.landmark, table.camera, table.frame))
+    rows = np.column_stack([table.camera, table.landmark, table.uv])[order]
+    seen: set[bytes] = set()
+    again = []
+    for part in np.split(np.arange(len(order)), np.flatnonzero(np.diff(table.frame[order])) + 1):
+        points = rows[part].tobytes()
+        if points in seen:
+            again.append(int(table.frame[order[part[0]]]))
+        seen.add(points)
+    return table.take(~np.isin(table.frame, again)), tuple(again)
+
+
 def check_cameras(observations: Observations) -> None:
     """Raise ObservationError where two cameras of a rig hold the same image points."""
     tables = [replace(observations.take(observations.camera == camera),

@@ -242,6 +242,20 @@ class TestTerminal:
                          '--lens', str(tmp_path / 'rough.yaml')]) == 0
         assert 'Keep the lens as it is' in capsys.readouterr().out
 
+    def test_a_frame_that_is_there_twice_counts_once(self, scene, capsys, tmp_path):
+        table = read_observations(scene / 'clean.csv')
+        again = table.take(table.frame == 3)
+        more = {name: np.concatenate([getattr(table, name), getattr(again, name)])
+                for name in ('landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')}
+        frame = np.concatenate([table.frame, np.full(len(again), 99)])
+        write_observations(tmp_path / 'twice.csv', replace(table, frame=frame, **more))
+        command = ['--lens', scene / 'lens.yaml', '--quick']
+        assert cli.main([*map(str, ['diagnose', tmp_path / 'twice.csv', *command])]) == 0
+        twice = capsys.readouterr()
+        assert cli.main([*map(str, ['diagnose', scene / 'clean.csv', *command])]) == 0
+        assert twice.out == capsys.readouterr().out
+        assert 'image points are those of an earlier frame: frame 99' in twice.err
+
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
         assert run('poor.csv', scene) == 0
         out, err = capsys.readouterr()
