@@ -292,6 +292,9 @@ def _next(d: Diagnosis) -> str:
         for c in d.causes if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if CATALOGUE[c.effect].stage == 'noise']
+    if 'focal_drift' in d.untestable and 'frame' in {one.variable for one in d.remaining}:
+        steps.append('give the time of each frame (a column t, s): what drifts, jumps or moves '
+                     'while rows are exposed can then be told')
     if d.remaining:
         steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
     text = '; '.join(steps) or 'keep the lens as it is'

@@ -311,6 +311,9 @@ class TestWords:
         assert 'a few points lie far off' in wrong
         assert 'no extension improved on it' in gained
         assert following.startswith('Look for the reason')
+        *_, following = verdict_sentences(replace(
+            found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}))
+        assert 'give the time of each frame (a column t, s)' in following
 
     def test_what_was_almost_named_is_told(self, found):
         step = replace(found.trace[0], accepted=False, corrected=3e-6,
