@@ -319,7 +319,7 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
 
     values = spread * np.random.default_rng(27).normal(size=40)
     evidence = SimpleNamespace(
-        own=1, scale=np.array([2.0]), information=information(values),
+        own=1, terms=[], scale=np.array([2.0]), information=information(values),
         in_turn=[information(np.delete(values, i)) for i in range(40)],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     expected = 1 if spread == 1 else values.std(ddof=1)
@@ -333,7 +333,8 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     rows[:, 2] = np.random.default_rng(28).normal(size=40) + 100 * rows[:, 1]
     without = [np.delete(rows, i, axis=0) for i in range(40)]
     evidence = SimpleNamespace(
-        own=2, scale=np.ones(2), information=rows.T @ rows, in_turn=[w.T @ w for w in without],
+        own=2, terms=[], scale=np.ones(2), information=rows.T @ rows,
+        in_turn=[w.T @ w for w in without],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     assert standard_errors(evidence) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
 
