@@ -38,14 +38,13 @@ def known_errors(
 
     position_error_m and axis_error_rad of the first camera where true poses are known;
     depth_error_m of two cameras (Error3 of Kita, section 5), unless the landmarks themselves are
-    in doubt, or the rig of a frame that was left out: mean distance of triangulated landmarks from
-    where poses and rig say they are.
+    in doubt, or where the cameras stood at each moment: mean distance of triangulated landmarks
+    from where poses and rig say they are.
     """
     measured: dict[str, Callable[[Data, State], Array]] = {}
     if after.data.poses is not None:
         measured |= {'position_error_m': _position_errors, 'axis_error_rad': _axis_errors}
-    effects = [effect for effect, _ in after.state.terms]
-    doubtful = any(effect.stage == 'target' or effect.per_frame for effect in effects)
+    doubtful = any(effect.stage in ('target', 'pose') for effect, _ in after.state.terms)
     if after.data.cameras == 2 and not doubtful:
         measured['depth_error_m'] = _depth_errors
     pairs = [list(_trained(linear, free)) for linear in (before, after)] if measured else []

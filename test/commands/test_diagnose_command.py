@@ -15,11 +15,13 @@ from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.points import point_residuals
+from fisheye_svp_ros.diagnosis.search import with_effect
 from fisheye_svp_ros.diagnosis.structure import Structure
 from fisheye_svp_ros.diagnosis.target_map import board_maps
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_table import CsvTable
@@ -437,3 +439,6 @@ def test_the_depth_of_a_rig_gains_too():
     depth = known['depth_error_m']
     assert 0 < depth.extended < depth.base
     assert depth.low <= depth.gain <= depth.high
+    # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
+    late = with_effect(found.after.state, StereoTimeOffsetEffect(), np.array([0.01]))
+    assert known_errors(found.before, Linearised(found.after.data, late, ()), ()) == {}
