@@ -54,16 +54,18 @@ class Examined(NamedTuple):
 
 
 def examine(
-    model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True
+    model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True,
+    searched: bool = True,
 ) -> Examined:
     """Test the poses that `localize` found, and look for gross errors where they fail.
 
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
     single one against its own median residual, and covariances are scaled by the estimate.
+    searched: look for gross errors; without, a view that fails is only said to.
     """
     model = model.seeing(views)
     if sigma_known:
-        return _examined(model, views, found, 1.0, 1.0)
+        return _examined(model, views, found, 1.0, 1.0, searched)
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
     usual = float(np.sqrt(np.median(found.cost / freedom)))
     if len(freedom) < _OTHERS:
@@ -82,7 +84,8 @@ def examine(
 
 
 def _examined(
-    model: ForwardModel, views: Views, found: Localization, sigma: float, tolerance: float
+    model: ForwardModel, views: Views, found: Localization, sigma: float, tolerance: float,
+    searched: bool = True,
 ) -> Examined:
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
@@ -95,7 +98,7 @@ def _examined(
     result = Localization.concatenate([found])  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
-        other = _agreed(model, view, found.take([i]), sigma, tolerance)
+        other = _agreed(model, view, found.take([i]), sigma, tolerance) if searched else None
         if other is not None:
             result.put([i], other)
             gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])

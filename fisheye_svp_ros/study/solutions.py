@@ -72,18 +72,18 @@ class Solved(NamedTuple, Generic[T]):
 
 def localized(
     model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None,
-    examined: bool = False,
+    examined: bool = False, searched: bool = True,
 ) -> Solved[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
     examined: test the misfit against sigma and leave gross errors out, which simulated sets do
-    not have: for them it changes nothing.
+    not have: for them it changes nothing.  searched: as `examine` has it.
     Raises GeometryError as `localize` does.
     """
     found = localize(model, views, start)
     residual, reasons = found.residual, ('',) * len(found.cost)
     if examined:
-        checked = examine(model, views, found)
+        checked = examine(model, views, found, searched=searched)
         found, reasons = checked.result, checked.reasons
         residual = np.where(checked.gross[..., None], np.nan, found.residual)
     metrics = localization_metrics(found.pose, residual, true)

@@ -44,6 +44,7 @@ from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.scene.rigs import paper_pose, rig
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.solve import reliability
 from fisheye_svp_ros.solve.localization import localize
 
 
@@ -370,6 +371,42 @@ def test_a_pose_that_is_not_to_be_relied_on_is_a_warning(graph: Callable[..., Gr
     assert all(f' {landmark} (' in status[1].message for landmark in named)
     assert 'times what sigma allows' in status[2].message
     sets.graph.until(lambda: len(sets.poses) == 3)
+
+
+def test_a_camera_that_stays_where_it_is_is_warned_of_in_every_set(
+    graph: Callable[..., Graph]
+) -> None:
+    sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
+    sets.tell_landmarks(0, 2.0)
+    seen = simulate_scenario(Scenario(radius=2.0, noise_px=0.3)).observations
+    off = seen.uv.copy()
+    off[4, 0] += 2.4
+    halved = 0.5 * seen.uv
+    for stamp, uv in enumerate((seen.uv, off, halved, halved, halved), start=1):
+        sets.points.publish(messages.image_points_message(seen.landmark, uv, stamp, 'camera'))
+        sets.result(stamp)
+    said = [message.status[0].message for message in sets.results]
+    assert said[0] == '' and f'left out: landmark {seen.landmark[4]} (' in said[1]
+    assert all('times what sigma allows' in text for text in said[2:])
+    sets.graph.until(lambda: len(sets.poses) == 5)
+    for pose in sets.poses[3:]:
+        assert pose.pose.covariance == pytest.approx(sets.poses[2].pose.covariance, rel=1e-3)
+
+
+def test_a_lens_that_is_wrong_in_every_set_is_not_searched_for_gross_errors_in_each(
+    graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
+    sets.tell_landmarks(0, 2.0)
+    search, searched = reliability._agreed, []
+    monkeypatch.setattr(reliability, '_agreed', lambda *arguments: (
+        searched.append(stamp), search(*arguments))[1])
+    seen = simulate_scenario(Scenario(radius=2.0, noise_px=0.3)).observations
+    for stamp in range(1, 22):
+        sets.points.publish(
+            messages.image_points_message(seen.landmark, 0.5 * seen.uv, stamp, 'camera'))
+        sets.result(stamp)
+    assert searched == [1, 11, 21]
 
 
 def test_the_covariance_of_a_pose_with_the_lens_s_own_errors(

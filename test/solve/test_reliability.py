@@ -63,6 +63,13 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     assert np.linalg.norm(found.solution.residual[0, 3]) > 30
 
 
+def test_without_a_search_gross_errors_are_a_misfit():
+    model, views, _ = spoilt('clean', 'room', 1, np.random.default_rng(5))
+    views.uv[0, 3] += [40.0, -5.0]
+    checked = examine(model, views, localize(model, views), searched=False)
+    assert 'times what sigma allows' in checked.reasons[0] and not checked.gross.any()
+
+
 @pytest.mark.parametrize(('off', 'gross'), [(4.5, False), (6.0, True)])
 def test_a_point_is_a_gross_error_beyond_five_standard_deviations(off, gross):
     model, views, true = spoilt('clean', 'room', 1, np.random.default_rng(5))
