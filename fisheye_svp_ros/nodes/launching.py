@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from launch.actions import DeclareLaunchArgument
@@ -10,7 +11,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from fisheye_svp_ros.errors import StandaloneError
+from fisheye_svp_ros.errors import ParameterError, StandaloneError
 
 PACKAGE = 'fisheye_svp_ros'
 STYLES = ('parallel', 'vergent', 'divergent')
@@ -70,14 +71,20 @@ def value(context: Any, name: str) -> str:
 def node(
     context: Any, name: str, given: Mapping[str, Any], remappings: Sequence[Any] = ()
 ) -> Any:
-    """Return a node with its files, then what was given; lens and svp where it has them."""
+    """Return a node with its files, then what was given; lens and svp where it has them.
+
+    Raises ParameterError for a file that is not there, of which launch_ros would only warn.
+    """
     words = _WORDS.get(name, ('lens', 'svp'))
     flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
-    files = [value(context, f'{name}_params'), value(context, 'params')]
+    files = {word: value(context, word) for word in (f'{name}_params', 'params')}
+    for word, file in files.items():
+        if file and not Path(file).is_file():
+            raise ParameterError(f'{word}: {file!r} is no file; name a parameter file')
     return Node(
         package=PACKAGE, executable=name, namespace=value(context, 'namespace'), output='screen',
         parameters=[
-            *filter(None, files),
+            *filter(None, files.values()),
             {word: value(context, word) for word in words if value(context, word)},
             {flag: value(context, flag) == 'true' for flag in flags if value(context, flag)},
             dict(given),

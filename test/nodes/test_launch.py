@@ -112,11 +112,18 @@ def test_a_sweep_whose_recorder_dies_ends_with_the_reason(
     assert 'a recording cannot be written there' in text and 'ended with status 2' in text
 
 
-def test_a_choice_that_is_none_is_refused(ros_domain: int) -> None:
-    launch = NodeProcess(
-        ['ros2', 'launch', 'fisheye_svp_ros', 'mono.launch.py', 'svp:=maybe'], dict(os.environ))
-    assert launch.finish() != 0
-    assert 'maybe' in '\n'.join(launch.lines) and 'process started' not in '\n'.join(launch.lines)
+@pytest.mark.parametrize(('word', 'reason'), [
+    ('svp:=maybe', 'maybe'),
+    ('params:=nothere.yaml', "params: 'nothere.yaml' is no file"),
+    ('localizer_params:=/', "localizer_params: '/' is no file"),
+])
+def test_an_argument_that_cannot_be_used_is_refused(
+    launch: Callable[..., NodeProcess], word: str, reason: str
+) -> None:
+    mono = launch('mono.launch.py', word)
+    assert mono.finish() != 0
+    text = '\n'.join(mono.lines)
+    assert reason in text and 'process started' not in text
 
 
 def test_everything_goes_below_a_namespace(graph: Graph) -> None:
