@@ -73,15 +73,20 @@ class Unread:
 
 
 def twins(receive: Callable[[bytes], None]) -> tuple[Callable[[bytes], None], ...]:
-    """Return callbacks for two subscriptions of one topic; what comes to both is received once."""
-    ahead: list[deque[bytes]] = [deque(maxlen=_TWINS), deque(maxlen=_TWINS)]
+    """Return callbacks for two subscriptions of one topic; what comes to both is received once.
+
+    Messages are known by their hashes: those of a volatile publisher come to one alone, and to
+    keep them would keep the last hundred.
+    """
+    ahead: list[deque[int]] = [deque(maxlen=_TWINS), deque(maxlen=_TWINS)]
 
     def callback(own: int) -> Callable[[bytes], None]:
         def hear(data: bytes) -> None:
+            known_by = hash(data)
             with suppress(ValueError):
-                ahead[1 - own].remove(data)
+                ahead[1 - own].remove(known_by)
                 return
-            ahead[own].append(data)
+            ahead[own].append(known_by)
             receive(data)
 
         return hear

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -257,6 +258,14 @@ def test_twins_take_every_message_once_and_in_order() -> None:
                        (one, b'a'), (other, b'a')):
         hear(data)
     assert heard == [b'a', b'b', b'c', b'a']
+
+
+def test_twins_keep_no_message() -> None:
+    one, _ = inputs.twins(lambda _: None)
+    data = bytes(1000)
+    before = sys.getrefcount(data)
+    one(data)
+    assert sys.getrefcount(data) == before
 
 
 @pytest.mark.parametrize('topics', ['!!bad name//', 'localizer/result 9x', '/', 'a//b'])
