@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+# As the Makefile has it: threads of OpenBLAS that wait for a core cost more than they bring.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
 # Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 

@@ -18,6 +18,9 @@ from fisheye_svp_ros.nodes import NODES
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row
 
+# Matrices are small for BLAS, and other nodes want the other cores.
+os.environ.setdefault('OMP_NUM_THREADS', '1')
+
 
 @contextmanager
 def ending_quietly() -> Iterator[None]:

@@ -111,6 +111,18 @@ def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
         'fisheye_svp_ros', 'fisheye_svp_ros.nodes', 'fisheye_svp_ros.nodes.executables']
 
 
+@pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])
+def test_a_node_computes_on_one_core_unless_told_otherwise(
+    given: dict[str, str], taken: str
+) -> None:
+    code = ('import os, sys; import fisheye_svp_ros.nodes.executables; '
+            "assert 'numpy' not in sys.modules; print(os.environ['OMP_NUM_THREADS'])")
+    env = {name: value for name, value in os.environ.items() if name != 'OMP_NUM_THREADS'}
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
+                          env=env | {'PYTHONPATH': str(ROOT)} | given)
+    assert done.stdout.strip() == taken
+
+
 @pytest.mark.parametrize('name', NODES)
 def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
     name: str, ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
