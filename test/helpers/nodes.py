@@ -80,24 +80,32 @@ class Caller:
         self._dds = dds
         self._participant = dds.Participant(domain)
         self._sequence = 0
+        self._endpoints: dict[str, tuple[Any, Any, Any]] = {}
 
-    def call(self, typename: str, service: str, **request: Any) -> Any:
-        """Call a service and return its response."""
+    def _client(self, typename: str, service: str) -> tuple[Any, Any, Any]:
+        """Return the request's type, a writer and a reader; a service has one of each."""
         from fisheye_svp_ros.standalone.messages import service_class
         from fisheye_svp_ros.standalone.qos import QoSProfile
 
-        dds, qos, types = self._dds, QoSProfile(depth=10), service_class(typename)
-        participant = self._participant
-        writer = dds.Writer(
-            participant, f'rq{service}Request', types.Request.TYPENAME, qos, 'clientid=1.2.3;')
-        reader = dds.Reader(
-            participant, f'rr{service}Reply', types.Response, qos, 'clientid=1.2.3;')
+        if service not in self._endpoints:
+            dds, qos, types = self._dds, QoSProfile(depth=10), service_class(typename)
+            self._endpoints[service] = (
+                types.Request,
+                dds.Writer(self._participant, f'rq{service}Request', types.Request.TYPENAME, qos,
+                           'clientid=1.2.3;'),
+                dds.Reader(self._participant, f'rr{service}Reply', types.Response, qos,
+                           'clientid=1.2.3;'))
+        return self._endpoints[service]
+
+    def call(self, typename: str, service: str, **request: Any) -> Any:
+        """Call a service and return its response."""
+        request_type, writer, reader = self._client(typename, service)
         until(lambda: bool(
             writer.entity.get_matched_subscriptions() and reader.entity.get_matched_publications()
         ))
         self._sequence += 1
-        header = dds.Header(writer.entity.instance_handle % 2**64, self._sequence)
-        writer.write_call(header, types.Request(**request))
+        header = self._dds.Header(writer.entity.instance_handle % 2**64, self._sequence)
+        writer.write_call(header, request_type(**request))
         while taken := until(reader.take_call):
             if taken[0][:2] == header[:2]:
                 return taken[1]
