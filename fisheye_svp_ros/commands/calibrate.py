@@ -155,6 +155,15 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
     if result.beyond:
         say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
             'turns back; another model may suit this lens')
+    _report_image(result)
+
+
+def _report_image(result: Calibration) -> None:
+    """Say where the image of the lens lies askew, or was not covered."""
+    import numpy as np
+
+    from fisheye_svp_ros.commands.notes import say
+
     lens, views = result.adjusted.lens, result.views
     off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
     if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:

@@ -67,11 +67,6 @@ def of_target(term: Term) -> bool:
     return term[0].stage == 'target'
 
 
-def without_terms(state: State, names: Collection[str]) -> State:
-    """Return the state without some effects."""
-    return replace(state, terms=tuple(t for t in state.terms if t[0].name not in names))
-
-
 def names_of(terms: Sequence[Term]) -> list[str]:
     """Return the names of effects."""
     return [effect.name for effect, _ in terms]

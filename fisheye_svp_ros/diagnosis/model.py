@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -91,6 +91,10 @@ class State:
         heads = [f'{label}.' if label else '' for label in self.labels]
         return [[name.removeprefix(head) for name in free if name.startswith(head)]
                 for head in heads]
+
+    def without(self, names: Collection[str]) -> State:
+        """Return the state without some effects."""
+        return replace(self, terms=tuple(t for t in self.terms if t[0].name not in names))
 
     def view_poses(self, data: Data) -> Pose:
         """Return the camera's pose in each view (S,)."""

@@ -124,14 +124,10 @@ def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]
     shared[kept] = change
     moves = (linear.shared_columns @ shared)[linear.used] / linear.row_weight[linear.used]
     if np.sqrt(2 * np.mean(moves**2)) > _LINEAR:
-        state = fit(linear.data, _without(linear.state, names), free)
+        state = fit(linear.data, linear.state.without(names), free)
         return refit(linear.data, state, free, evidence.variances)
     frame = np.zeros((linear.data.frames, 6))
-    return _without(moved(linear.data, linear.state, free, frame, shared), names)
-
-
-def _without(state: State, names: Collection[str]) -> State:
-    return replace(state, terms=tuple(t for t in state.terms if t[0].name not in names))
+    return moved(linear.data, linear.state, free, frame, shared).without(names)
 
 
 def _refitted(

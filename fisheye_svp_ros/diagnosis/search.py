@@ -166,7 +166,7 @@ def _changed(
     evidence: Evidence, state: State, included: Index, gone: Sequence[str], forms: Sequence[int]
 ) -> State:
     """Return the state without some effects and with chosen forms of others."""
-    kept = replace(state, terms=tuple(t for t in state.terms if t[0].name not in gone))
+    kept = state.without(gone)
     estimated = _estimated(evidence, included, forms)
 
     def after(part: float) -> State:

@@ -23,7 +23,6 @@ from fisheye_svp_ros.diagnosis.carried import (
     settled,
     target_of,
     with_target,
-    without_terms,
 )
 from fisheye_svp_ros.diagnosis.known_truth import Compared, compared
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
@@ -168,7 +167,7 @@ def _has_target(found: Found) -> bool:
 def _compared(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
     carried, poses = [], []
     for mine, source in ((one, other), (other, one)):
-        data, state = mine.data, without_terms(mine.state, names_of(
+        data, state = mine.data, mine.state.without(names_of(
             [term for term in mine.state.terms if of_target(term)]))
         if source.target is None:
             after = fit(data, state, mine.free)

@@ -20,7 +20,6 @@ from fisheye_svp_ros.diagnosis.carried import (
     settled,
     target_of,
     with_target,
-    without_terms,
 )
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.evidence import bare_evidence
@@ -169,7 +168,7 @@ def _tried(one: Diagnosis, other: Diagnosis, source: str, to: str) -> Tried | No
         return None
     data, free = other.after.data, other.after.free
     own = other.after.state
-    bare = without_terms(own, names_of([t for t in own.terms if of_lens(t)]))
+    bare = own.without(names_of([t for t in own.terms if of_lens(t)]))
 
     def held_out(terms: Sequence[Term], state: State = bare, free: Sequence[str] = free) -> Any:
         there = replace(state, terms=(*state.terms, *terms))
@@ -197,7 +196,7 @@ def _target(one: Diagnosis, other: Diagnosis, source: str, to: str) -> Carried |
         return None
     fitted = fit_linear(one.after, one.errors.variances)
     own, free = other.after.state, other.after.free
-    state = without_terms(own, names_of([t for t in own.terms if of_target(t)]))
+    state = own.without(names_of([t for t in own.terms if of_target(t)]))
     moved = less_similarity(known.points, target_of(fitted, known))
     _, without = settled(other.after.data, state, free)
     _, carried = settled(with_target(other.after.data, known, moved), state, free)

@@ -269,11 +269,11 @@ def _loose(d: Diagnosis) -> list[str]:
 
 
 def _next(d: Diagnosis) -> str:
+    elsewhere = _elsewhere(d)
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
-        return '; '.join([_elsewhere(d) or 'Keep the lens as it is', *_loose(d)]) + f'{blind}.'
-    steps = [_elsewhere(d)] if _elsewhere(d) else []
-    steps += _loose(d)
+        return '; '.join([elsewhere or 'Keep the lens as it is', *_loose(d)]) + f'{blind}.'
+    steps = [*([elsewhere] if elsewhere else []), *_loose(d)]
     steps += [
         f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
