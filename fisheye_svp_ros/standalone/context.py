@@ -6,12 +6,14 @@ import os
 import signal
 import sys
 import threading
+from functools import partial
 from types import FrameType
 from typing import Any
 
 from fisheye_svp_ros.standalone import arguments, dds, logging
 from fisheye_svp_ros.standalone.exceptions import NotInitializedException, RCLError
 from fisheye_svp_ros.standalone.graph import Graph
+from fisheye_svp_ros.standalone.interrupts import INTERRUPTS
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LAST_DOMAIN = 232  # the ports of higher ones do not exist
@@ -80,7 +82,7 @@ class Context:
         self.interrupted = number == signal.SIGINT
         previous = self._handlers.get(signal.Signals(number))
         if callable(previous):
-            previous(number, frame)
+            INTERRUPTS.handle(partial(previous, number, frame))
 
 
 _default = Context()

@@ -43,6 +43,7 @@ from rosbags.interfaces import Nodetype
 
 from fisheye_svp_ros.standalone import messages
 from fisheye_svp_ros.standalone.exceptions import NotSupportedError, RCLError
+from fisheye_svp_ros.standalone.interrupts import INTERRUPTS
 from fisheye_svp_ros.standalone.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -190,7 +191,9 @@ class _Endpoints:
 
     def alive(self) -> Collection[tuple[str, str, QoSProfile]]:
         """Return topic, type and QoS of every endpoint that is there now."""
-        for endpoint in self._reader.take(_MANY):
+        with INTERRUPTS:
+            taken = self._reader.take(_MANY)
+        for endpoint in taken:
             if endpoint.sample_info.instance_state == InstanceState.Alive:
                 self._alive[endpoint.key] = (
                     endpoint.topic_name, endpoint.type_name, _ros_qos(endpoint.qos))
@@ -287,7 +290,8 @@ class Writer:
         deadline = time.monotonic() + timeout
         while time.monotonic() < deadline:
             for handle in self.matched():
-                endpoint = self.entity.get_matched_subscription_data(handle)
+                with INTERRUPTS:
+                    endpoint = self.entity.get_matched_subscription_data(handle)
                 if endpoint and _client_id(endpoint.qos) == user_data:
                     return
             time.sleep(0.005)
@@ -342,14 +346,16 @@ class Reader:
 
     def client_of(self, header: Header) -> bytes:
         """Return what a client calls itself; empty when it is gone or does not say."""
-        endpoint = self.entity.get_matched_publication_data(header.writer)
+        with INTERRUPTS:
+            endpoint = self.entity.get_matched_publication_data(header.writer)
         return _client_id(endpoint.qos) if endpoint else b''
 
     def _take(self) -> Sample | None:
         # Samples without data tell that a writer left; there may be several before the next one.
-        while taken := self.entity.take(1):
-            if taken[0].sample_info.valid_data:
-                return taken[0]  # type: ignore[no-any-return]
+        with INTERRUPTS:
+            while taken := self.entity.take(1):
+                if taken[0].sample_info.valid_data:
+                    return taken[0]  # type: ignore[no-any-return]
         return None
 
 
