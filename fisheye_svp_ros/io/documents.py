@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import yaml
 
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -53,6 +54,12 @@ class _Dumper(yaml.SafeDumper):
 
     def ignore_aliases(self, _: Any) -> bool:
         return True
+
+
+# Whoever builds a lens or a scenario in Python computes with numpy.
+for _scalar in (np.bool_, np.integer, np.floating):
+    _Dumper.add_multi_representer(
+        _scalar, lambda dumper, value: dumper.represent_data(value.item()))
 
 
 def read_yaml(path: str | Path, error: type[FisheyeSvpError]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import math
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError, StandaloneError
@@ -52,6 +53,11 @@ def test_plain_values_stay() -> None:
         'name': '2001-99-99', 'when': '2001-01-01', 'a': 1e-3, 'b': [1, 2.5, True]}
     shared = [1.0, 2.0]
     assert parse_yaml(dump_yaml({'a': shared, 'b': shared}), 'x', LensError)['b'] == shared
+
+
+def test_numpy_scalars_are_written_as_numbers() -> None:
+    written = {'a': np.float64(0.1), 'b': np.int64(3), 'c': np.bool_(True), 'd': [np.float32(0.5)]}
+    assert dump_yaml(written) == dump_yaml({'a': 0.1, 'b': 3, 'c': True, 'd': [0.5]})
 
 
 def test_numbers_are_those_of_yaml_1_2() -> None:
