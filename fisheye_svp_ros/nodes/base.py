@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import functools
+import math
 import signal
 import sys
+import time
 import traceback
 from collections.abc import Callable, Mapping
 from copy import copy
@@ -40,6 +42,7 @@ HEARD_LATER = QoSProfile(depth=100)
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
                QoSPolicyKind.DURABILITY)
+_TWICE = 1.0  # s between two interrupts that are one
 _KINDS_OF_ERRORS = 100  # that are told from each other
 
 T = TypeVar('T')
@@ -314,13 +317,15 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
 def _interrupting_once() -> Callable[..., None]:
     """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
 
-    The second one would end what the first one has begun to put away.
+    The second one would end what the first one has begun to put away.  A later one counts again:
+    the first is lost where C code calls Python and drops its exceptions.
     """
-    heard: list[bool] = []
+    last = -math.inf
 
     def interrupt(*_: Any) -> None:
-        heard.append(True)
-        if len(heard) == 1:
+        nonlocal last
+        before, last = last, time.monotonic()
+        if last - before > _TWICE:
             raise KeyboardInterrupt
 
     return interrupt

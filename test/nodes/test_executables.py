@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -158,6 +159,30 @@ def test_a_second_interrupt_does_not_disturb_what_the_first_one_ends(
     finally:
         signal.signal(signal.SIGINT, before)
     assert capfd.readouterr().err == ''
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+def test_an_interrupt_that_was_lost_can_be_repeated(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+
+    def lose(*_: object, **__: object) -> None:
+        ctypes.CFUNCTYPE(None)(interrupt)()  # C code that drops what its callbacks raise
+        time.sleep(1.1)
+        interrupt()
+        went_on.append(True)
+
+    went_on: list[bool] = []
+    monkeypatch.setattr(base.BaseNode, 'announce', lose)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        assert executables.run('localizer', []) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not went_on
 
 
 @pytest.mark.parametrize('ended', [True, False])
