@@ -21,23 +21,15 @@ from importlib.util import find_spec
 _MODULES = {
     'rclpy': 'rclpy',
     'rclpy.clock': 'clock',
-    'rclpy.context': 'context',
-    'rclpy.duration': 'clock',
     'rclpy.event_handler': 'qos',
     'rclpy.exceptions': 'exceptions',
     'rclpy.executors': 'executor',
     'rclpy.lifecycle': 'lifecycle',
-    'rclpy.logging': 'logging',
     'rclpy.node': 'node',
     'rclpy.parameter': 'parameters',
-    'rclpy.publisher': 'entities',
     'rclpy.qos': 'qos',
     'rclpy.qos_overriding_options': 'qos',
-    'rclpy.serialization': 'serialization',
-    'rclpy.service': 'entities',
-    'rclpy.subscription': 'entities',
-    'rclpy.time': 'clock',
-    'rclpy.timer': 'entities',
+    'rclpy.serialization': 'messages',
 }
 
 _installed = False

@@ -30,7 +30,7 @@ class Context:
         self._wire: tuple[dds.Participant, Graph] | None = None
         self._handlers: dict[signal.Signals, Any] = {}
 
-    def init(self, args: list[str] | None = None, domain_id: int | None = None) -> None:
+    def init(self, args: list[str] | None) -> None:
         """Read the arguments, join the domain and take over SIGINT and SIGTERM."""
         if self._running:
             raise RCLError('Context.init() must only be called once')
@@ -38,7 +38,7 @@ class Context:
         self.arguments = arguments.parse(sys.argv if args is None else args)
         for name, level in self.arguments.log_levels.items():
             logging.set_logger_level(name, level)
-        given = os.getenv('ROS_DOMAIN_ID') or '0' if domain_id is None else str(domain_id)
+        given = os.getenv('ROS_DOMAIN_ID') or '0'
         if not given.isdecimal() or int(given) > _LAST_DOMAIN:
             raise RCLError(f'ROS_DOMAIN_ID={given} is not a number from 0 to {_LAST_DOMAIN}')
         participant = dds.Participant(int(given))

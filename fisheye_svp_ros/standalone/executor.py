@@ -8,7 +8,7 @@ from typing import Any
 
 from cyclonedds.core import WaitSet
 
-from fisheye_svp_ros.standalone.context import Context, get_default_context
+from fisheye_svp_ros.standalone.context import get_default_context
 from fisheye_svp_ros.standalone.exceptions import ExternalShutdownException, NotSupportedError
 
 __all__ = ['ExternalShutdownException', 'SingleThreadedExecutor']
@@ -20,8 +20,8 @@ _LONGEST_WAIT_NS = 100_000_000
 class SingleThreadedExecutor:
     """Waits for timers, messages and requests of its nodes and runs one callback at a time."""
 
-    def __init__(self, *, context: Context | None = None) -> None:
-        self.context = context or get_default_context()
+    def __init__(self) -> None:
+        self.context = get_default_context()
         self._nodes: list[Any] = []
         self._ready: deque[Any] = deque()
         self._attached: list[Any] = []
@@ -41,13 +41,12 @@ class SingleThreadedExecutor:
             self._nodes.remove(node)
         self._attached, self._waitset = [], None
 
-    def shutdown(self, timeout_sec: float | None = None) -> bool:
+    def shutdown(self) -> None:
         """Stop, and forget all nodes."""
         self._stopped = True
         self._nodes.clear()
         self._ready.clear()
         self._attached, self._waitset = [], None
-        return True
 
     def spin(self) -> None:
         """Run callbacks until the context or this executor is shut down."""

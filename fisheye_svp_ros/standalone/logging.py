@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from enum import IntEnum
+from functools import partialmethod
 
 
 class LoggingSeverity(IntEnum):
@@ -32,47 +33,12 @@ class Logger:
         self.name = name
         self._calls: dict[tuple[str, int], float] = {}
 
-    def set_level(self, level: int) -> None:
-        """Drop messages of this logger below a severity."""
-        _levels[self.name] = LoggingSeverity(level)
-
-    def get_effective_level(self) -> LoggingSeverity:
-        """Return the severity set for this logger or for the nearest one above it."""
+    def _log(self, severity: LoggingSeverity, message: str, **filters: float) -> bool:
+        """Write a message of a severity; False if it was filtered out."""
         name = self.name
-        while name and not _levels.get(name):
+        while name and not _levels.get(name):  # the severity set for the nearest one above it
             name = name.rpartition('.')[0]
-        return _levels[name]
-
-    def is_enabled_for(self, severity: int) -> bool:
-        """Say whether a message of this severity is written."""
-        return severity >= self.get_effective_level()
-
-    def debug(self, message: str, **filters: float) -> bool:
-        """Write a message of severity DEBUG; False if it was filtered out."""
-        return self._log(LoggingSeverity.DEBUG, message, filters)
-
-    def info(self, message: str, **filters: float) -> bool:
-        """Write a message of severity INFO; False if it was filtered out."""
-        return self._log(LoggingSeverity.INFO, message, filters)
-
-    def warning(self, message: str, **filters: float) -> bool:
-        """Write a message of severity WARN; False if it was filtered out."""
-        return self._log(LoggingSeverity.WARN, message, filters)
-
-    def warn(self, message: str, **filters: float) -> bool:
-        """Write a message of severity WARN; False if it was filtered out."""
-        return self._log(LoggingSeverity.WARN, message, filters)
-
-    def error(self, message: str, **filters: float) -> bool:
-        """Write a message of severity ERROR; False if it was filtered out."""
-        return self._log(LoggingSeverity.ERROR, message, filters)
-
-    def fatal(self, message: str, **filters: float) -> bool:
-        """Write a message of severity FATAL; False if it was filtered out."""
-        return self._log(LoggingSeverity.FATAL, message, filters)
-
-    def _log(self, severity: LoggingSeverity, message: str, filters: dict[str, float]) -> bool:
-        if not self.is_enabled_for(severity) or (filters and not self._passes(**filters)):
+        if severity < _levels[name] or (filters and not self._passes(**filters)):
             return False
         stamp = time.time_ns()
         seconds, rest = divmod(stamp, 10**9)
@@ -83,8 +49,14 @@ class Logger:
             sink(stamp, severity, self.name, message)
         return True
 
+    debug = partialmethod(_log, LoggingSeverity.DEBUG)
+    info = partialmethod(_log, LoggingSeverity.INFO)
+    warning = warn = partialmethod(_log, LoggingSeverity.WARN)
+    error = partialmethod(_log, LoggingSeverity.ERROR)
+    fatal = partialmethod(_log, LoggingSeverity.FATAL)
+
     def _passes(self, *, throttle_duration_sec: float = 0, once: float = False) -> bool:
-        frame = sys._getframe(3)  # filters count per line of code, so find the caller's
+        frame = sys._getframe(2)  # filters count per line of code, so find the caller's
         call = (frame.f_code.co_filename, frame.f_lineno)
         last, now = self._calls.get(call), time.monotonic()
         if last is not None and (once or now < last + throttle_duration_sec):

@@ -24,8 +24,6 @@ from fisheye_svp_ros.errors import StandaloneError
 # The message store of rosbags has no services; these are the ones that nodes offer.
 _SERVICES = {
     'std_srvs/srv/Trigger': ('', 'bool success\nstring message'),
-    'std_srvs/srv/SetBool': ('bool data', 'bool success\nstring message'),
-    'std_srvs/srv/Empty': ('', ''),
     'rcl_interfaces/srv/GetParameters': (
         'string[] names', 'rcl_interfaces/ParameterValue[] values'),
     'rcl_interfaces/srv/GetParameterTypes': ('string[] names', 'uint8[] types'),
@@ -44,7 +42,6 @@ _SERVICES = {
 # The store keeps no default values; these are the non-zero ones of the common interfaces.
 _DEFAULTS: dict[tuple[str, str], object] = {
     ('geometry_msgs/msg/Quaternion', 'w'): 1.0,
-    ('sensor_msgs/msg/NavSatStatus', 'status'): -2,
 }
 
 _CODES = {
@@ -210,6 +207,10 @@ def deserialize(data: bytes, cls: type[Message]) -> Message:
             mended = bad.object.decode('utf-8', 'mark').encode()
             data = data.replace(length + bad.object, length + mended, 1)
     raise UnreadableError(f'{cls.TYPENAME} with more than {_BAD_STRINGS} strings not in UTF-8')
+
+
+# As `rclpy.serialization` calls them
+serialize_message, deserialize_message = serialize, deserialize
 
 
 def _to_wire(message: Message) -> object:

@@ -7,9 +7,8 @@ from copy import copy
 from typing import Any
 
 from fisheye_svp_ros.standalone import dds, logging, names
-from fisheye_svp_ros.standalone.arguments import parse
-from fisheye_svp_ros.standalone.clock import Clock, ClockType, Duration, Time
-from fisheye_svp_ros.standalone.context import Context, get_default_context
+from fisheye_svp_ros.standalone.clock import Clock, ClockType, Time
+from fisheye_svp_ros.standalone.context import get_default_context
 from fisheye_svp_ros.standalone.entities import (
     GuardCondition,
     Publisher,
@@ -23,7 +22,7 @@ from fisheye_svp_ros.standalone.exceptions import (
 )
 from fisheye_svp_ros.standalone.messages import Message, message_class
 from fisheye_svp_ros.standalone.parameter_services import ParameterServices
-from fisheye_svp_ros.standalone.parameters import Parameter, ParameterHolder
+from fisheye_svp_ros.standalone.parameters import ParameterHolder
 from fisheye_svp_ros.standalone.qos import (
     QoSOverridingOptions,
     QoSProfile,
@@ -45,31 +44,18 @@ class Node(ParameterHolder):
         self,
         node_name: str,
         *,
-        context: Context | None = None,
-        cli_args: list[str] | None = None,
-        namespace: str | None = None,
-        use_global_arguments: bool = True,
-        enable_rosout: bool = True,
-        start_parameter_services: bool = True,
-        parameter_overrides: list[Parameter] | None = None,
-        allow_undeclared_parameters: bool = False,
+        namespace: str = '/',
         automatically_declare_parameters_from_overrides: bool = False,
     ) -> None:
-        self.context = context or get_default_context()
+        self.context = get_default_context()
         if not self.context.ok():
             raise NotInitializedException('cannot create a node before rclpy.init()')
-        local = parse(['--ros-args', *(cli_args or [])])
-        sources = [self.context.arguments, local] if use_global_arguments else [local]
-        # Rules for this node alone come before those for the process.
-        self.__rules = [rule for source in reversed(sources) for rule in source.rules]
-        given = names.node_name(node_name), names.namespace(namespace or '/')
+        arguments = self.context.arguments
+        self.__rules = arguments.rules
+        given = names.node_name(node_name), names.namespace(namespace)
         self.__name, self.__namespace = names.remap_node(self.__rules, *given)
-        overrides = {
-            name: Parameter(name, value=value)
-            for source in sources
-            for name, value in source.overrides(self.get_fully_qualified_name()).items()
-        } | {parameter.name: parameter for parameter in parameter_overrides or []}
-        super().__init__(overrides.values(), allow_undeclared_parameters)
+        overrides = arguments.overrides(self.get_fully_qualified_name())
+        super().__init__(overrides)
         self._publishers: list[Publisher] = []
         self._subscriptions: list[Subscription] = []
         self._services: list[Service] = []
@@ -79,14 +65,13 @@ class Node(ParameterHolder):
         dotted = self.get_fully_qualified_name()[1:].replace('/', '.')
         self._logger = logging.get_logger(dotted)
         self.context.nodes.append(self)
-        self.__set_up(enable_rosout and all(source.rosout for source in sources))
+        self.__set_up(arguments.rosout)
         if automatically_declare_parameters_from_overrides:
-            for parameter in overrides.values():
-                self.declare_parameter(parameter.name, parameter.value)
+            for name, value in overrides.items():
+                self.declare_parameter(name, value)
         if not self.has_parameter('use_sim_time'):
             self.declare_parameter('use_sim_time', False)
-        if start_parameter_services:
-            ParameterServices(self)
+        ParameterServices(self)
 
     def __set_up(self, rosout: bool) -> None:
         event: Any = message_class('rcl_interfaces/msg/ParameterEvent')
@@ -97,8 +82,8 @@ class Node(ParameterHolder):
             publisher = self.create_publisher(log, '/rosout', qos_profile_rosout_default)
 
             def sink(stamp: int, severity: int, name: str, message: str) -> None:
-                now = Time(nanoseconds=stamp).to_msg()
-                publisher.publish(log(stamp=now, level=int(severity), name=name, msg=message))
+                publisher.publish(log(stamp=Time(stamp).to_msg(), level=int(severity), name=name,
+                                      msg=message))
 
             logging.attach_sink(self._logger.name, sink)
 
@@ -213,13 +198,9 @@ class Node(ParameterHolder):
         self, timer_period_sec: float, callback: Callable[[], Any], *, clock: Clock | None = None
     ) -> Timer:
         """Have a function called periodically; no clock here is other than real time."""
-        timer = Timer(self, callback, Duration(seconds=timer_period_sec).nanoseconds)
+        timer = Timer(self, callback, int(timer_period_sec * 1e9))
         self._timers.append(timer)
         return timer
-
-    def destroy_publisher(self, publisher: Publisher) -> bool:
-        """Leave a topic."""
-        return self.__destroy(self._publishers, publisher)
 
     def destroy_subscription(self, subscription: Subscription) -> bool:
         """Leave a topic."""
@@ -228,10 +209,6 @@ class Node(ParameterHolder):
     def destroy_timer(self, timer: Timer) -> bool:
         """Stop a timer for good."""
         return self.__destroy(self._timers, timer)
-
-    def destroy_service(self, service: Service) -> bool:
-        """Answer no more requests."""
-        return self.__destroy(self._services, service)
 
     def destroy_node(self) -> None:
         """Leave the graph; the node is of no use afterwards."""

@@ -49,8 +49,7 @@ class ParameterServices:
 
     def _get_types(self, request: Any, response: Any) -> Any:
         if all(self._node.has_parameter(name) for name in request.names):
-            parameters = [self._node.get_parameter_or(name) for name in request.names]
-            response.types = [parameter.type_.value for parameter in parameters]
+            response.types = [self._node.describe_parameter(n).type for n in request.names]
         return response
 
     def _list(self, request: Any, response: Any) -> Any:

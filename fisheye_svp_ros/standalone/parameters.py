@@ -107,9 +107,8 @@ class ParameterHolder:
     names for itself gets along with both or with neither.
     """
 
-    def __init__(self, overrides: Iterable[Parameter], allow_undeclared: bool) -> None:
-        self._parameter_overrides = {parameter.name: parameter for parameter in overrides}
-        self._allow_undeclared_parameters = allow_undeclared
+    def __init__(self, overrides: dict[str, Any]) -> None:
+        self._parameter_overrides = overrides
         self._parameters: dict[str, Parameter] = {}
         self._descriptors: dict[str, Any] = {}
         self._on_set_parameters_callbacks: list[OnSet] = []
@@ -118,45 +117,22 @@ class ParameterHolder:
     def _publish_parameter_event(self, event: Any) -> None:
         raise NotImplementedError
 
-    def declare_parameter(
-        self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
-    ) -> Parameter:
+    def declare_parameter(self, name: str, value: Any = None, descriptor: Any = None) -> Parameter:
         """Declare a parameter with a default value; the command line overrides the value."""
-        given = (name, value, descriptor if descriptor is not None else _Descriptor())
-        return self.declare_parameters('', [given], ignore_override)[0]
-
-    def declare_parameters(
-        self, namespace: str, parameters: Iterable[tuple[Any, ...]], ignore_override: bool = False
-    ) -> list[Parameter]:
-        """Declare several parameters, each given as (name, value, descriptor)."""
-        wanted = [self.__declaration(namespace, *given) for given in parameters]
-        if known := [name for name, *_ in wanted if name in self._parameters]:
-            raise ParameterAlreadyDeclaredException(known)
-        result = []
-        for name, value, descriptor in wanted:
-            if name in self._parameter_overrides and not ignore_override:
-                value = self._parameter_overrides[name].value
-            parameter = Parameter(name, value=value)
-            outcome = self.__set([parameter], {name: descriptor})
-            if not outcome.successful:
-                self.__refuse(parameter, descriptor, outcome.reason)
-            result.append(parameter)
-        return result
-
-    def __declaration(
-        self, namespace: str, name: str, value: Any = None, descriptor: Any = None
-    ) -> tuple[str, Any, Any]:
-        full = f'{namespace}.{name}' if namespace else name
-        if not full:
-            raise InvalidParameterException(full)
+        if not name:
+            raise InvalidParameterException(name)
+        if name in self._parameters:
+            raise ParameterAlreadyDeclaredException([name])
         descriptor = descriptor if descriptor is not None else _Descriptor()
-        if isinstance(value, Parameter.Type):
-            descriptor.type, value = value.value, None
-        elif not descriptor.dynamic_typing:
+        if not descriptor.dynamic_typing:
             descriptor.type = Parameter.Type.from_parameter_value(value).value
-        if descriptor.type == 0 and not descriptor.dynamic_typing:
-            raise ValueError(f'{full}: a statically typed parameter needs a value or a type')
-        return full, value, descriptor
+            if descriptor.type == 0:
+                raise ValueError(f'{name}: a statically typed parameter needs a value')
+        parameter = Parameter(name, value=self._parameter_overrides.get(name, value))
+        outcome = self.__set([parameter], {name: descriptor})
+        if not outcome.successful:
+            self.__refuse(parameter, descriptor, outcome.reason)
+        return parameter
 
     def __refuse(self, parameter: Parameter, descriptor: Any, reason: str) -> None:
         if reason.startswith('Wrong parameter type'):
@@ -178,8 +154,6 @@ class ParameterHolder:
     def get_parameter(self, name: str) -> Parameter:
         """Return a declared parameter."""
         if name not in self._parameters:
-            if self._allow_undeclared_parameters:
-                return Parameter(name)
             raise ParameterNotDeclaredException(name)
         parameter = self._parameters[name]
         if parameter.value is None and not self._descriptors[name].dynamic_typing:
@@ -190,13 +164,6 @@ class ParameterHolder:
         """Return declared parameters."""
         return [self.get_parameter(name) for name in names]
 
-    def get_parameter_or(self, name: str, alternative_value: Parameter | None = None) -> Parameter:
-        """Return a parameter, or the alternative when it is not declared or has no value."""
-        parameter = self._parameters.get(name)
-        if parameter is not None and parameter.value is not None:
-            return parameter
-        return alternative_value or Parameter(name)
-
     def get_parameters_by_prefix(self, prefix: str) -> dict[str, Parameter]:
         """Return the parameters below a prefix, by the rest of their names."""
         start = f'{prefix}.' if prefix else ''
@@ -204,9 +171,9 @@ class ParameterHolder:
 
     def describe_parameter(self, name: str) -> Any:
         """Return the descriptor of a parameter."""
-        if name not in self._descriptors and not self._allow_undeclared_parameters:
+        if name not in self._descriptors:
             raise ParameterNotDeclaredException(name)
-        return self._descriptors.get(name, _Descriptor())
+        return self._descriptors[name]
 
     def set_parameters(self, parameter_list: list[Parameter]) -> list[Any]:
         """Set parameters one by one and return a result with a reason for each."""
@@ -215,7 +182,7 @@ class ParameterHolder:
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Any:
         """Set all parameters, or none when one of them is refused."""
         unknown = [p.name for p in parameter_list if p.name not in self._parameters]
-        if unknown and not self._allow_undeclared_parameters:
+        if unknown:
             raise ParameterNotDeclaredException(unknown)
         return self.__set(parameter_list)
 
@@ -231,8 +198,8 @@ class ParameterHolder:
 
     def __set(self, parameters: list[Parameter], declared: dict[str, Any] | None = None) -> Any:
         for parameter in parameters:
-            descriptor = (declared or self._descriptors).get(parameter.name)
-            if descriptor and (reason := self.__objection(parameter, descriptor, bool(declared))):
+            descriptor = (declared or self._descriptors)[parameter.name]
+            if reason := self.__objection(parameter, descriptor, bool(declared)):
                 return _Result(successful=False, reason=reason)
         for callback in self._on_set_parameters_callbacks:
             result = callback(parameters)
@@ -250,16 +217,13 @@ class ParameterHolder:
         name = parameter.name
         if parameter.value is None and not declared:
             event.deleted_parameters.append(parameter.to_parameter_msg())
-            self._parameters.pop(name, None)
-            self._descriptors.pop(name, None)
+            del self._parameters[name], self._descriptors[name]
             return
-        new = self.get_parameter_or(name).value is None
+        before = self._parameters.get(name)
+        new = before is None or before.value is None
         kind = event.new_parameters if new else event.changed_parameters
         kind.append(parameter.to_parameter_msg())
-        if declared:
-            self._descriptors[name] = declared[name]
-        self._descriptors.setdefault(
-            name, _Descriptor(name=name, dynamic_typing=True, type=parameter.type_.value))
+        self._descriptors |= declared or {}
         self._parameters[name] = parameter
 
     def __objection(self, parameter: Parameter, descriptor: Any, declaring: bool) -> str:
@@ -278,36 +242,18 @@ class ParameterHolder:
         if name == 'use_sim_time' and parameter.value is True:
             return str(NotSupportedError('simulated time needs an installation of ROS 2'))
         if kind == Parameter.Type.INTEGER and descriptor.integer_range:
-            return _outside_integers(parameter, descriptor.integer_range[0])
+            return _outside(parameter, descriptor.integer_range[0], 0.0, '.')
         if kind == Parameter.Type.DOUBLE and descriptor.floating_point_range:
-            return _outside_floats(parameter, descriptor.floating_point_range[0])
+            limits = descriptor.floating_point_range[0]
+            return _outside(parameter, limits, _RELATIVE_TOLERANCE, '')
         return ''
 
 
-def _outside_integers(parameter: Parameter, limits: Any) -> str:
+def _outside(parameter: Parameter, limits: Any, tolerance: float, mark: str) -> str:
+    """Return why a value is out of its range, in rclpy's words, which have a mark for integers."""
     name, value = parameter.name, parameter.value
     low, high = sorted((limits.from_value, limits.to_value))
-    if value in {low, high}:
+    at_end = any(math.isclose(value, end, rel_tol=tolerance) for end in (low, high))
+    if at_end or low < value < high:
         return ''
-    if not low < value < high:
-        return f'Parameter {name} out of range. Min: {low}, Max: {high}, value: {value}'
-    if limits.step and (value - low) % limits.step:
-        return (f'The parameter value for {name} is not a valid step. '
-                f'Min: {low}, max: {high}, value: {value}, step: {limits.step}')  # fmt: skip
-    return ''
-
-
-def _outside_floats(parameter: Parameter, limits: Any) -> str:
-    def close(a: float, b: float) -> bool:
-        return math.isclose(a, b, rel_tol=_RELATIVE_TOLERANCE)
-
-    name, value = parameter.name, parameter.value
-    low, high = sorted((limits.from_value, limits.to_value))
-    if close(value, low) or close(value, high):
-        return ''
-    if not low < value < high:
-        return f'Parameter {name} out of range Min: {low}, Max: {high}, value: {value}'
-    if limits.step and not close(low + round((value - low) / limits.step) * limits.step, value):
-        return (f'The parameter value for {name} is not close enough to a valid step. '
-                f'Min: {low}, max: {high}, value: {value}, step: {limits.step}')  # fmt: skip
-    return ''
+    return f'Parameter {name} out of range{mark} Min: {low}, Max: {high}, value: {value}'

@@ -40,11 +40,6 @@ class DurabilityPolicy(IntEnum):
     VOLATILE = 2
 
 
-QoSHistoryPolicy = HistoryPolicy
-QoSReliabilityPolicy = ReliabilityPolicy
-QoSDurabilityPolicy = DurabilityPolicy
-
-
 @dataclass(init=False)
 class QoSProfile:
     """History, depth, reliability and durability of a topic, with the defaults of ROS 2."""
@@ -73,8 +68,6 @@ class QoSProfile:
         self.durability = DurabilityPolicy(durability)
 
 
-qos_profile_system_default = QoSProfile(depth=10)
-qos_profile_default = QoSProfile(depth=10)
 qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
-from fisheye_svp_ros.standalone.context import Context, get_default_context
+from fisheye_svp_ros.standalone.context import get_default_context
 from fisheye_svp_ros.standalone.exceptions import NotSupportedError, RCLError
 from fisheye_svp_ros.standalone.executor import SingleThreadedExecutor
 from fisheye_svp_ros.standalone.node import Node
@@ -23,30 +25,30 @@ __all__ = [
 _executor: SingleThreadedExecutor | None = None
 
 
-def init(*, args: list[str] | None = None, domain_id: int | None = None) -> None:
+def init(*, args: list[str] | None = None) -> None:
     """Join the domain; arguments come from the command line unless given."""
-    get_default_context().init(args, domain_id)
+    get_default_context().init(args)
 
 
-def ok(*, context: Context | None = None) -> bool:
+def ok() -> bool:
     """Say whether nodes may run."""
-    return (context or get_default_context()).ok()
+    return get_default_context().ok()
 
 
-def shutdown(*, context: Context | None = None) -> None:
+def shutdown() -> None:
     """Leave the domain; an error when that has happened before."""
-    if not ok(context=context):
+    if not ok():
         raise RCLError('failed to shutdown: rcl_shutdown already called on the given context')
-    try_shutdown(context=context)
+    try_shutdown()
 
 
-def try_shutdown(*, context: Context | None = None) -> None:
+def try_shutdown() -> None:
     """Leave the domain, unless that has happened before."""
     global _executor
     if _executor is not None:
         _executor.shutdown()
         _executor = None
-    (context or get_default_context()).shut_down()
+    get_default_context().shut_down()
 
 
 def create_node(node_name: str, **options: Any) -> Node:
@@ -54,36 +56,27 @@ def create_node(node_name: str, **options: Any) -> Node:
     return Node(node_name, **options)
 
 
-def _global_executor() -> SingleThreadedExecutor:
+@contextmanager
+def _running(node: Node) -> Iterator[SingleThreadedExecutor]:
     global _executor
-    if _executor is None:
-        _executor = SingleThreadedExecutor()
-    return _executor
+    executor = _executor = _executor or SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        yield executor
+    finally:
+        executor.remove_node(node)
 
 
-def spin(node: Node, executor: SingleThreadedExecutor | None = None) -> None:
+def spin(node: Node) -> None:
     """Run the callbacks of a node until the context is shut down."""
-    executor = executor or _global_executor()
-    executor.add_node(node)
-    try:
+    with _running(node) as executor:
         executor.spin()
-    finally:
-        executor.remove_node(node)
 
 
-def spin_once(
-    node: Node,
-    *,
-    executor: SingleThreadedExecutor | None = None,
-    timeout_sec: float | None = None,
-) -> None:
+def spin_once(node: Node, *, timeout_sec: float | None = None) -> None:
     """Run one callback of a node, or return after a while without any."""
-    executor = executor or _global_executor()
-    executor.add_node(node)
-    try:
+    with _running(node) as executor:
         executor.spin_once(timeout_sec)
-    finally:
-        executor.remove_node(node)
 
 
 def __getattr__(name: str) -> Any:

@@ -78,7 +78,7 @@ def test_shutdown_from_a_callback_ends_spin(run_node: Callable[..., NodeProcess]
 import rclpy
 from rclpy.node import Node
 rclpy.init()
-node = Node('short', start_parameter_services=False)
+node = Node('short')
 node.create_timer(0.01, rclpy.shutdown)
 rclpy.spin(node)
 print('over', rclpy.ok())
@@ -123,7 +123,7 @@ import time
 import rclpy
 from rclpy.node import Node
 rclpy.init()
-node = Node('idle', start_parameter_services=False)
+node = Node('idle')
 start = time.monotonic()
 rclpy.spin_once(node, timeout_sec=0)
 rclpy.spin_once(node, timeout_sec=0.3)

@@ -20,7 +20,7 @@ from rclpy.node import Node
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 rclpy.init()
-nodes = [Node('a', namespace='ns'), Node('b', cli_args=['-r', 'x:=mine'])]
+nodes = [Node('a', namespace='ns'), Node('b')]
 for node in nodes:
     topics = [node.create_publisher(Float64, t, 1).topic_name for t in ('x', '~/x', '/x', 'sub/x')]
     service = node.create_service(Trigger, 'x', lambda request, response: response)
@@ -30,7 +30,8 @@ for node in nodes:
 
 def test_nodes_of_one_process(run_node: Callable[..., NodeProcess]) -> None:
     node = run_node(
-        _NODE, '--ros-args', '-r', 'a:__node:=first', '-r', 'x:=y', '-r', 'b:__ns:=/deep/down',
+        _NODE, '--ros-args', '-r', 'a:__node:=first', '-r', 'b:x:=mine', '-r', 'x:=y',
+        '-r', 'b:__ns:=/deep/down',
         '-r', 'rosservice://x:=asked', '-r', '/x:=/z')  # fmt: skip
     assert node.finish() == 0
     assert node.lines == [
