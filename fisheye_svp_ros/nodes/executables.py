@@ -17,6 +17,7 @@ from fisheye_svp_ros.nodes import NODES
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row
+    from fisheye_svp_ros.nodes.base import BaseNode
 
 # Matrices are small for BLAS, and other nodes want the other cores.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
@@ -37,17 +38,22 @@ def ending_quietly() -> Iterator[None]:
 def run(name: str, args: list[str] | None = None) -> int:
     """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
     with ending_quietly():
-        module = import_module(f'fisheye_svp_ros.nodes.{name}')
-    return int(module.main(args))
+        kind = _kind(name)
+        from fisheye_svp_ros.nodes import base
+    return base.run(kind, args)
 
 
 def parameters(name: str) -> list[Row]:
     """Return the parameters of a node, its own before those of every node; rclpy must be there."""
     from fisheye_svp_ros.io.parameters import rows
 
+    return sorted(rows(_kind(name).SETTINGS), key=lambda row: row.name == 'wait_for_subscribers')
+
+
+def _kind(name: str) -> type[BaseNode]:
     module = import_module(f'fisheye_svp_ros.nodes.{name}')
-    kind = getattr(module, name.title().replace('_', ''))
-    return sorted(rows(kind.SETTINGS), key=lambda row: row.name == 'wait_for_subscribers')
+    kind: type[BaseNode] = getattr(module, name.title().replace('_', ''))
+    return kind
 
 
 def __getattr__(name: str) -> Callable[..., int]:

@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.markers import camera_shape
@@ -150,8 +150,3 @@ def residuals(model: ForwardModel, views: Views, solution: Localization) -> Poin
     distance = np.linalg.norm(points, axis=-1)
     columns = (*views.uv[0].T, *solution.residual[0].T, theta, distance)
     return structured(RESIDUALS, views.landmark[0], *columns)
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(Localizer, args)

@@ -16,7 +16,6 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.io.readers import read_observations, read_poses
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.nodes.base import run
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
@@ -129,8 +128,3 @@ def _true_poses(path: str, table: Observations) -> dict[int, Pose]:
         raise ParameterError('true_poses is for the observations of one camera; leave it empty')
     frame, pose = read_poses(path)
     return {number: pose.take(i) for i, number in enumerate(frame.tolist())}
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(MeasuredCamera, args)

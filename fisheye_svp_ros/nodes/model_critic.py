@@ -23,7 +23,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
@@ -237,8 +237,3 @@ def in_background(work: Callable[[], T]) -> Future[T]:
 
     threading.Thread(target=complete, daemon=True).start()
     return future
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(ModelCritic, args)

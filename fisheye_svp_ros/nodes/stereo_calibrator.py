@@ -6,7 +6,7 @@ from geometry_msgs.msg import TransformStamped, Vector3Stamped
 
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
@@ -59,8 +59,3 @@ class StereoCalibrator(SolverNode):
             self._position_error.publish(messages.vector_message(error[:3], stamp, right))
             self._rotation_error.publish(messages.vector_message(error[3:], stamp, right))
         self.publish_result(stamp, found.metrics, found.reasons[0])
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(StereoCalibrator, args)

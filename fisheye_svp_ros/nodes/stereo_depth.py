@@ -13,7 +13,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, run
+from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT
 from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
 from fisheye_svp_ros.nodes.solver import (
     Items,
@@ -114,8 +114,3 @@ def _shapes(
     curves = epipolar_curves(*models, rig, uv_right)
     return [camera_shape(left, 'left', alpha=0.6),
             *epipolar_shapes(models[0].lens, left, curves, uv_left), found]
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(StereoDepth, args)

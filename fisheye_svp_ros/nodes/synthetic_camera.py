@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, parameter, sweep_of
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, run
+from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
@@ -161,8 +161,3 @@ def _shapes(step: SweepSet) -> Iterator[messages.Segments]:
         pose = poses.take(step.frame)
         yield camera_shape(pose, f'true {name}'.strip(), alpha=1.0)
         yield rays_shape(simulation.lens, pose, seen.xyz, name)
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(SyntheticCamera, args)
