@@ -38,6 +38,9 @@ COMMANDS = {
     'watch': 'the results of running nodes, live, in the terminal',
 }
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
+# Threads of BLAS wait for each other at small matrices, and some BLAS gives other last digits on
+# more of them.  It reads their number as it is loaded; workers inherit it.
+_ON_ONE_THREAD = ('calibrate', 'diagnose', 'sweep')
 _SIGNALLED = ('record', 'run', 'watch')  # these end themselves on SIGTERM
 _BAD_INPUT = 2
 _INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
@@ -92,6 +95,8 @@ def _run(arguments: Sequence[str]) -> None:
     for name, purpose in COMMANDS.items():
         commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
     named = next((word for word in arguments if not word.startswith('-')), '')
+    if named in _ON_ONE_THREAD:
+        os.environ.setdefault('OMP_NUM_THREADS', '1')
     if named in COMMANDS:
         module = import_module(f'fisheye_svp_ros.commands.{named}')
         module.add_arguments(commands.choices[named])

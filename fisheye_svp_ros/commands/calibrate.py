@@ -3,18 +3,33 @@
 from __future__ import annotations
 
 import argparse
-import os
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, note_left_out, say
+from fisheye_svp_ros.commands.photographs import (
+    add_observation_arguments,
+    check_sizes,
+    measured,
+    sizes_beside,
+)
+from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.results import write_json
+from fisheye_svp_ros.io.rig_files import save_rig
+from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.arrays import Array
     from fisheye_svp_ros.diagnosis.calibration import Trust
-    from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.scene.observations import Observations
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
@@ -22,20 +37,10 @@ _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens s
 _ASIDE = 0.1  # of the image, by which a principal point is seldom off its centre
 _MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
 
-# Matrices are small for BLAS: more threads than one wait for each other.
-os.environ.setdefault('OMP_NUM_THREADS', '1')
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.commands.photographs import add_board_arguments
-    from fisheye_svp_ros.commands.ports import add_port_arguments
-    from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
-
-    parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
-                        'photographs, with --board')
-    add_board_arguments(parser)
+    add_observation_arguments(parser)
     parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
                         metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
                         + '; kannala_brandt by default')
@@ -59,10 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
-    from fisheye_svp_ros.commands.photographs import check_sizes, measured, sizes_beside
-    from fisheye_svp_ros.io.lens_files import load_lens
-    from fisheye_svp_ros.scene.observations import rig_cameras
-
     if args.lens and not (args.medium or args.port):
         raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
                              'water, or --port')
@@ -103,10 +104,7 @@ def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> tuple[Calibration, Observations]:
     """Return the lens and the rows that it is of: those that are no gross errors."""
-    from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge
-    from fisheye_svp_ros.commands.ports import port_of
     from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
-    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
 
@@ -136,10 +134,6 @@ def _trusted(table: Observations, result: Calibration) -> Trust:
 
 def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:
     """Print the lens, and what there is to say against it; sigmas (N,), px, NaN = unknown."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import note_left_out, say
-
     _print(result, trust)
     for name, range_ in trust.doubtful_shift.items():
         low, high = 1e3 * range_.low, 1e3 * range_.high
@@ -179,8 +173,6 @@ def _report_image(result: Calibration) -> None:
 
 def _write(result: Calibration, trust: Trust, path: Path) -> None:
     from fisheye_svp_ros.diagnosis.calibration import with_stderr
-    from fisheye_svp_ros.io.lens_files import save_lens
-    from fisheye_svp_ros.io.results import write_json
 
     save_lens(with_stderr(result.adjusted.lens, trust), path)
     write_json(path.with_suffix('.calibrate.json'), _document(result, trust))
@@ -191,13 +183,7 @@ def _rig(
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.diagnosis.moments import FEWEST, LOOSE
-    from fisheye_svp_ros.effects.forward import ForwardModel
-    from fisheye_svp_ros.io.rig_files import save_rig
-    from fisheye_svp_ros.scene.observations import stereo_views
     from fisheye_svp_ros.solve.measured import rms_px, sigma_known
     from fisheye_svp_ros.study.solutions import calibrated
 
@@ -232,11 +218,6 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
 
     Raises ObservationError where there is no such frame, or no rig explains most of them.
     """
-    from dataclasses import replace
-
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.diagnosis.adjustment import start
     from fisheye_svp_ros.diagnosis.inputs import posable
     from fisheye_svp_ros.diagnosis.model import prepare
@@ -270,8 +251,6 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
 
 
 def _print(result: Calibration, trust: Trust) -> None:
-    import numpy as np
-
     from fisheye_svp_ros.reporting.tables import (
         UNITS,
         interval,
@@ -307,8 +286,6 @@ def _print(result: Calibration, trust: Trust) -> None:
 
 def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself."""
-    from dataclasses import asdict
-
     from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 
     adjusted = result.adjusted

@@ -6,7 +6,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fisheye_svp_ros.commands.photographs import add_board_arguments, search
 from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.results import write_json
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
@@ -16,8 +21,6 @@ _SHOWN = 12
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.commands.photographs import add_board_arguments
-
     parser.add_argument('photographs', nargs='+', metavar='PHOTOS',
                         help='image files, folders of them (left/ and right/ for a rig), videos, '
                         'rosbag2 recordings with Image or CompressedImage')
@@ -31,10 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Search all photographs, say what was found, write the observations."""
-    from fisheye_svp_ros.commands.photographs import search
     from fisheye_svp_ros.detect.photographs import find_photographs
-    from fisheye_svp_ros.io.readers import write_observations
-    from fisheye_svp_ros.io.results import write_json
 
     detection = search(args.photographs, args)
     _print(detection, args.board)
@@ -51,8 +51,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _print(detection: Detection, board: str) -> None:
-    import numpy as np
-
     table, found = detection.observations, [one for one in detection.searched if one.points]
     print(f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
           f'{len(table)} points'

@@ -3,36 +3,35 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
+from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
+from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes, measured
+from fisheye_svp_ros.commands.plan import room_of
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
+from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.results import write_json
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.commands.lenses import Lenses
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
     from fisheye_svp_ros.diagnosis.known_truth import Compared
     from fisheye_svp_ros.diagnosis.next_question import Next
     from fisheye_svp_ros.diagnosis.points import PointResiduals
-    from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.scene.observations import Observations
-
-# Matrices are small for BLAS: more threads than one wait for each other.
-os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.commands.lenses import add_lens_argument
-    from fisheye_svp_ros.commands.photographs import add_board_arguments
-
-    parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
-                        'photographs, with --board')
-    add_board_arguments(parser)
+    add_observation_arguments(parser)
     add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
                         help='true poses; unknown and fitted by default')
@@ -66,15 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.lenses import load_lenses
     from fisheye_svp_ros.diagnosis.diagnosis import diagnose
     from fisheye_svp_ros.diagnosis.inputs import free_names, poses_by_frame, rig_lenses
     from fisheye_svp_ros.diagnosis.known_truth import known_errors
     from fisheye_svp_ros.diagnosis.two_sets import diagnose_against
     from fisheye_svp_ros.diagnosis.wanted import Wanted
-    from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.reporting.progress import stages
 
     if (args.number or args.room) and not args.count:
@@ -120,7 +115,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _wanted(args: argparse.Namespace, diagnosis: Diagnosis) -> Next:
-    from fisheye_svp_ros.commands.plan import room_of
     from fisheye_svp_ros.diagnosis.next_question import next_photographs
 
     room = None if args.room is None else room_of(args.room)
@@ -132,9 +126,6 @@ def _read(
     path: str, args: argparse.Namespace, given: Lenses
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
-    from fisheye_svp_ros.commands.lenses import lenses_of
-    from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
-    from fisheye_svp_ros.commands.photographs import check_sizes, measured
     from fisheye_svp_ros.diagnosis.inputs import posable, without_copies
 
     table, sizes = measured(path, args)
@@ -190,8 +181,6 @@ def _write(
     wanted: Next | None,
 ) -> None:
     from fisheye_svp_ros.diagnosis.points import point_residuals
-    from fisheye_svp_ros.io.lens_files import save_lens
-    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
 
@@ -210,10 +199,6 @@ def _write(
 
 
 def _write_residuals(path: Path, points: PointResiduals, cameras: Sequence[str]) -> None:
-    import numpy as np
-
-    from fisheye_svp_ros.io.csv_table import write_table
-
     named = {'camera': np.array(cameras)[points.camera]} if len(cameras) > 1 else {}
     write_table(path, {
         'frame': points.frame, **named, 'landmark': points.landmark,

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from fisheye_svp_ros.errors import ParameterError
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.io.lens_formats import Foreign
-    from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
+from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
+from fisheye_svp_ros.io.rig_files import save_rig
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.optics.lens import PORT, Lens
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.io.lens_formats import WRITABLE
-
     parser.add_argument('lens', metavar='LENS',
                         help='a lens file of this package or of another tool (FILE#cam1 for '
                         'another camera than the first), or the name of one that comes with it')
@@ -29,14 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Show the lens, write it, say what the form cannot hold."""
-    import numpy as np
-
-    from fisheye_svp_ros.io.files import write_text
-    from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
-    from fisheye_svp_ros.io.lens_formats import read_foreign, write_foreign
-    from fisheye_svp_ros.io.rig_files import save_rig
-    from fisheye_svp_ros.io.share import lens_path
-
     if args.format and not args.output:
         raise ParameterError(f'--format {args.format}: name the file to write, -o FILE')
     path = lens_path(args.lens)
@@ -74,10 +68,6 @@ def _rigs(foreign: Foreign) -> None:
 
 def _lost(lens: Lens, written: Lens) -> None:
     """Say what the form does not hold, px, by angle and range."""
-    import numpy as np
-
-    from fisheye_svp_ros.optics.camera import project
-    from fisheye_svp_ros.optics.lens import PORT
     from fisheye_svp_ros.reporting.tables import print_table
 
     port = () if lens.port is None else (PORT,)

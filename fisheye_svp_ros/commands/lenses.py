@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.errors import LensError
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.lens import Lens
 
 
 def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> None:
@@ -35,9 +34,6 @@ def load_lenses(given: Sequence[str]) -> Lenses:
 
     Raises LensError for a lens that cannot be read, and for two of one camera.
     """
-    from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
-    from fisheye_svp_ros.io.share import lens_path
-
     lenses = Lenses()
     for text in given:
         camera, equals, path = text.partition('=')

@@ -6,10 +6,19 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
+from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
+from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes
+from fisheye_svp_ros.commands.photographs import measured as read
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.readers import write_poses
+from fisheye_svp_ros.io.results import write_json
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.solve.measured import MeasuredPoses
 
 _SHOWN = 40  # frames in the table for people
@@ -19,13 +28,7 @@ _AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.commands.lenses import add_lens_argument
-    from fisheye_svp_ros.commands.photographs import add_board_arguments
-
-    parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
-                        'photographs, with --board')
-    add_board_arguments(parser)
+    add_observation_arguments(parser)
     add_lens_argument(parser)
     parser.add_argument('--model-error', action='store_true',
                         help='covariances with what the lens file says of its own errors: its '
@@ -37,11 +40,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
-    from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
-    from fisheye_svp_ros.commands.photographs import check_sizes
-    from fisheye_svp_ros.commands.photographs import measured as read
-    from fisheye_svp_ros.effects.forward import ForwardModel
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.solve.measured import localize_measured
 
@@ -70,8 +68,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> None:
-    import numpy as np
-
     from fisheye_svp_ros.reporting.tables import noise_text, print_table
     from fisheye_svp_ros.solve.measured import rms_px
 
@@ -110,11 +106,6 @@ def _parts_text(uncertainty: _Parts) -> str:
 def _write(
     folder: Path, model: ForwardModel, measured: MeasuredPoses, uncertainty: _Parts | None
 ) -> None:
-    import numpy as np
-
-    from fisheye_svp_ros.io.csv_table import write_table
-    from fisheye_svp_ros.io.readers import write_poses
-    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.solve.measured import rms_px
 
     views, result = measured.views, measured.result

@@ -7,12 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.detect.finders import DETECTORS
+from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
+from fisheye_svp_ros.io.documents import read_json
+from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
-    from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.scene.observations import Observations
 
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _SHOWN = 12
@@ -20,8 +25,6 @@ _SHOWN = 12
 
 def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
     """Declare what a search for a board in photographs needs."""
-    from fisheye_svp_ros.detect.finders import DETECTORS
-
     parser.add_argument('--board', required=required, metavar='SPEC',
                         help='what the photographs show: chessboard:9x6:24.23mm (inner corners), '
                         'charuco:7x5:30mm:22mm:DICT_5X5_100, aprilgrid:target.yaml, '
@@ -32,6 +35,14 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         help='take one of N photographs or video frames')
 
 
+def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare OBS, and what a search needs where these are photographs."""
+    parser.add_argument('observations', metavar='OBS',
+                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
+                        'photographs, with --board')
+    add_board_arguments(parser)
+
+
 def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
     """Return observations from a file, or from photographs, with the image size of each camera.
 
@@ -39,7 +50,6 @@ def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
     without a board.
     """
     from fisheye_svp_ros.detect.photographs import is_photographs
-    from fisheye_svp_ros.io.readers import read_observations
 
     # Beside photographs other observations (held out, of another day) may be a table already.
     if args.board and Path(path).suffix.lower() != '.csv':
@@ -53,8 +63,6 @@ def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
 
 def sizes_beside(path: Path) -> Sizes:
     """Return the image size of each camera that `detect` wrote beside its observations."""
-    from fisheye_svp_ros.io.documents import read_json
-
     beside = path.with_suffix('.detect.json')
     if not beside.exists():
         return {}
@@ -86,10 +94,7 @@ def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
 
 def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     """Search photographs for the board; say which have none, and which are odd."""
-    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.detect.detection import detect
-    from fisheye_svp_ros.detect.finders import DETECTORS
-    from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.detect.photographs import (
         count_photographs,
         doubtful_folders,

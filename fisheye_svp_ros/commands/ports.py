@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.errors import ParameterError
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.optics.ports import Port
+from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port
 
 _FORMS = 'flat, flat:5mm:1.49 (glass and its index), dome:60mm, dome:60mm:4mm:1.5 (inner radius)'
 
 
 def add_port_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --medium and --port."""
-    from fisheye_svp_ros.optics.ports import MEDIA
-
     parser.add_argument('--medium', metavar='MEDIUM',
                         help='what was between port and target: ' + ', '.join(MEDIA)
                         + ' or a refractive index')
@@ -32,8 +27,6 @@ def port_of(args: argparse.Namespace) -> Port | None:
     """
     if args.medium is None and args.port is None:
         return None
-    from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
-
     index = _index(args.medium or 'water')
     kind, *numbers = (args.port or 'flat').split(':')
     try:
@@ -52,8 +45,6 @@ def port_of(args: argparse.Namespace) -> Port | None:
 
 
 def _index(medium: str) -> float:
-    from fisheye_svp_ros.optics.ports import MEDIA
-
     if medium in MEDIA:
         return MEDIA[medium]
     try:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.io.files import together, written
+from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.errors import OutputError, ParameterError
+from fisheye_svp_ros.io.files import read_text, together, write_text, written
+from fisheye_svp_ros.io.results import write_json
+from fisheye_svp_ros.io.share import sweep_path
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.columns import Parts
@@ -17,10 +20,6 @@ if TYPE_CHECKING:
 _LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
 _MARK = 'sweep.txt'
-
-# Rows are the same to the last digit whoever works on them.  Some BLAS gives others on more
-# threads; it reads their number as it is loaded, and workers inherit it.
-os.environ.setdefault('OMP_NUM_THREADS', '1')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,11 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Solve what is not solved yet; join the parts."""
-    from fisheye_svp_ros.commands.notes import note_formats, say
     from fisheye_svp_ros.commands.sweep_file import read_sweep
-    from fisheye_svp_ros.errors import OutputError, ParameterError
     from fisheye_svp_ros.io.columns import Parts
-    from fisheye_svp_ros.io.share import sweep_path
     from fisheye_svp_ros.study.sweep import column_types, fingerprint, tasks, work
 
     path = sweep_path(str(args.file))
@@ -75,7 +71,6 @@ def run(args: argparse.Namespace) -> None:
 
 def _finished(folder: Path, mine: str) -> bool:
     """Say whether a folder holds the whole table of a sweep."""
-    from fisheye_svp_ros.errors import OutputError
     from fisheye_svp_ros.io.documents import read_json
 
     summary = folder / _SUMMARY
@@ -87,8 +82,6 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 
     Return the engine for all of the sweep: the one that it was begun with.
     """
-    from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.io.files import read_text, write_text
     from fisheye_svp_ros.optics import engines
 
     mark = parts.folder / _MARK
@@ -108,7 +101,6 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 
 def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> None:
     from fisheye_svp_ros.commands.executors import dask, local
-    from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.study.sweep import solve_sweep, tasks
 
@@ -129,7 +121,6 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
 def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
     from fisheye_svp_ros.io.columns import as_numbers, read_columns
-    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.study.summary import summarise
     from fisheye_svp_ros.study.sweep import column_types
