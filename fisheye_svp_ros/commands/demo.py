@@ -136,13 +136,10 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 
 def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.recording_residuals import has_residuals
-    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.paper.demonstration import residual_fields
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 
     fields = residual_fields(Bag(bag).records(has_residuals))
-    lenses = {name: load_lens(lens_path(name)) for name in {field.lens for field in fields}}
     draw_comparison(rows, folder / 'errors.png')
-    draw_residual_fields(fields, lenses, folder / 'residuals.png')
+    draw_residual_fields(fields, folder / 'residuals.png')

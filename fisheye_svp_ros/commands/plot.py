@@ -80,9 +80,7 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
 
 def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
     """Draw the residuals over the image, once a lens and range, where a scenario names these."""
-    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.recording_residuals import residual_field
-    from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
 
     named: dict[Any, ResidualSet] = {}
@@ -93,9 +91,7 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
             named.setdefault(key, one)
     if not named:
         return []
-    fields = [residual_field(one) for one in named.values()]
-    lenses = {field.lens: load_lens(lens_path(field.lens)) for field in fields}
-    draw_residual_fields(fields, lenses, path)
+    draw_residual_fields([residual_field(one) for one in named.values()], path)
     return [path]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +10,19 @@ import numpy as np
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator
 
+from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording_residuals import ResidualField
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.demonstration import DemoRow
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, legend_below, picture
+from fisheye_svp_ros.reporting.plots import (
+    FAINT,
+    OURS,
+    PUBLISHED,
+    legend_below,
+    picture,
+    round_number,
+)
 
 _TITLES = {
     'localization': 'Localization: error along the axis',
@@ -57,18 +66,16 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
     axis.grid(visible=False, axis='y')
 
 
-def draw_residual_fields(
-    fields: Sequence[ResidualField], lenses: Mapping[str, Lens], path: Path
-) -> None:
+def draw_residual_fields(fields: Sequence[ResidualField], path: Path) -> None:
     """Draw the residuals of localization over the image, magnified (figure 6): a row a lens."""
     names = list(dict.fromkeys(field.lens for field in fields))
     columns = max(sum(field.lens == name for field in fields) for name in names)
     with picture(path, 3.4 * columns, 0.3 + 3.7 * len(names)) as figure:
         axes = figure.subplots(len(names), columns, squeeze=False)
         for line, name in zip(axes, names, strict=True):
-            mine = [field for field in fields if field.lens == name]
+            lens, mine = load_lens(lens_path(name)), [one for one in fields if one.lens == name]
             for axis, field in zip(line, mine, strict=False):
-                _draw_field(axis, field, lenses[name])
+                _draw_field(axis, field, lens)
 
 
 def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
@@ -76,7 +83,7 @@ def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
     axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
     size = np.linalg.norm(field.residual, axis=-1)
     # The longest residual takes an eighth of the image, whatever it is.
-    factor = _round_down(lens.width / 8 / size.max())
+    factor = round_number(lens.width / 8 / size.max())
     axis.quiver(*field.uv.T, *(factor * field.residual.T), angles='xy', scale_units='xy', scale=1,
                 color=OURS, width=0.005)
     axis.plot(*field.uv.T, 'o', markersize=3, color='#404850')
@@ -87,9 +94,3 @@ def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
     axis.axis('off')
     axis.set_title(f'{field.lens}, landmarks at {field.radius:g} m\n'
                    f'residual {size.mean():.2g} px on average, x {factor:g}', loc='left')
-
-
-def _round_down(value: float) -> float:
-    """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
-    decade = 10.0 ** np.floor(np.log10(value))
-    return float(decade * max(step for step in (1, 2, 5) if step * decade <= value))

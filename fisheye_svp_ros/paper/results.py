@@ -17,12 +17,14 @@ from fisheye_svp_ros.paper.claims import Claim, claims
 from fisheye_svp_ros.paper.evaluation import Evaluation, captions_of
 from fisheye_svp_ros.paper.studies import Family, Stopping, load_family, load_stopping
 from fisheye_svp_ros.paper.tables import (
+    CALIBRATION,
     LENSES,
+    LOCALIZATION,
     PANELS,
+    STYLE_NAMES,
     Cell,
     agreeing,
-    calibration_cells,
-    localization_cells,
+    cells,
 )
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 
@@ -65,8 +67,8 @@ class Results(NamedTuple):
     def cells(self, variant: str = SVP) -> list[Cell]:
         """Return the 180 cells of tables 1 to 4 for a variant of the solver."""
         found = [self.found[variant][name] for name in LENSES]
-        return [*localization_cells(np.stack([one.localization for one in found])),
-                *calibration_cells(np.stack([one.calibration for one in found]))]
+        return [*cells(LOCALIZATION, np.stack([one.localization for one in found]), 1, SPREADS),
+                *cells(CALIBRATION, np.stack([one.calibration for one in found]), 3, STYLE_NAMES)]
 
     def panels(self) -> list[Panel]:
         """Return the 18 panels of figures 9 and 10 with the captions that belong to them."""

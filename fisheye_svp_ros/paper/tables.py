@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.landmarks import RADII
 from fisheye_svp_ros.scene.rigs import STYLES
 
 NAMES = {'fish180': 'Fish180', 'fish214': 'Fish214'}
@@ -123,13 +123,3 @@ def cells(published: Array, ours: Array, first_table: int, rows: Sequence[str]) 
              UNITS[quantity], float(value), float(ours[lens, radius, row, quantity]))
         for (lens, radius, row, quantity), value in np.ndenumerate(published)
     ]
-
-
-def localization_cells(ours: Array) -> list[Cell]:
-    """Return the 90 cells of tables 1 and 2."""
-    return cells(LOCALIZATION, ours, 1, SPREADS)
-
-
-def calibration_cells(ours: Array) -> list[Cell]:
-    """Return the 90 cells of tables 3 and 4."""
-    return cells(CALIBRATION, ours, 3, STYLE_NAMES)

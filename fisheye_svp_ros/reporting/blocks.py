@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jinja2
 
@@ -52,20 +52,25 @@ def write_blocks(folder: Path, name: str, blocks: Sequence[Block]) -> list[Path]
 
     Raises OutputError where one cannot be written.
     """
+    pictures = {block.file: data_uri(folder / block.file)
+                for block in blocks if isinstance(block, Picture)}
+    pages = [folder / f'{name}.{suffix}' for suffix in ('md', 'html')]
+    for path in pages:
+        write_text(path, page(f'blocks{path.suffix}', blocks=blocks, title=blocks[0],
+                              pictures=pictures))
+    return pages
+
+
+def page(template: str, **values: Any) -> str:
+    """Return a template of this package, filled in."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'),
         autoescape=jinja2.select_autoescape(['html']),
         undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )
-    pictures = {
-        block.file: base64.b64encode(written(folder / block.file).read_bytes()).decode('ascii')
-        for block in blocks if isinstance(block, Picture)
-    }
-    pages = []
-    for suffix in ('md', 'html'):
-        page = environment.get_template(f'blocks.{suffix}').render(
-            blocks=blocks, title=blocks[0], pictures=pictures
-        )
-        write_text(folder / f'{name}.{suffix}', page)
-        pages.append(folder / f'{name}.{suffix}')
-    return pages
+    return environment.get_template(template).render(values)
+
+
+def data_uri(path: Path) -> str:
+    """Return a picture as part of a page."""
+    return 'data:image/png;base64,' + base64.b64encode(written(path).read_bytes()).decode('ascii')

@@ -16,7 +16,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.plots import picture, round_number
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
 _SIDES = (('before', BEFORE), ('after', AFTER))
@@ -244,12 +244,6 @@ def _polar(shown: Shown, residual: Array) -> Array:
 
 def _rms(residual: Array) -> float:
     return float(np.sqrt((residual**2).sum(axis=1).mean()))
-
-
-def round_number(value: float) -> float:
-    """Return 1, 2 or 5 times a power of ten, near a value."""
-    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
-    return float(max((m * power for m in (1, 2, 5) if m * power <= value), default=power))
 
 
 def residual_pictures(shown: Shown) -> Iterator[Picture]:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
-
-import jinja2
 
 from fisheye_svp_ros.diagnosis.budget import stage_shares
 from fisheye_svp_ros.diagnosis.choice import NAMED, TraceStep
@@ -19,9 +16,10 @@ from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.diagnosis.target_map import BoardMap, board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.io.files import write_text, written
+from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting import external_text, shot_list
+from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
 from fisheye_svp_ros.reporting.uncertainty_plot import draw_uncertainty
@@ -79,25 +77,20 @@ def write_report(
         pictures.append(inputs.folder / 'next.png')
         state = diagnosis.after.state
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader('fisheye_svp_ros.reporting'), autoescape=True,
-        undefined=jinja2.StrictUndefined, trim_blocks=True,
-    )
-    page = environment.get_template('diagnosis.html').render(
-        d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED,
+    report = inputs.folder / 'report.html'
+    write_text(report, page(
+        'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED,
         headline=text.VERDICTS[diagnosis.verdict],
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
-                  **{p.stem: _data_uri(p) for p in pictures}},
+                  **{p.stem: data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
         next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
         extended=_extended(diagnosis, inputs.folder),
-    )
-    report = inputs.folder / 'report.html'
-    write_text(report, page)
+    ))
     return [report, *pictures]
 
 
@@ -141,10 +134,6 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
         yield from ((title, m) for m in board_maps(diagnosis.after, names) if m.spread_out)
 
 
-def _data_uri(path: Path) -> str:
-    return 'data:image/png;base64,' + base64.b64encode(written(path).read_bytes()).decode('ascii')
-
-
 def _free(inputs: Inputs) -> str:
     free = {'poses': not inputs.poses, 'intrinsics': inputs.free_intrinsics}
     return text.listed([name for name, fitted in free.items() if fitted]) or 'nothing'
@@ -186,8 +175,7 @@ def _step(step: TraceStep) -> dict[str, Any]:
         'effect': step.effect, 'accepted': step.accepted, 'why': step.why,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
-        'p': text.probability(step.corrected).removeprefix('p ').removeprefix('= ')
-        if tried else '',
+        'p': text.bare_probability(step.corrected) if tried else '',
         'held_out': held_out,
     }
 
@@ -216,7 +204,7 @@ def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 'words': text.remaining_text(diagnosis, s.variable),
                 'link': _PICTURE_OF.get(s.variable),
-                'p': text.probability(s.p_value).removeprefix('p ').removeprefix('= '),
+                'p': text.bare_probability(s.p_value),
                 'share': text.percent(s.share) if s.variable in text.VARIABLES else '',
                 'width': round(_BAR * min(s.share, 1.0)),
             }

@@ -133,6 +133,11 @@ def probability(p_value: float) -> str:
     return f'p = {p_value:.1g}' if p_value > 1e-12 else 'p < 1e-12'
 
 
+def bare_probability(p_value: float) -> str:
+    """Return a p-value under a head that says p."""
+    return probability(p_value).removeprefix('p ').removeprefix('= ')
+
+
 def percent(share: float) -> str:
     """Return a share in percent."""
     return f'{100 * share:.0f} %'
@@ -316,9 +321,8 @@ def advice_text(advice: Advice) -> str:
 def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]]:
     """Yield the variance budget: part, stage, sd in px, share, p-value."""
     for part in diagnosis.components:
-        p = probability(part.p_value).removeprefix('p ').removeprefix('= ')
         yield (COMPONENTS[part.name], part.stage, f'{part.sd_px:.3f}', percent(part.share),
-               '-' if part.name == 'noise' else p)
+               '-' if part.name == 'noise' else bare_probability(part.p_value))
 
 
 BUDGET_HEADER = ('part', 'stage', 'sd px', 'share', 'p')
@@ -366,7 +370,7 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
     for c in diagnosis.causes:
         rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
         same = ', '.join(c.indistinguishable_from) or '-'
-        p_value = probability(c.p_value).removeprefix('p ').removeprefix('= ')
+        p_value = bare_probability(c.p_value)
         same += '' if c.survives else ' (not needed with another cause out)'
         share = percent(c.share) if c.share else '-'
         yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same

@@ -12,8 +12,8 @@ from matplotlib.ticker import NullFormatter
 
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.target_map import BoardMap
-from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, round_number
-from fisheye_svp_ros.reporting.plots import picture
+from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK
+from fisheye_svp_ros.reporting.plots import picture, round_number
 
 _REFUSED = '#cbd5e1'
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -47,6 +48,12 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
         drawn = BytesIO()
         figure.savefig(drawn, format=path.suffix[1:])
         write_bytes(path, drawn.getvalue())
+
+
+def round_number(value: float) -> float:
+    """Return the largest of 1, 2, 5, 10, 20 ... that is not above a value."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-12)))
+    return float(max((m * power for m in (1, 2, 5) if m * power <= value), default=power))
 
 
 def legend_below(figure: Figure, *axes: Any) -> None:

@@ -26,6 +26,7 @@ from fisheye_svp_ros.solve.stereo_depth import (
     triangulate,
     triangulate_optimally,
 )
+from fisheye_svp_ros.study.metrics import known_mean
 
 QUANTITIES = ('position', 'axis', 'residual', 'epipolar', 'depth')
 UNITS = {'position': 'm', 'axis': 'rad', 'residual': 'px', 'epipolar': 'px', 'depth': 'm'}
@@ -198,7 +199,7 @@ def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     return [
         (np.linalg.norm(solved.pose.position, axis=-1), np.sqrt(variance[:, :3].sum(axis=-1))),
         (axis_angle_between(solved.pose, true), np.sqrt(variance[:, 3:5].sum(axis=-1))),
-        (_known_mean(np.linalg.norm(solved.residual, axis=-1)), np.full(len(points), mean_norm)),
+        (known_mean(np.linalg.norm(solved.residual, axis=-1)), np.full(len(points), mean_norm)),
     ]
 
 
@@ -267,16 +268,7 @@ def _blank(points: Array) -> Views:
 def _mean_by_cap(both: Mask, values: Array) -> Array:
     whole = np.full(both.shape, np.nan)
     whole[both] = values
-    return _known_mean(whole)
-
-
-def _known_mean(values: Array) -> Array:
-    """Return the mean over the last axis of what is known; NaN where nothing is."""
-    known = np.isfinite(values)
-    count = known.sum(axis=-1)
-    total = np.where(known, values, 0.0).sum(axis=-1)
-    mean: Array = np.where(count > 0, total / np.maximum(count, 1), np.nan)
-    return mean
+    return known_mean(whole)
 
 
 def _along(places: Array, table: Array, place: float) -> Array:

@@ -57,13 +57,13 @@ def stereo_depth_metrics(
     """
     metrics = {
         'points': np.isfinite(points[..., 0]).sum(axis=-1).astype(float),
-        'error2_px': _mean(distance),
-        'error2_vertical_px': _mean(np.abs(vertical)),
+        'error2_px': known_mean(distance),
+        'error2_vertical_px': known_mean(np.abs(vertical)),
         'error2_max_px': _largest(distance),
     }
     if true is not None:
         off = np.linalg.norm(points - true, axis=-1)
-        metrics |= {'error3_m': _mean(off), 'error3_max_m': _largest(off)}
+        metrics |= {'error3_m': known_mean(off), 'error3_max_m': _largest(off)}
     return metrics
 
 
@@ -71,8 +71,8 @@ def _fit(residual: Array) -> Metrics:
     norm = np.linalg.norm(residual, axis=-1)
     return {
         'points': np.isfinite(norm).sum(axis=-1).astype(float),
-        'rms_px': np.sqrt(_mean(norm**2)),
-        'mean_residual_px': _mean(norm),
+        'rms_px': np.sqrt(known_mean(norm**2)),
+        'mean_residual_px': known_mean(norm),
     }
 
 
@@ -88,7 +88,8 @@ def _pose_errors(pose: Pose, true: Pose | None) -> Metrics:
     }
 
 
-def _mean(values: Array) -> Array:
+def known_mean(values: Array) -> Array:
+    """Return the mean over the last axis of what is known; NaN where nothing is."""
     known = np.isfinite(values)
     count = known.sum(axis=-1)
     total = np.where(known, values, 0.0).sum(axis=-1)
