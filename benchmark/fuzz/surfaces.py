@@ -34,7 +34,7 @@ from fisheye_svp_ros.io.readers import (
     write_observations,
     write_poses,
 )
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.io.share import config_path, lens_path
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import KannalaBrandt

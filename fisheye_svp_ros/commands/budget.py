@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> None:
     """Tabulate, answer, draw."""
     import numpy as np
 
+    from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.lens_files import load_lens
-    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.budget_report import (
         Asked,

@@ -20,9 +20,8 @@ from fisheye_svp_ros.commands.photographs import (
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
-from fisheye_svp_ros.io.results import write_json
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens

@@ -35,9 +35,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import note_formats
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.columns import write_columns
-    from fisheye_svp_ros.io.files import together
-    from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
-    from fisheye_svp_ros.io.results import write_json
+    from fisheye_svp_ros.io.files import together, write_json
+    from fisheye_svp_ros.io.recording import is_tabulated, tabulate
     from fisheye_svp_ros.paper.demonstration import demo_rows
     from fisheye_svp_ros.reporting.progress import progress
 
@@ -136,7 +135,7 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 
 def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording_residuals import has_residuals
+    from fisheye_svp_ros.io.recording import has_residuals
     from fisheye_svp_ros.paper.demonstration import residual_fields
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fisheye_svp_ros.commands.photographs import add_board_arguments, search
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.readers import write_observations
-from fisheye_svp_ros.io.results import write_json
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection

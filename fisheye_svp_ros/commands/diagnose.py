@@ -15,10 +15,9 @@ from fisheye_svp_ros.commands.photographs import add_observation_arguments, chec
 from fisheye_svp_ros.commands.plan import room_of
 from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
-from fisheye_svp_ros.io.results import write_json
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 

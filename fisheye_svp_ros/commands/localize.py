@@ -14,9 +14,8 @@ from fisheye_svp_ros.commands.photographs import add_observation_arguments, chec
 from fisheye_svp_ros.commands.photographs import measured as read
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.readers import write_poses
-from fisheye_svp_ros.io.results import write_json
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.solve.measured import MeasuredPoses

@@ -45,9 +45,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.diagnosis.plan import plan
     from fisheye_svp_ros.effects.forward import ForwardModel
-    from fisheye_svp_ros.io.files import together
+    from fisheye_svp_ros.io.files import together, write_json
     from fisheye_svp_ros.io.readers import write_poses
-    from fisheye_svp_ros.io.results import write_json
     from fisheye_svp_ros.reporting import shot_list
     from fisheye_svp_ros.reporting.tables import UNITS, print_table
 

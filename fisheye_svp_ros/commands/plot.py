@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.io.recording_residuals import ResidualSet
+    from fisheye_svp_ros.io.recording import ResidualSet
 
 _FIELDS = 4  # residual fields a lens
 _TABLES = ('.csv', '.parquet')
@@ -57,8 +57,7 @@ def _of_table(args: argparse.Namespace) -> list[Path]:
 def _of_bag(args: argparse.Namespace) -> list[Path]:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording_residuals import has_residuals, residual_sets
-    from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+    from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, residual_sets, tabulate
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 
@@ -80,7 +79,7 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
 
 def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
     """Draw the residuals over the image, once a lens and range, where a scenario names these."""
-    from fisheye_svp_ros.io.recording_residuals import residual_field
+    from fisheye_svp_ros.io.recording import residual_field
     from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
 
     named: dict[Any, ResidualSet] = {}
@@ -97,7 +96,7 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
 
 def _main_namespace(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
     """Return the rows of the namespace with most of them: others have other metrics."""
-    from fisheye_svp_ros.io.recording_table import NAMESPACE
+    from fisheye_svp_ros.io.recording import NAMESPACE
 
     names = columns[NAMESPACE]
     most = max(set(names), key=names.count, default=None)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.notes import note_formats, say
 from fisheye_svp_ros.errors import OutputError, ParameterError
-from fisheye_svp_ros.io.files import read_text, together, write_text, written
-from fisheye_svp_ros.io.results import write_json
+from fisheye_svp_ros.io.files import read_text, together, write_json, write_text, written
 from fisheye_svp_ros.io.share import sweep_path
 
 if TYPE_CHECKING:
@@ -122,7 +121,7 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
     from fisheye_svp_ros.io.columns import as_numbers, read_columns
     from fisheye_svp_ros.reporting.tables import print_table
-    from fisheye_svp_ros.study.summary import summarise
+    from fisheye_svp_ros.study.metrics import summarise
     from fisheye_svp_ros.study.sweep import column_types
 
     table = read_columns(written(folder / 'sweep.csv'))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from fisheye_svp_ros.io.files import together
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.io.recording_table import Columns
+    from fisheye_svp_ros.io.recording import Columns
 
 Cells = dict[str, list[str]]  # by column
 _SHOWN = 40  # rows for people
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import note_formats, say
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording_table import STAMP, is_tabulated, tabulate
+    from fisheye_svp_ros.io.recording import STAMP, is_tabulated, tabulate
     from fisheye_svp_ros.reporting.progress import progress
 
     bag = Bag(args.bag)
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> None:
     _print(args.bag, columns)
     if args.output:
         from fisheye_svp_ros.io.columns import write_columns
-        from fisheye_svp_ros.io.results import write_json
+        from fisheye_svp_ros.io.files import write_json
 
         with together():
             write_columns(args.output / 'table', columns)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _print(bag: str, columns: Columns) -> None:
     """Print the columns that differ from row to row; the others once, above the table."""
-    from fisheye_svp_ros.io.recording_table import STAMP
+    from fisheye_svp_ros.io.recording import STAMP
     from fisheye_svp_ros.reporting.tables import print_table
 
     varying = [name for name, cells in columns.items() if len(set(cells)) > 1] or list(columns)

@@ -13,8 +13,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.documents import read_json
+from fisheye_svp_ros.io.files import write_json
 from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
-from fisheye_svp_ros.io.results import write_json
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 

@@ -9,8 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.recording_residuals import ResidualField, residual_field, residual_sets
-from fisheye_svp_ros.io.recording_table import NAMESPACE, Columns
+from fisheye_svp_ros.io.recording import (
+    NAMESPACE,
+    Columns,
+    ResidualField,
+    residual_field,
+    residual_sets,
+)
 from fisheye_svp_ros.paper.evaluation import RIGHT_CAMERA_Z
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator
 
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.recording_residuals import ResidualField
+from fisheye_svp_ros.io.recording import ResidualField
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.demonstration import DemoRow

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.files import replacing, together
-from fisheye_svp_ros.io.results import write_json
+from fisheye_svp_ros.io.files import replacing, together, write_json
 from fisheye_svp_ros.paper import figures
 from fisheye_svp_ros.paper.beyond import CALIBRATION_NOISE, NOISES, POSE_SETS
 from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART

@@ -21,8 +21,7 @@ from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
-from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target
-from fisheye_svp_ros.reporting.uncertainty_plot import draw_uncertainty
+from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '

@@ -9,14 +9,55 @@ import threading
 from functools import partial
 from types import FrameType
 from typing import Any
+from uuid import UUID
 
-from fisheye_svp_ros.standalone import arguments, dds, logging
+from fisheye_svp_ros.standalone import arguments, dds, logging, messages
 from fisheye_svp_ros.standalone.exceptions import NotInitializedException, RCLError
-from fisheye_svp_ros.standalone.graph import Graph
 from fisheye_svp_ros.standalone.interrupts import INTERRUPTS
+from fisheye_svp_ros.standalone.qos import DurabilityPolicy, QoSProfile
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _LAST_DOMAIN = 232  # the ports of higher ones do not exist
+
+
+class Graph:
+    """Announces the nodes of this process, as `ros2 node list` and `info` see them."""
+
+    _QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+    def __init__(self, participant: dds.Participant) -> None:
+        self._participant = participant
+        self._nodes: dict[Any, tuple[list[Any], list[Any]]] = {}
+        name = 'rmw_dds_common/msg/ParticipantEntitiesInfo'
+        self._writer = dds.Writer(participant, 'ros_discovery_info', name, self._QOS)
+
+    def announce(
+        self, node: tuple[str, str], readers: list[dds.Reader], writers: list[dds.Writer]
+    ) -> None:
+        """Tell what a node, given as (namespace, name), reads and writes by now."""
+        self._nodes[node] = ([_gid(r.entity.guid) for r in readers],
+                             [_gid(w.entity.guid) for w in writers])  # fmt: skip
+        self._publish()
+
+    def withdraw(self, node: tuple[str, str]) -> None:
+        """Tell that a node is gone."""
+        self._nodes.pop(node, None)
+        self._publish()
+
+    def _publish(self) -> None:
+        info: Any = messages.message_class('rmw_dds_common/msg/ParticipantEntitiesInfo')
+        entry: Any = messages.message_class('rmw_dds_common/msg/NodeEntitiesInfo')
+        self._writer.write(info(
+            gid=_gid(self._participant.guid),
+            node_entities_info_seq=[
+                entry(node_namespace=ns, node_name=name, reader_gid_seq=r, writer_gid_seq=w)
+                for (ns, name), (r, w) in self._nodes.items()
+            ],
+        ))
+
+
+def _gid(guid: UUID) -> Any:
+    return messages.message_class('rmw_dds_common/msg/Gid')(data=[*guid.bytes])
 
 
 class Context:

@@ -6,6 +6,8 @@ names of all are listed beside each function.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
@@ -20,6 +22,16 @@ LOCALIZATION_METRICS = (*_FIT, *_POSE)
 STEREO_CALIBRATION_METRICS = ('views', *_FIT, *_POSE)
 STEREO_DEPTH_METRICS = ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px', 'error3_m',
                         'error3_max_m')
+
+
+class Summary(NamedTuple):
+    """Of the finite ones among some values; NaN where there is none."""
+
+    solved: int
+    missing: int
+    median: float
+    mean: float
+    largest: float
 
 
 def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) -> Metrics:
@@ -100,3 +112,13 @@ def _largest(values: Array) -> Array:
     known = np.isfinite(values)
     largest = np.where(known, values, -np.inf).max(axis=-1, initial=-np.inf)
     return np.asarray(np.where(known.any(axis=-1), largest, np.nan))
+
+
+def summarise(values: Array) -> Summary:
+    """Return the summary of values (N,), NaN = missing; the largest is that of the magnitudes."""
+    known = values[np.isfinite(values)]
+    missing = len(values) - len(known)
+    if not len(known):
+        return Summary(0, missing, np.nan, np.nan, np.nan)
+    largest = np.abs(known).max()
+    return Summary(len(known), missing, *map(float, (np.median(known), known.mean(), largest)))

@@ -13,7 +13,7 @@ import numpy as np
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, rows, sweep_of
-from fisheye_svp_ros.io.recording_table import Columns
+from fisheye_svp_ros.io.recording import Columns
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.simulate.scenario import (
     MONO,

@@ -20,7 +20,7 @@ from helpers.photographs import BOARD, LENS, poses
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.lens_files import save_lens
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.pose import quaternion_from_rotation
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip

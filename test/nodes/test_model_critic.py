@@ -29,13 +29,13 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import model_critic
 from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.runs_plot import draw_runs
+from fisheye_svp_ros.reporting.sweep_plots import draw_runs
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
 FRAMES = 16

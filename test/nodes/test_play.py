@@ -25,7 +25,7 @@ from rclpy.serialization import serialize_message  # isort: skip
 from fisheye_svp_ros.io import bags
 from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
 from fisheye_svp_ros.io.decoding import read_key_values
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario

@@ -33,7 +33,7 @@ from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
 from fisheye_svp_ros.io.columns import arrow, read_columns
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.readers import read_observations
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 

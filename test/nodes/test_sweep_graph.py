@@ -20,7 +20,7 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands import record
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import read_columns
-from fisheye_svp_ros.io.recording_table import NAMESPACE, STAMP, is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import NAMESPACE, STAMP, is_tabulated, tabulate
 
 MONO = """
 /**:

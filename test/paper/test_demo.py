@@ -16,7 +16,7 @@ from helpers.nodes import ROOT
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import BagError, StandaloneError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.recording_table import is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.paper.demonstration import demo_rows
 
 pytestmark = pytest.mark.xdist_group('demo')  # run once

@@ -1,28 +1,43 @@
-"""A recording as a table: one row an input stamp, with its scenario and every metric."""
+"""What a recording tells: a table, one row an input stamp; residuals, with their scenarios."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.io.clouds import Points
 from fisheye_svp_ros.io.columns import typed
-from fisheye_svp_ros.io.decoding import stamp_of, statuses
+from fisheye_svp_ros.io.decoding import (
+    columns,
+    read_key_values,
+    read_residuals,
+    stamp_of,
+    statuses,
+)
 
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
 
-
-class _Record(Protocol):
-    @property
-    def topic(self) -> str:
-        """Full name of the topic."""
-
-    @property
-    def message(self) -> Any:
-        """A DiagnosticArray."""
-
-
 Columns = dict[str, list[Any]]
+
+
+class ResidualField(NamedTuple):
+    """Residuals of one localization: uv and residual (N, 2), px."""
+
+    lens: str
+    radius: float
+    uv: Array
+    residual: Array
+
+
+class ResidualSet(NamedTuple):
+    """Residuals of one localization: clouds.RESIDUALS; tags of its scenario, empty for none."""
+
+    topic: str
+    stamp: int
+    points: Points
+    tags: dict[str, str]
 
 
 def is_tabulated(topic: str, typename: str) -> bool:
@@ -31,7 +46,7 @@ def is_tabulated(topic: str, typename: str) -> bool:
     return name in ('scenario', 'result') and typename == 'diagnostic_msgs/msg/DiagnosticArray'
 
 
-def tabulate(records: Iterable[_Record]) -> Columns:
+def tabulate(records: Iterable[Any]) -> Columns:
     """Join scenarios and results by stamp: columns of equal length, None where nothing is known.
 
     Metrics carry the name of the node, below the namespace of its scenario, before theirs.  Rows
@@ -73,3 +88,35 @@ def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
     for name in names:
         columns[name] = typed([rows[key].get(name) for key in order])
     return columns
+
+
+def has_residuals(topic: str, typename: str) -> bool:
+    """Say whether `residual_sets` wants a topic."""
+    return topic.endswith(('/localizer/residuals', '/scenario'))
+
+
+def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
+    """Return the residuals of every localization, by topic and stamp."""
+    tags: dict[tuple[str, int], dict[str, str]] = {}
+    clouds: dict[tuple[str, int], Points] = {}
+    for record in records:
+        when = stamp_of(record.message, record.topic)
+        if record.topic.endswith('/scenario'):
+            namespace = record.topic.removesuffix('/scenario')
+            tags[namespace, when] = read_key_values(record.message, record.topic)
+        else:
+            clouds[record.topic, when] = read_residuals(record.message, record.topic)
+    return [
+        ResidualSet(topic, when, points,
+                    tags.get((topic.removesuffix('/localizer/residuals'), when), {}))
+        for (topic, when), points in sorted(clouds.items(), key=lambda item: item[0])
+    ]
+
+
+def residual_field(one: ResidualSet) -> ResidualField:
+    """Return the residuals of one set over the image; its scenario names lens and radius."""
+    points = one.points
+    return ResidualField(
+        one.tags['lens'], float(one.tags['radius']),
+        columns(points, ('u', 'v')), columns(points, ('du', 'dv')),
+    )
