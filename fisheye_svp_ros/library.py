@@ -19,11 +19,12 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
 from fisheye_svp_ros.io.parameters import SWEEP, changed, rows
+from fisheye_svp_ros.io.poses_csv import pose_columns
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
@@ -63,7 +64,7 @@ class Localized(Result):
 
     def table(self) -> Columns:
         """Return one row a frame, as poses.csv has it, with the rms."""
-        return Columns({'frame': self.frame, **_pose_columns(self.pose), 'rms_px': self.rms_px})
+        return Columns(pose_columns(self.frame, self.pose) | {'rms_px': self.rms_px})
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class CalibratedRig(Result):
 
     def table(self) -> Columns:
         """Return one row a frame: the right camera in the world."""
-        return Columns({'frame': self.frame, **_pose_columns(self.pose)})
+        return Columns(pose_columns(self.frame, self.pose))
 
 
 @dataclass(frozen=True)
@@ -392,8 +393,3 @@ def _table(observations: AnyObservations) -> Observations:
 
 def _models(left: AnyLens, right: AnyLens) -> tuple[ForwardModel, ForwardModel]:
     return ForwardModel(load_lens(left)), ForwardModel(load_lens(right))
-
-
-def _pose_columns(pose: Pose) -> dict[str, Array]:
-    numbers = np.concatenate([pose.position, quaternion_from_rotation(pose.rotation)], axis=-1)
-    return dict(zip(('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), numbers.T, strict=True))

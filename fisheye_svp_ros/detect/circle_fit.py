@@ -165,15 +165,7 @@ class _Problem(WindowProblem):
         turn, size, _ = np.linalg.svd(radius * np.swapaxes(self._axes, -1, -2))
         matrix = (turn / size[:, None]) @ np.swapaxes(turn, -1, -2)
         values[:, 2:5] = matrix.reshape(-1, 4)[:, [0, 1, 3]]
-        values[:, 7] = 1.0
-        shape, _ = self.model(values, np.arange(len(values)))
-        total = np.maximum(self.weight.sum(axis=1), 1e-9)
-        mean = (self.weight * shape).sum(axis=1) / total
-        level = (self.weight * self.cut.data).sum(axis=1) / total
-        off = self.weight * (shape - mean[:, None])
-        values[:, 7] = (off * self.cut.data).sum(1) / np.maximum((off * shape).sum(1), 1e-9)
-        values[:, 6] = level - values[:, 7] * mean
-        return values
+        return self.lit(values, 6)
 
     def lost(self, values: Array) -> Mask:
         return np.asarray((np.abs(values[:, 5]) > 3)

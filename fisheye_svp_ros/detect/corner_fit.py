@@ -91,14 +91,7 @@ class _Problem(WindowProblem):
             normal = np.stack([along[:, 1], -along[:, 0]], axis=-1)
             normal *= np.sign((normal * other).sum(axis=1, keepdims=True))
             values[:, 2 + edge] = np.arctan2(normal[:, 1], normal[:, 0])
-        values[:, 9] = 1.0
-        (shape, _), weight = self.model(values, np.arange(len(values))), self.weight
-        total = np.maximum(weight.sum(axis=1), 1e-9)
-        mean, level = (weight * shape).sum(1) / total, (weight * self.cut.data).sum(1) / total
-        off = weight * (shape - mean[:, None])
-        values[:, 9] = (off * self.cut.data).sum(1) / np.maximum((off * shape).sum(1), 1e-9)
-        values[:, 8] = level - values[:, 9] * mean
-        return values
+        return self.lit(values, 8)
 
     def lost(self, values: Array) -> Mask:
         return np.asarray(np.abs(values[:, 6:8]).max(axis=1) > 4)

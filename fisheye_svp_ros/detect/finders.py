@@ -95,11 +95,6 @@ def chessboard(image: Grey, pattern: Pattern) -> Found | None:
     return _sharper(classic)(image, pattern) or sector_based(image, pattern)
 
 
-def circles(image: Grey, pattern: Pattern) -> Found | None:
-    """Blobs, put into a grid from circle to circle."""
-    return find_circles(image, pattern)
-
-
 def charuco(image: Grey, pattern: Pattern) -> Found | None:
     """Chessboard corners between ArUco markers, by cv2.aruco; parts of a board as well."""
     dictionary = dictionary_of(pattern)
@@ -141,11 +136,6 @@ def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     return index, uv.astype(float)
 
 
-def squares(image: Grey, pattern: Pattern) -> Found | None:
-    """Separate dark squares: four-cornered contours, put into a grid from square to square."""
-    return find_squares(image, pattern)
-
-
 # Which patterns a detector is for, and its finder
 DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
     'saddle': (('chessboard',), _smaller(chessboard)),
@@ -154,8 +144,8 @@ DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
     'classic': (('chessboard',), classic_subpixel),
     'charuco': (('charuco',), _sharper(charuco)),
     'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
-    'circles': (('circles', 'asymmetric_circles'), _smaller(circles)),
-    'squares': (('squares',), squares),
+    'circles': (('circles', 'asymmetric_circles'), _smaller(find_circles)),
+    'squares': (('squares',), find_squares),
 }, tuple)
 AS_FOUND = ('sb', 'classic')  # keep their own points; the others are fitted
 

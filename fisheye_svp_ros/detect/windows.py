@@ -127,6 +127,17 @@ class WindowProblem(ABC):
     def lost(self, values: Array) -> Mask:
         """Return which states (A, U) are outside the domain."""
 
+    def lit(self, values: Array, at: int) -> Array:
+        """Return states (N, U) with what suits a window best at `at`: brightness and contrast."""
+        values[:, at + 1] = 1.0
+        (shape, _), weight = self.model(values, np.arange(len(values))), self.weight
+        total = np.maximum(weight.sum(axis=1), 1e-9)
+        mean, level = (weight * shape).sum(1) / total, (weight * self.cut.data).sum(1) / total
+        off = weight * (shape - mean[:, None])
+        values[:, at + 1] = (off * self.cut.data).sum(1) / np.maximum((off * shape).sum(1), 1e-9)
+        values[:, at] = level - values[:, at + 1] * mean
+        return values
+
     def solve(self, values: Array) -> Array:
         """Return the states (N, U) of least squares, from a start."""
         return levenberg_marquardt(self, (values,), _ITERATIONS).state[0]

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
@@ -40,5 +41,10 @@ def read_poses(path: str | Path) -> FramePoses:
 
 def write_poses(path: str | Path, frame: Index, pose: Pose) -> None:
     """Write frames (F,) and poses (F,).  Raises OutputError where the file cannot be written."""
+    write_table(path, pose_columns(frame, pose))
+
+
+def pose_columns(frame: Index, pose: Pose) -> dict[str, NDArray[Any]]:
+    """Return frames (F,) and poses (F,) as COLUMNS."""
     numbers = np.concatenate([pose.position, quaternion_from_rotation(pose.rotation)], axis=-1)
-    write_table(path, dict(zip(COLUMNS, (frame, *numbers.T), strict=True)))
+    return dict(zip(COLUMNS, (frame, *numbers.T), strict=True))

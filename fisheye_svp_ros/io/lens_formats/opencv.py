@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_json, parse_yaml
+from fisheye_svp_ros.io.documents import parse_json, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, nearest_rotation
@@ -80,18 +79,11 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
 
 def _from_xml(text: str, where: str) -> dict[str, Any]:
     """Return the numbers, lists and matrices of a FileStorage in XML by name."""
-    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
-        raise LensError(f'{where}: not a whole OpenCV file (document types are not read, nor more '
-                        f'than {LARGEST_YAML >> 20} MB)')
-    try:
-        root = ElementTree.fromstring(text.lstrip().encode())
-        return {
-            one.tag: {part.tag: _from_words(part.text, part.tag == 'data') for part in one}
-            if one.get('type_id') == 'opencv-matrix' else _from_words(one.text, False)
-            for one in root
-        }
-    except (ElementTree.ParseError, ValueError, LookupError) as cause:
-        raise LensError(f'{where}: not a whole OpenCV file ({cause})') from cause
+    return {
+        one.tag: {part.tag: _from_words(part.text, part.tag == 'data') for part in one}
+        if one.get('type_id') == 'opencv-matrix' else _from_words(one.text, False)
+        for one in radial.xml(text, where, 'OpenCV file')
+    }
 
 
 def _from_words(text: str | None, always_listed: bool) -> Any:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import LARGEST_YAML
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
@@ -134,6 +136,17 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
+
+
+def xml(text: str, where: str, form: str) -> ElementTree.Element:
+    """Return the root of an XML text; raise LensError for one that is no whole file of a form."""
+    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
+        raise LensError(f'{where}: not a whole {form} (document types are not read, nor more than '
+                        f'{LARGEST_YAML >> 20} MB)')
+    try:
+        return ElementTree.fromstring(text.lstrip().encode())
+    except (ElementTree.ParseError, ValueError, LookupError) as cause:
+        raise LensError(f'{where}: not a whole {form} ({cause})') from cause
 
 
 def unified(alpha: float, beta: float) -> tuple[Curve, float]:

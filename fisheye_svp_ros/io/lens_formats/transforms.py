@@ -9,13 +9,12 @@ import itertools
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
+from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_quaternion, rotation_from_vector
 
@@ -61,14 +60,7 @@ def _rooted(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:
 
 
 def _urdf(text: str, where: str) -> Iterator[_Joint]:
-    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
-        raise LensError(f'{where}: not a whole URDF (document types are not read, nor more than '
-                        f'{LARGEST_YAML >> 20} MB)')
-    try:
-        root = ElementTree.fromstring(text.lstrip().encode())
-    except (ElementTree.ParseError, ValueError, LookupError) as cause:
-        raise LensError(f'{where}: not a whole URDF ({cause})') from cause
-    for joint in root.iter('joint'):
+    for joint in radial.xml(text, where, 'URDF').iter('joint'):
         ends = joint.find('parent'), joint.find('child')
         if joint.get('type') == 'fixed' and ends[0] is not None and ends[1] is not None:
             origin = joint.find('origin')
