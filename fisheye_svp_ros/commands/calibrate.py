@@ -84,8 +84,7 @@ def run(args: argparse.Namespace) -> None:
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
         size = sizes.get(camera) or sizes['']
-        results[camera], tables[camera] = _calibrated(table, args, size, name)
-        trusts[camera] = _trusted(tables[camera], results[camera])
+        results[camera], tables[camera], trusts[camera] = _calibrated(table, args, size, name)
     # Written before a word is printed: nobody may be reading.
     if args.output:
         with together():
@@ -101,10 +100,10 @@ def run(args: argparse.Namespace) -> None:
 
 def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
-) -> tuple[Calibration, Observations]:
-    """Return the lens and the rows that it is of: those that are no gross errors."""
-    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors
-    from fisheye_svp_ros.reporting.progress import progress
+) -> tuple[Calibration, Observations, Trust]:
+    """Return the lens, the rows that it is of, without gross errors, and what may be trusted."""
+    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
+    from fisheye_svp_ros.reporting.progress import progress, stages
     from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
 
     port = port_of(args)
@@ -119,16 +118,8 @@ def _calibrated(
     with progress('calibrating'):
         result, kept, gross = calibrated_without_gross_errors(table, fitted)
     note_gross_errors(table, gross)
-    return result, kept
-
-
-def _trusted(table: Observations, result: Calibration) -> Trust:
-    """Return what may be trusted, beside local errors of target and frames."""
-    from fisheye_svp_ros.diagnosis.calibration import trust
-    from fisheye_svp_ros.reporting.progress import stages
-
     with stages('how far it may be trusted'):
-        return trust(table, result.adjusted.lens, result.adjusted.names)
+        return result, kept, trust(kept, result.adjusted.lens, result.adjusted.names)
 
 
 def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:

@@ -35,13 +35,15 @@ def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
     Of what is found contrast is above 0 for dark circles; sigma is that of the centre, NaN where
     nothing tells how the image bends.
     """
-    apart = _apart(points)
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
+    apart = float(np.sort(distance, axis=1)[:, 1].min())
     axes = local_axes(points[:, :2], start)
     longest = np.linalg.norm(axes, axis=(1, 2)).max()
     if 0.5 * apart * longest > _LARGEST:
         return _halved(pixels, start, points)
     radius = _radius(pixels, start, axes, 0.5 * apart)
-    found = _none(start)
+    nothing = np.full(len(start), np.nan)
+    found = Corners(start, nothing, nothing, nothing, np.zeros(len(start), dtype=bool))
     if not 0.05 < radius / apart < 0.49:
         return found
     for _ in range(_ROUNDS):
@@ -51,22 +53,12 @@ def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
     return found
 
 
-def _none(uv: Array) -> Corners:
-    nothing = np.full(len(uv), np.nan)
-    return Corners(uv, nothing, nothing, nothing, np.zeros(len(uv), dtype=bool))
-
-
 def _halved(pixels: Pixels, start: Array, points: Array) -> Corners:
     height, width = (side // 2 * 2 for side in pixels.shape)
     half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
                       interpolation=cv2.INTER_AREA)
     found = fit_circles(half, (start + 0.5) / 2 - 0.5, points)
     return found._replace(uv=2 * found.uv + 0.5, sigma=2 * found.sigma, blur=2 * found.blur)
-
-
-def _apart(points: Array) -> float:
-    distance = np.linalg.norm(points[:, None] - points, axis=-1)
-    return float(np.sort(distance, axis=1)[:, 1].min())
 
 
 def _bends(

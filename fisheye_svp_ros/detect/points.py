@@ -247,7 +247,9 @@ def _checked(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> 
         if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
             return 'bright and dark squares do not take turns; check the size of the board'
     if not pattern.marker and len(index) == len(pattern.points):
-        if pattern.kind == 'chessboard' and _shifted(ok.reshape(pattern.rows, pattern.columns)):
+        grid = ok.reshape(-1, pattern.columns)
+        sides = grid[0], grid[-1], grid[:, 0], grid[:, -1]
+        if pattern.kind == 'chessboard' and not all(side.any() for side in sides):
             return 'the grid that was found has a side without corners: it may lie a square off'
         keep = pattern.kind != 'chessboard' or agreed > 0
         turns = [turn for turn in pattern.turns if turn.same == keep] or list(pattern.symmetries)
@@ -258,11 +260,6 @@ def _checked(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> 
         ok, reach = ok[order], reach[order]
     blur = float(np.median(corners.blur[ok]))
     return Points(index[ok], corners.uv[ok], corners.sigma[ok], blur, reach[ok])
-
-
-def _shifted(ok: Mask) -> bool:
-    """Whether no point of one side of the grid (rows, columns) is a corner."""
-    return not all(side.any() for side in (ok[0], ok[-1], ok[:, 0], ok[:, -1]))
 
 
 def _eight_bit(pixels: Pixels) -> Grey:

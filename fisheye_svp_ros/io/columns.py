@@ -39,7 +39,7 @@ def arrow() -> tuple[Any, str]:
     try:
         pyarrow = import_module('pyarrow')
         import_module('pyarrow.parquet')
-        if _major(pyarrow) < _OLDEST:
+        if int(pyarrow.__version__.partition('.')[0]) < _OLDEST:
             raise ImportError(f'{pyarrow.__version__} is older than {_OLDEST}')
     except Exception as cause:  # beside an older NumPy it ends in more than one way
         return None, f'no Parquet file, the CSV file has it all: pyarrow is not usable ({cause})'
@@ -210,7 +210,3 @@ def _to_parquet(
     with writer:
         if pending:
             writer.write_table(pyarrow.concat_tables(pending))
-
-
-def _major(module: Any) -> int:
-    return int(module.__version__.partition('.')[0])

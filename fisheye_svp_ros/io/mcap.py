@@ -114,19 +114,15 @@ def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
             yield _parsed(opcode, body, f'the record at byte {place}', note)
         place = stream.tell()
     note(f'from byte {place} on it cannot be followed')
-    for start in _indexed_chunks(stream):
+    summary = _summary(stream)
+    chunks = summary.chunk_indexes if summary else ()
+    for start in sorted(chunk.chunk_start_offset for chunk in chunks):
         if place < start < size:
             stream.seek(start)
             opcode, length = _HEAD.unpack(stream.read(_HEAD.size).ljust(_HEAD.size, b'\0'))
             if opcode == Opcode.CHUNK:
                 body = stream.read(min(length, size))
                 yield _contents(body, f'the chunk at byte {start}', note)
-
-
-def _indexed_chunks(stream: IO[bytes]) -> list[int]:
-    """Return where the index at the end of a file says that chunks start; empty without one."""
-    summary = _summary(stream)
-    return sorted(c.chunk_start_offset for c in summary.chunk_indexes) if summary else []
 
 
 def _summary(stream: IO[bytes]) -> Any:

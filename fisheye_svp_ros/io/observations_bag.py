@@ -39,7 +39,8 @@ def read(path: str | Path) -> Observations:
     landmarks: dict[int, Landmarks] = {}
     worlds: set[str] = set()
     sets: list[_Set] = []
-    for record in bag.records(_is_wanted):
+    for record in bag.records(
+            lambda topic, kind: topic.rpartition('/')[2] in _NAMES and kind == _CLOUD):
         namespace, _, name = record.topic.rpartition('/')
         where = f'{path}, {record.topic}'
         stamp = stamp_of(record.message, where)
@@ -88,7 +89,3 @@ def _places(one: _Set, landmarks: dict[int, Landmarks], source: str) -> Any:
             f'{source}: landmark {missing} of {one.camera}/image_points is not in the landmarks'
         )
     return points
-
-
-def _is_wanted(topic: str, typename: str) -> bool:
-    return topic.rpartition('/')[2] in _NAMES and typename == _CLOUD

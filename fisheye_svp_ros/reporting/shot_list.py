@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from fisheye_svp_ros.diagnosis.next_photographs import Board, Shots
+from fisheye_svp_ros.diagnosis.next_photographs import Shots
 from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
@@ -68,7 +68,7 @@ def purpose(wanted: Next) -> str:
 def draw_shots(path: Path, model: ForwardModel, wanted: Next) -> None:
     """Draw each wanted view through the present lens: PNG, or PDF to be printed."""
     board, shots = wanted.board, wanted.shots
-    count = len(shots.distance)
+    count, first = len(shots.distance), int(np.argmin(board.landmark))
     views = blank_views(board.landmark, board.points, count, board=board.board)
     uv = model.predict(shots.camera, views).uv
     lines = -(-count // _COLUMNS)
@@ -81,15 +81,11 @@ def draw_shots(path: Path, model: ForwardModel, wanted: Next) -> None:
             hull = uv[i][ConvexHull(uv[i]).vertices]
             axis.fill(*hull.T, facecolor=FAINT, edgecolor=OURS, alpha=0.5)
             axis.plot(*uv[i].T, '.', color=OURS, markersize=2.5)
-            axis.plot(*uv[i][_first(board)], 'o', color=PUBLISHED, markersize=6, fillstyle='none')
+            axis.plot(*uv[i][first], 'o', color=PUBLISHED, markersize=6, fillstyle='none')
             away, where, tilt, roll = instruction(shots, i)
             axis.set_title(f'{i + 1}: {away}, {where}\ntilt {tilt}, turn {roll}; '
                            f'{then(wanted, i + 1)}', fontsize=7.5)
         figure.suptitle(purpose(wanted), fontsize=9)
-
-
-def _first(board: Board) -> int:
-    return int(np.argmin(board.landmark))
 
 
 def _frame(axis: Any, lens: Lens) -> None:

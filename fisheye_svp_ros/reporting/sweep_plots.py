@@ -22,6 +22,7 @@ from fisheye_svp_ros.study.dependence import (
     is_number,
     noise_spreads,
     swept_parameters,
+    value_text,
 )
 
 _COLOURS = 'viridis'
@@ -114,7 +115,7 @@ def _draw_curves(
                 axis.plot(
                     curve.x, middle, _LINES[place[1]] if len(place) > 1 else '-', marker='.',
                     color=colour, label=', '.join(
-                        f'{name} {_text(v)}' for name, v in zip(by, curve.key, strict=True)))
+                        f'{name} {value_text(v)}' for name, v in zip(by, curve.key, strict=True)))
             _scale(axis, found[0].x, metric.factor * np.concatenate([c.median for c in found]))
             axis.set_xlabel(_label(x))
             axis.set_title(metric.title, loc='left')
@@ -131,10 +132,6 @@ def _some(values: list[Any], most: int) -> list[Any]:
     """Return the first, the last and what lies evenly between, `most` in all."""
     places = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
     return [values[i] for i in places]
-
-
-def _text(value: Any) -> str:
-    return f'{value:g}' if isinstance(value, float) else str(value)
 
 
 def _draw_grids(

@@ -9,7 +9,6 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import (
@@ -99,7 +98,9 @@ def recorded(
     if not (np.isfinite(sigma) and sigma >= 0):
         raise ParameterError(f'noise is {sigma} px; 0 or more is needed')
     uv = seen.uv + sigma * seen.scale * rng.standard_normal(seen.uv.shape)
-    uv = np.where(_inside(model.lens, uv)[..., None], uv, np.nan)
+    size = np.array([model.lens.width, model.lens.height])
+    inside = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1, keepdims=True)
+    uv = np.where(inside, uv, np.nan)
     for effect, values in model.noise_terms:
         uv = effect.recorded(uv, values, rng)
     return uv
@@ -110,12 +111,6 @@ def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array:
         return np.ones((*views.uv.shape[:2], 1))
     scene = model.scene(poses, views, model.linearise(poses, views))
     return np.broadcast_to(model.noise_scale(scene), views.uv.shape[:2])[..., None]
-
-
-def _inside(lens: Lens, uv: Array) -> Array:
-    size = np.array([lens.width, lens.height])
-    inside: Array = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1)
-    return inside
 
 
 def _table(

@@ -111,7 +111,9 @@ class Message:
         )
 
     def __repr__(self) -> str:
-        fields = (f'{n}={_plain(getattr(self, n))!r}' for n in self.FIELDS if n != _EMPTY)
+        values = {name: getattr(self, name) for name in self.FIELDS if name != _EMPTY}
+        fields = (f'{name}={list(value) if isinstance(value, array.array) else value!r}'
+                  for name, value in values.items())
         return f'{self.TYPENAME.replace("/", ".")}({", ".join(fields)})'
 
     @classmethod
@@ -122,10 +124,6 @@ class Message:
             convert = field.from_wire
             object.__setattr__(message, name, convert(value) if convert else value)
         return message
-
-
-def _plain(value: object) -> object:
-    return list(value) if isinstance(value, array.array) else value
 
 
 @cache

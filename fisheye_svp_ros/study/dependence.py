@@ -114,7 +114,7 @@ def noise_spreads(table: SweptTable, by: str | None) -> list[Spread]:
                 part / len(kept) * chi2.pdf(n * at**2, 2 * n - 6) * 2 * n * at
                 for n, part in zip(counts, share, strict=True)
             )
-            name = f'{by} {_text(label)}' if by else ''
+            name = f'{by} {value_text(label)}' if by else ''
             found.append(Spread(name, ratio, at, np.asarray(density)))
     return found
 
@@ -136,5 +136,6 @@ def _slots(table: SweptTable, name: str) -> dict[Any, Any]:
     return {value: np.flatnonzero(column == value) for value in order}
 
 
-def _text(value: Any) -> str:
+def value_text(value: Any) -> str:
+    """Return the value of a parameter as text."""
     return f'{value:g}' if isinstance(value, float) else str(value)
