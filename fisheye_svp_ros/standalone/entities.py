@@ -32,7 +32,7 @@ class Publisher:
             raise TypeError(f'Expected {self.msg_type.TYPENAME}, got {type(msg).__name__}')
         if not self._alive().write(msg):
             self.lost += 1
-            logging.get_logger('rclpy.publisher').warning(
+            logging.Logger('rclpy.publisher').warning(
                 f'{self.topic_name}: a subscriber is too slow; {self.lost} messages are lost',
                 throttle_duration_sec=5.0)
 

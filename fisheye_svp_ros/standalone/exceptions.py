@@ -43,31 +43,17 @@ class ParameterNotDeclaredException(ParameterException):
 class ParameterAlreadyDeclaredException(ParameterException):
     """A parameter was declared twice."""
 
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__(f'Parameter(s) already declared: {parameters}')
-
 
 class ParameterUninitializedException(ParameterException):
     """A statically typed parameter was read before it had a value."""
-
-    def __init__(self, parameter: str) -> None:
-        super().__init__(f"The parameter '{parameter}' is not initialized: {parameter}")
 
 
 class InvalidParameterException(ParameterException):
     """A parameter name is malformed."""
 
-    def __init__(self, parameter: str) -> None:
-        super().__init__(f'Invalid parameter name: {parameter}')
-
 
 class InvalidParameterTypeException(ParameterException):
     """An initial value has another type than the parameter."""
-
-    def __init__(self, parameter: str, value: object, got: str, expected: str) -> None:
-        super().__init__(
-            f"Trying to set parameter '{parameter}' to '{value}' of type '{got}', "
-            f"expecting type '{expected}': {parameter}")
 
 
 class InvalidParameterValueException(ParameterException):

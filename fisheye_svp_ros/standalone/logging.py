@@ -27,7 +27,10 @@ _sinks: dict[str, Sink] = {}
 
 
 class Logger:
-    """Writes messages of a node; `throttle_duration_sec` and `once` filter them."""
+    """Writes messages of a node; `throttle_duration_sec` and `once` filter them.
+
+    Loggers of one name share their level.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -63,11 +66,6 @@ class Logger:
             return False
         self._calls[call] = now
         return True
-
-
-def get_logger(name: str) -> Logger:
-    """Return a logger of a name; loggers of one name share their level."""
-    return Logger(name)
 
 
 def set_logger_level(name: str, level: int) -> None:

@@ -63,7 +63,7 @@ class Node(ParameterHolder):
         self._guards: list[GuardCondition] = []
         self._clock = Clock(clock_type=ClockType.ROS_TIME)
         dotted = self.get_fully_qualified_name()[1:].replace('/', '.')
-        self._logger = logging.get_logger(dotted)
+        self._logger = logging.Logger(dotted)
         self.context.nodes.append(self)
         self.__set_up(arguments.rosout)
         if automatically_declare_parameters_from_overrides:

@@ -120,9 +120,9 @@ class ParameterHolder:
     def declare_parameter(self, name: str, value: Any = None, descriptor: Any = None) -> Parameter:
         """Declare a parameter with a default value; the command line overrides the value."""
         if not name:
-            raise InvalidParameterException(name)
+            raise InvalidParameterException(f'Invalid parameter name: {name}')
         if name in self._parameters:
-            raise ParameterAlreadyDeclaredException([name])
+            raise ParameterAlreadyDeclaredException(f'Parameter(s) already declared: {[name]}')
         descriptor = descriptor if descriptor is not None else _Descriptor()
         if not descriptor.dynamic_typing:
             descriptor.type = Parameter.Type.from_parameter_value(value).value
@@ -130,16 +130,14 @@ class ParameterHolder:
                 raise ValueError(f'{name}: a statically typed parameter needs a value')
         parameter = Parameter(name, value=self._parameter_overrides.get(name, value))
         outcome = self.__set([parameter], {name: descriptor})
-        if not outcome.successful:
-            self.__refuse(parameter, descriptor, outcome.reason)
-        return parameter
-
-    def __refuse(self, parameter: Parameter, descriptor: Any, reason: str) -> None:
-        if reason.startswith('Wrong parameter type'):
-            expected = Parameter.Type(descriptor.type).name
+        if outcome.reason.startswith('Wrong parameter type'):
             raise InvalidParameterTypeException(
-                parameter.name, parameter.value, parameter.type_.name, expected)
-        raise InvalidParameterValueException(parameter.name, parameter.value, reason)
+                f"Trying to set parameter '{name}' to '{parameter.value}' of type "
+                f"'{parameter.type_.name}', expecting type "
+                f"'{Parameter.Type(descriptor.type).name}': {name}")
+        if not outcome.successful:
+            raise InvalidParameterValueException(name, parameter.value, outcome.reason)
+        return parameter
 
     def undeclare_parameter(self, name: str) -> None:
         """Forget a parameter."""
@@ -157,7 +155,8 @@ class ParameterHolder:
             raise ParameterNotDeclaredException(name)
         parameter = self._parameters[name]
         if parameter.value is None and not self._descriptors[name].dynamic_typing:
-            raise ParameterUninitializedException(name)
+            raise ParameterUninitializedException(
+                f"The parameter '{name}' is not initialized: {name}")
         return parameter
 
     def get_parameters(self, names: Iterable[str]) -> list[Parameter]:

@@ -11,17 +11,6 @@ from fisheye_svp_ros.standalone.exceptions import NotSupportedError, RCLError
 from fisheye_svp_ros.standalone.executor import SingleThreadedExecutor
 from fisheye_svp_ros.standalone.node import Node
 
-__all__ = [
-    'create_node',
-    'get_default_context',
-    'init',
-    'ok',
-    'shutdown',
-    'spin',
-    'spin_once',
-    'try_shutdown',
-]
-
 _executor: SingleThreadedExecutor | None = None
 
 
