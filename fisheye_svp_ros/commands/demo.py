@@ -6,10 +6,22 @@ import argparse
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from fisheye_svp_ros.paper.demonstration import DemoRow
+import numpy as np
+
+from fisheye_svp_ros.commands.notes import note_formats
+from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.files import together, write_json, write_text
+from fisheye_svp_ros.paper.demonstration import (
+    DEPTH_POSES,
+    TASKS,
+    DemoRow,
+    demo_rows,
+    residual_fields,
+)
+from fisheye_svp_ros.paper.tables import LENSES
+from fisheye_svp_ros.scene.landmarks import RADII
 
 _MARK = '.demo'
 _PATIENCE = 900.0  # s; only a hang takes this long
@@ -17,9 +29,6 @@ _PATIENCE = 900.0  # s; only a hang takes this long
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    from fisheye_svp_ros.paper.tables import LENSES
-    from fisheye_svp_ros.scene.landmarks import RADII
-
     parser.add_argument('-o', '--output', type=Path, default=Path('demo'), metavar='DIR',
                         help='folder for the recording (an earlier one is replaced), demo.json, '
                         'table.csv, table.parquet and pictures; default: demo')
@@ -32,12 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the graph; make everything else from its recording."""
-    from fisheye_svp_ros.commands.notes import note_formats
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.columns import write_columns
-    from fisheye_svp_ros.io.files import together, write_json
     from fisheye_svp_ros.io.recording import is_tabulated, tabulate
-    from fisheye_svp_ros.paper.demonstration import demo_rows
     from fisheye_svp_ros.reporting.progress import progress
 
     bag = args.output / 'recording'
@@ -60,9 +66,6 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     """Run the node graph through its scenarios, in lock-step, into a recording."""
     from fisheye_svp_ros.commands.lock_step import start_in_step, values
     from fisheye_svp_ros.commands.processes import Processes
-    from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.io.files import write_text
-    from fisheye_svp_ros.paper.demonstration import TASKS
 
     mark = logs.parent / _MARK
     if bag.exists() and not mark.exists():
@@ -88,8 +91,6 @@ def _scenarios(
     task: str, lenses: Sequence[str], radii: Sequence[float]
 ) -> Iterator[tuple[str, Any]]:
     """Yield the camera's parameters for the scenarios of a task."""
-    from fisheye_svp_ros.paper.demonstration import DEPTH_POSES, TASKS
-
     swept, values = next((t.swept, t.values) for t in TASKS if t.name == task)
     yield 'sweep.lens', _list(lenses)
     yield 'sweep.radius', _list(radii)
@@ -105,7 +106,6 @@ def _list(values: Sequence[Any]) -> str:
 
 
 def _print(rows: Sequence[DemoRow]) -> None:
-    from fisheye_svp_ros.paper.demonstration import TASKS
     from fisheye_svp_ros.reporting.tables import print_table
 
     for task in TASKS:
@@ -116,8 +116,6 @@ def _print(rows: Sequence[DemoRow]) -> None:
 
 
 def _cells(row: DemoRow) -> tuple[str, ...]:
-    import numpy as np
-
     def span(values: tuple[float, float], scale: float) -> str:
         low, high = (scale * value for value in values)
         return number(low) if not low < high else f'{low:g} to {high:g}'
@@ -136,7 +134,6 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
     from fisheye_svp_ros.io.bags import Bag
     from fisheye_svp_ros.io.recording import has_residuals
-    from fisheye_svp_ros.paper.demonstration import residual_fields
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 
     fields = residual_fields(Bag(bag).records(has_residuals))

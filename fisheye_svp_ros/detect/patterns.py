@@ -111,7 +111,7 @@ def local_axes(points: Array, uv: Array) -> Array:
 def _chessboard(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (size,) = _numbers(spec, words, 1, least=3)
     points = _grid(columns, rows, size)
-    return Pattern('chessboard', spec, columns, rows, points, size, _none(points),
+    return Pattern('chessboard', spec, columns, rows, points, size, np.zeros((len(points), 2)),
                    _checks(columns, rows), size)
 
 
@@ -122,7 +122,7 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
     points = _grid(columns - 1, rows - 1, size)
     clearance = (size - marker) / np.sqrt(2)  # the corner of a marker is the nearest of it
-    return Pattern('charuco', spec, columns, rows, points, clearance, _none(points),
+    return Pattern('charuco', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
                    _checks(columns - 1, rows - 1), size, marker, dictionary)
 
 
@@ -134,7 +134,7 @@ def _circles(spec: str, words: list[str]) -> Pattern:
         row = np.repeat(np.arange(rows), columns)
         points[:, 0] = 2 * points[:, 0] + (row % 2) * size
     kind = 'asymmetric_circles' if asymmetric else 'circles'
-    return Pattern(kind, spec, columns, rows, points, 0.5 * size, _none(points),
+    return Pattern(kind, spec, columns, rows, points, 0.5 * size, np.zeros((len(points), 2)),
                    np.zeros(len(points)), size)
 
 
@@ -167,7 +167,7 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     points = np.pad(tiles.reshape(-1, 2), ((0, 0), (0, 1)))
     # The border of a tag is two of its ten cells: a corner of a cell is nearest.
     clearance = tag * min(ratio, 0.2 * np.sqrt(2))
-    return Pattern('aprilgrid', spec, columns, rows, points, clearance, _none(points),
+    return Pattern('aprilgrid', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
                    np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, 'DICT_APRILTAG_36H11')
 
 
@@ -218,10 +218,6 @@ def _grid(columns: int, rows: int, size: float) -> Array:
     """Return points (columns * rows, 3), m, row by row: x right, y down, z into the board."""
     y, x = np.mgrid[:rows, :columns]
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1) * size
-
-
-def _none(points: Array) -> Array:
-    return np.zeros((len(points), 2))
 
 
 def _checks(columns: int, rows: int) -> Array:

@@ -121,7 +121,9 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
         'max_incidence_deg': float(np.degrees(lens.max_incidence)),
     }
     if lens.viewpoint_shift is not None:
-        document['viewpoint_shift'] = _shift_to_dict(lens.viewpoint_shift)
+        parts = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e')
+                 for part in lens.viewpoint_shift.pieces()]
+        document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
     document |= {'corrections': own | dict(lens.corrections), 'target': dict(lens.target)}
     for name in ('calibration', 'uncertainty'):
@@ -163,11 +165,6 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
 
 def _port(section: Any, where: str) -> Port | None:
     return None if section is None else _curve(section, PORTS, '', 0, f'{where}: corrections.port')
-
-
-def _shift_to_dict(shift: ViewpointShift) -> Any:
-    entries = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e') for part in shift.pieces()]
-    return entries if len(entries) > 1 else entries[0]
 
 
 def _curve(

@@ -16,13 +16,13 @@ from fisheye_svp_ros.io.recording import (
     residual_field,
     residual_sets,
 )
-from fisheye_svp_ros.paper.evaluation import RIGHT_CAMERA_Z
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
     ERROR2_RANGE,
     ERROR3_RANGE,
     LENSES,
     LOCALIZATION,
+    RIGHT_CAMERA_Z,
     STYLE_NAMES,
 )
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS

@@ -17,7 +17,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.tables import CAPTIONS, PANELS, STYLE_NAMES
+from fisheye_svp_ros.paper.tables import CAPTIONS, PANELS, RIGHT_CAMERA_Z, STYLE_NAMES
 from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -26,9 +26,6 @@ from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.metrics import Metrics
 from fisheye_svp_ros.study.solutions import calibrated, localized, measured
-
-# Section 5: where along z the right camera stands, m; Fish214 alone is moved.
-RIGHT_CAMERA_Z = {'fish214': -0.1}
 
 
 class LocalizedSpread(NamedTuple):

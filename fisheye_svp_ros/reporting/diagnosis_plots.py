@@ -90,20 +90,6 @@ def draw_phase(path: Path, shown: Shown) -> None:
     ], 'distance of u (above) and v (below) from the middle of its pixel / px', False)
 
 
-def draw_landmarks(path: Path, shown: Shown) -> None:
-    """Rms of each landmark's residuals."""
-    _by_group(path, shown, shown.points.landmark, None, 'landmark')
-
-
-def draw_frames(path: Path, shown: Shown) -> None:
-    """Rms of each frame's residuals, over time where it is known."""
-    t = shown.points.t
-    if np.isfinite(t).all():
-        _by_group(path, shown, shown.points.frame, t - t.min(), 'time / s')
-    else:
-        _by_group(path, shown, shown.points.frame, None, 'frame')
-
-
 def draw_histogram(path: Path, shown: Shown) -> None:
     """Residuals of both coordinates over the noise, beside the normal distribution."""
     bins = np.linspace(-6, 6, 73)
@@ -172,7 +158,8 @@ def _legend(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc='upper right', ncols=len(labels), fontsize=8)
 
 
-def _by_group(path: Path, shown: Shown, group: Index, x: Array | None, label: str) -> None:
+def draw_groups(path: Path, shown: Shown, group: Index, x: Array | None, label: str) -> None:
+    """Rms of the residuals of each group (K,): landmark or frame, or over a variable (K,)."""
     names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
     place = names if x is None else np.bincount(label_of, weights=x) / count
     order = np.argsort(place, kind='stable')
@@ -253,7 +240,9 @@ def residual_pictures(shown: Shown) -> Iterator[Picture]:
     yield 'field', draw_field, (shown,)
     yield 'theta', draw_against, (shown, np.degrees(points.theta), 'incidence angle / deg')
     yield 'range', draw_against, (shown, points.range, 'distance of the landmark / m', spread)
-    yield 'landmark', draw_landmarks, (shown,)
-    yield 'frame', draw_frames, (shown,)
+    yield 'landmark', draw_groups, (shown, points.landmark, None, 'landmark')
+    timed = (points.t - points.t.min(), 'time / s') if np.isfinite(points.t).all() else (
+        None, 'frame')
+    yield 'frame', draw_groups, (shown, points.frame, *timed)
     yield 'phase', draw_phase, (shown,)
     yield 'histogram', draw_histogram, (shown,)
