@@ -110,6 +110,8 @@ class WindowProblem(ABC):
     be from where it settles.
     """
 
+    step = staticmethod(dense_step)
+
     slack = 1e-4
 
     def __init__(self, cut: Windows, weight: Array) -> None:
@@ -160,9 +162,6 @@ class WindowProblem(ABC):
         cost = (weight * residual**2).sum(axis=1)
         return np.where(self.lost(state[0]) | ~np.isfinite(cost), np.inf, cost), (
             hessian, gradient)
-
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return dense_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (state[0] + step[0],)

@@ -92,6 +92,8 @@ def parameter_values(lens: Lens, names: Sequence[str]) -> list[float]:
 class _Adjustment:
     """S adjustments to the same views, see least_squares.Problem."""
 
+    step = staticmethod(arrow_step)
+
     def __init__(self, lens: Lens, views: Views, names: Sequence[str]) -> None:
         self._lens = lens
         self._views = views
@@ -101,9 +103,6 @@ class _Adjustment:
         systems = [self._system(Pose(r, p), values) for r, p, values in zip(*state, strict=True)]
         cost, hessian, gradient = (np.stack(part) for part in zip(*systems, strict=True))
         return arrow_of_views(cost, hessian, gradient, block=6)
-
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return arrow_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         rotation, position, values = state

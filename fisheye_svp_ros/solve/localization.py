@@ -166,6 +166,8 @@ def _covariance(hessian: Array) -> tuple[Array, Mask]:
 class _Localization:
     """S systems of one pose each, see least_squares.Problem."""
 
+    step = staticmethod(dense_step)
+
     def __init__(self, model: ForwardModel, views: Views) -> None:
         self._model = model
         self._views = views
@@ -175,9 +177,6 @@ class _Localization:
         if len(index) < len(views.frame):
             views = views.take(index)
         return pose_equations(self._model, Pose(*state), views)
-
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return dense_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return tuple(Pose(*state).retract(step[0]))

@@ -94,6 +94,8 @@ class _Rigs:
     The state is (rotation, position) of the right camera (S, V) and of the rig (S,).
     """
 
+    step = staticmethod(arrow_step)
+
     def __init__(
         self, models: tuple[ForwardModel, ForwardModel], views: tuple[Views, Views], systems: int
     ) -> None:
@@ -122,9 +124,6 @@ class _Rigs:
             views = views.take(self._rows[index].ravel())
         cost, (hessian, gradient) = pose_equations(self._models[side], pose.reshape(-1), views)
         return cost.reshape(shape), hessian.reshape(*shape, 6, 6), gradient.reshape(*shape, 6)
-
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return arrow_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (*Pose(*state[:2]).retract(step[0]), *Pose(*state[2:]).retract(step[1]))

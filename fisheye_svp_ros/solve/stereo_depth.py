@@ -198,6 +198,8 @@ class _Curve:
     distance in u alone counts.
     """
 
+    step = staticmethod(dense_step)
+
     def __init__(
         self, model: ForwardModel, origin: Array, direction: Array, uv: Array, column_only: bool
     ) -> None:
@@ -225,15 +227,14 @@ class _Curve:
         gradient[outward] = 0.0
         return cost, (hessian, gradient)
 
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return dense_step(normal, damping)
-
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (np.clip(state[0] + step[0], _FARTHEST, _NEAREST),)
 
 
 class _Depth:
     """M points seen by both cameras; the state is (points (M, 3),), see least_squares.Problem."""
+
+    step = staticmethod(dense_step)
 
     def __init__(
         self, left: ForwardModel, right: ForwardModel, pairs: _Pairs, sigma: float
@@ -254,9 +255,6 @@ class _Depth:
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         return normal_equations(*self.image(state[0], index), self._views.take(index))
-
-    def step(self, normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-        return dense_step(normal, damping)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (state[0] + step[0],)
