@@ -37,8 +37,8 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
+from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.measured import localize_measured, rms_px
 

@@ -43,9 +43,9 @@ from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 

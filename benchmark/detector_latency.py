@@ -34,8 +34,8 @@ from fisheye_svp_ros.nodes.messages import image_message  # noqa: E402
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt  # noqa: E402
 from fisheye_svp_ros.optics.lens import Lens  # noqa: E402
 from fisheye_svp_ros.pose import Pose  # noqa: E402
-from fisheye_svp_ros.simulate.board_views import board_views  # noqa: E402
 from fisheye_svp_ros.simulate.render import Exposure, Print, render  # noqa: E402
+from fisheye_svp_ros.simulate.targets import board_views  # noqa: E402
 
 LENS = Lens('wide', 848, 800, 285.2, 284.9, 424.3, 398.7,
             KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0), Gennery(e0=0.003))

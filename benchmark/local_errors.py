@@ -33,9 +33,9 @@ from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SHIFTS, BENDS = (0.0, 3e-3, 7e-3), (0.0, 4e-4, 1.2e-3)  # m

@@ -35,9 +35,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.lens_files import save_lens
     from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
     from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.simulate.board_views import board_views
     from fisheye_svp_ros.simulate.render import Exposure, Print
-    from fisheye_svp_ros.simulate.targets import board
+    from fisheye_svp_ros.simulate.targets import board, board_views
 
     lens = Lens('example', 848, 800, 285.0, 285.3, 424.7, 398.2,
                 KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))

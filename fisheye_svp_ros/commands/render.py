@@ -53,9 +53,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.readers import read_poses
     from fisheye_svp_ros.io.share import lens_path
-    from fisheye_svp_ros.simulate.board_views import board_views
     from fisheye_svp_ros.simulate.render import Exposure, Print
-    from fisheye_svp_ros.simulate.targets import TARGETS, board, target_views
+    from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views
 
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':

@@ -176,10 +176,11 @@ def _of_board(
 ) -> NDArray[np.float32]:
     """Return what a board adds to the light of the parts of pixels uv (H, W, 2)."""
     places = _seen_places(lens, board, camera, exposure, uv)
-    for _ in range(3 if moved is not None else 0):
-        # The image of a place is moved: look where the unmoved image of what is seen lies.
-        off = moved(_near(places, board.printed)) if moved is not None else 0.0
-        places = _seen_places(lens, board, camera, exposure, uv - off)
+    if moved is not None:
+        for _ in range(3):
+            # The image of a place is moved: look where the unmoved image of what is seen lies.
+            off = moved(_near(places, board.printed))
+            places = _seen_places(lens, board, camera, exposure, uv - off)
     return _light(board.printed, places) - np.float32(_ROOM)
 
 

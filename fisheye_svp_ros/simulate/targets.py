@@ -1,8 +1,10 @@
-"""Targets of several boards: a cube seen from outside, a room from inside."""
+"""Targets of one board or several, and poses from which a camera sees them all over its image."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from itertools import islice
 
 import numpy as np
 
@@ -11,10 +13,11 @@ from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.simulate.board_views import placed_in_sight
 from fisheye_svp_ros.simulate.render import Placed, Print
 
 _TRIES = 400  # a view
+_EDGE, _SPACING = 8.0, 9.0  # px, least distance from the image's edge and between corners
+_TILT = np.radians(50.0)
 _LEAST = 2  # boards of which something is seen
 _INSIDE = 0.3  # of half the room: how far from its middle the camera comes
 
@@ -24,20 +27,8 @@ def board(printed: Print) -> tuple[Placed, ...]:
     return (Placed(printed, identity()),)
 
 
-def cube(printed: Print) -> tuple[Placed, ...]:
-    """Return six boards on the faces of a cube, its middle the origin."""
-    return _box(printed, outside=True)
-
-
-def room(printed: Print) -> tuple[Placed, ...]:
-    """Return six boards on the walls of a room, its middle the origin."""
-    return _box(printed, outside=False)
-
-
-TARGETS: dict[str, Callable[[Print], tuple[Placed, ...]]] = {'cube': cube, 'room': room}
-
-
 def _box(printed: Print, outside: bool) -> tuple[Placed, ...]:
+    """Return six boards on the faces of a cube or the walls of a room, its middle the origin."""
     half = printed.size * (max(printed.columns, printed.rows) + 1 + 2 * printed.margin) / 2
     boards = []
     for axis in range(3):
@@ -49,6 +40,11 @@ def _box(printed: Print, outside: bool) -> tuple[Placed, ...]:
             middle = turn @ printed.corners.mean(axis=0)
             boards.append(Placed(printed, Pose(turn, half * normal - middle)))
     return tuple(boards)
+
+
+TARGETS: dict[str, Callable[[Print], tuple[Placed, ...]]] = {
+    'cube': partial(_box, outside=True), 'room': partial(_box, outside=False),
+}
 
 
 def visible(lens: Lens, boards: tuple[Placed, ...], camera: Pose) -> tuple[Array, Array]:
@@ -65,6 +61,25 @@ def visible(lens: Lens, boards: tuple[Placed, ...], camera: Pose) -> tuple[Array
     return np.stack(uv), np.stack(seen)
 
 
+def board_views(
+    lens: Lens, printed: Print, count: int, ranges: tuple[float, float], rng: np.random.Generator
+) -> Pose:
+    """Return `count` poses of the camera in the board's frame, the board in sight as a whole.
+
+    ranges: nearest and furthest, m, to the middle of the board.
+    Raises GeometryError where the board does not fit into the image.
+    """
+    corners, middle = printed.true_corners(), printed.corners.mean(axis=0)
+
+    def draw() -> Pose:
+        turn, place = _placed_in_sight(lens, ranges, rng)
+        return Pose(turn, place - turn @ middle).inverse()
+
+    return _chosen(count, draw, lambda camera: _whole(lens, camera.into_body(corners), printed), (
+        f'lens {lens.name!r} does not see the whole board at {ranges[0]:g} to {ranges[1]:g} m; '
+        'choose a smaller board or other ranges'))
+
+
 def target_views(
     lens: Lens, kind: str, boards: tuple[Placed, ...], count: int, ranges: tuple[float, float],
     rng: np.random.Generator,
@@ -74,18 +89,65 @@ def target_views(
     ranges: nearest and furthest, m, to the middle of a cube; in a room the camera stays inside.
     Raises GeometryError where too few poses do.
     """
-    found: list[Pose] = []
     half = max(float(np.abs(board.pose.position).max()) for board in boards)
-    for _ in range(count * _TRIES):
+
+    def draw() -> Pose:
         if kind == 'room':
-            camera = Pose(rotation_from_vector(rng.normal(size=3)),
-                          _INSIDE * half * rng.uniform(-1, 1, 3))
-        else:
-            turn, place = placed_in_sight(lens, ranges, rng)
-            camera = Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
-        if (visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _LEAST:
-            found.append(camera)
-        if len(found) == count:
-            return Pose(*(np.stack(part) for part in zip(*found, strict=True)))
-    raise GeometryError(f'lens {lens.name!r} does not see two boards of the {kind} at '
-                        f'{ranges[0]:g} to {ranges[1]:g} m; choose other ranges')
+            return Pose(rotation_from_vector(rng.normal(size=3)),
+                        _INSIDE * half * rng.uniform(-1, 1, 3))
+        turn, place = _placed_in_sight(lens, ranges, rng)
+        return Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
+
+    def seen(camera: Pose) -> bool:
+        return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _LEAST)
+
+    return _chosen(count, draw, seen, (
+        f'lens {lens.name!r} does not see two boards of the {kind} at '
+        f'{ranges[0]:g} to {ranges[1]:g} m; choose other ranges'))
+
+
+def _chosen(
+    count: int, draw: Callable[[], Pose], good: Callable[[Pose], bool], wrong: str
+) -> Pose:
+    """Return the first `count` poses drawn that are good; raise GeometryError for too few."""
+    drawn = (draw() for _ in range(count * _TRIES))
+    found = [*islice(filter(good, drawn), count)]
+    if len(found) < count:
+        raise GeometryError(wrong)
+    return Pose.stack(found)
+
+
+def _placed_in_sight(
+    lens: Lens, ranges: tuple[float, float], rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return the turn (3, 3) of a board towards the camera, and a place (3,), m, in its sight."""
+    # Evenly over the sphere, so that the outer part of the image gets its share.
+    cosine = rng.uniform(np.cos(lens.max_incidence), 1.0)
+    azimuth, distance = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(*np.log(ranges)))
+    sine = np.sqrt(1 - cosine**2)
+    sight = np.array([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
+    return _facing(sight, rng), distance * sight
+
+
+def _facing(sight: Array, rng: np.random.Generator) -> Array:
+    """Return the turn (3, 3) of a board that looks back along `sight`, tilted and rolled."""
+    across = np.cross([0.0, 0.0, 1.0], sight)
+    angle = np.arctan2(np.linalg.norm(across), sight[2])
+    towards = rotation_from_vector(angle * across / max(float(np.linalg.norm(across)), 1e-12))
+    axis, roll = rng.uniform(0, 2 * np.pi, 2)
+    tilt = _TILT * np.sqrt(rng.uniform()) * np.array([np.cos(axis), np.sin(axis), 0.0])
+    return np.asarray(towards @ rotation_from_vector(tilt)
+                      @ rotation_from_vector(np.array([0.0, 0.0, roll])))
+
+
+def _whole(lens: Lens, points: Array, printed: Print) -> bool:
+    image = project(lens, points)
+    if not image.valid.all():
+        return False
+    uv = image.uv
+    inside = (uv > _EDGE).all() and (uv < (lens.width - _EDGE, lens.height - _EDGE)).all()
+    grid = uv.reshape(printed.rows, printed.columns, 2)
+    steps = [np.linalg.norm(np.diff(grid, axis=axis), axis=-1).min() for axis in (0, 1)]
+    right, down = grid[1:, 1:] - grid[1:, :-1], grid[1:, 1:] - grid[:-1, 1:]
+    front = right[..., 0] * down[..., 1] - right[..., 1] * down[..., 0] > 0
+    return bool(inside and min(steps) > _SPACING and front.all())

@@ -73,8 +73,7 @@ def epipolar_curves(
     origin, direction = pairs.ray_in_left(right)
     inverse = np.maximum(np.linspace(0.0, 1 / nearest, count), _FARTHEST)
     points = origin[:, None] + direction[:, None] / inverse[:, None]
-    views = views_of(points.reshape(1, -1, 3), np.zeros((1, points.size // 3, 2)))
-    return left.predict(identity(1), views).uv.reshape(*pairs.shape, count, 2)
+    return left.project(points).uv.reshape(*pairs.shape, count, 2)
 
 
 def epipolar_offset(

@@ -42,8 +42,8 @@ from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
+from fisheye_svp_ros.simulate.targets import board_views
 
 PATTERN = parse_pattern(BOARD)
 

@@ -11,8 +11,8 @@ from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, render
+from fisheye_svp_ros.simulate.targets import board_views
 
 
 def pattern_photograph(

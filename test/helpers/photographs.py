@@ -14,8 +14,8 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
+from fisheye_svp_ros.simulate.targets import board_views
 
 LENS = Lens('small', 424, 400, 142.0, 142.0, 211.3, 200.2, KannalaBrandt(-0.01, 0.004, -0.0015),
             np.radians(92.0), Gennery(e0=0.003))

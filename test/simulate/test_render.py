@@ -13,9 +13,8 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points, local_axes
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.simulate.board_views import board_views
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
-from fisheye_svp_ros.simulate.targets import TARGETS, target_views, visible
+from fisheye_svp_ros.simulate.targets import TARGETS, board_views, target_views, visible
 
 QUIET = Exposure(noise=0.0)
 PATTERN = parse_pattern(BOARD)
