@@ -25,6 +25,7 @@ class Publisher:
         self.msg_type = msg_type
         self.topic_name = topic
         self.lost = 0
+        self._logger = logging.Logger('rclpy.publisher')
 
     def publish(self, msg: Message | bytes) -> None:
         """Send a message, or one that is serialized already, to all subscribers."""
@@ -32,7 +33,7 @@ class Publisher:
             raise TypeError(f'Expected {self.msg_type.TYPENAME}, got {type(msg).__name__}')
         if not self._alive().write(msg):
             self.lost += 1
-            logging.Logger('rclpy.publisher').warning(
+            self._logger.warning(
                 f'{self.topic_name}: a subscriber is too slow; {self.lost} messages are lost',
                 throttle_duration_sec=5.0)
 
