@@ -291,9 +291,9 @@ class BaseNode(Node):  # type: ignore[misc]
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
         trouble = trouble or ('' if now else 'use_sim_time is true, but /clock has no time yet')
-        bad = trouble or any(count.dropped for count in self._inputs.values())
-        text = trouble or (self._complaint if bad else 'all inputs usable')
-        level = DiagnosticStatus.WARN if bad else DiagnosticStatus.OK
+        text = trouble or self._complaint
+        level = DiagnosticStatus.WARN if text else DiagnosticStatus.OK
+        text, self._complaint = text or 'all inputs usable', ''  # what it was is in the counts
         if self._failures:
             level, text = DiagnosticStatus.ERROR, f'{self._failures} internal errors; {text}'
         name = f'{self.get_fully_qualified_name()}: inputs'

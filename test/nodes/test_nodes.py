@@ -510,6 +510,11 @@ def test_malformed_messages_are_counted_and_the_node_lives_on(sets: Sets) -> Non
     status = sets.diagnostics[-1].status[0]
     assert status.name == '/localizer: inputs' and status.level == status.WARN
     assert 'missing' in status.message or 'finite' in status.message
+    sets.diagnostics.clear()
+    sets.graph.until(lambda: sets.diagnostics)
+    status = sets.diagnostics[0].status[0]
+    assert (status.level, status.message) == (status.OK, 'all inputs usable')
+    assert sets.dropped() == 4
 
 
 def test_two_landmarks_of_one_id_are_refused(sets: Sets) -> None:
