@@ -18,6 +18,7 @@ from fisheye_svp_ros.detect.photographs import Pixels
 
 _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
+_GLANCE = 350  # px, of these surroundings; without a board larger ones take up to half a second
 _SHORTEST, _LONGEST = 24, 32_766  # px, of an image that OpenCV searches
 _LEAST = 4
 _ODD = 6.0  # times the median sigma
@@ -218,9 +219,12 @@ def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | 
     right, bottom = np.clip(high + margin, 0, (width, height)).astype(int)
     if min(right - left, bottom - top) < 10:
         return None
-    crop = np.ascontiguousarray(grey[top:bottom, left:right])
+    glance = _GLANCE / max(right - left, bottom - top)
+    scale = min(glance, 1.0) if pattern.kind == 'chessboard' else 1.0
+    crop = cv2.resize(grey[top:bottom, left:right], None, fx=scale, fy=scale,
+                      interpolation=cv2.INTER_AREA)
     found: Found | None = finder(crop, pattern)  # type: ignore[operator]
-    return None if found is None else (found[0], found[1] + (left, top))
+    return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5 + (left, top))
 
 
 def _right_handed(uv: Array, pattern: Pattern) -> Array:

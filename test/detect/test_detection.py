@@ -28,6 +28,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
+from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
@@ -219,6 +220,21 @@ class TestCorners:
         assert not isinstance(points, str)
         assert not isinstance(lost, str)
         assert np.abs(points.uv - lost.uv).max() < 0.02
+
+    def test_the_last_place_is_only_glanced_at(self, monkeypatch: Any) -> None:
+        """To find none takes OpenCV up to half a second, to find a board 2 ms."""
+        searched: list[tuple[int, ...]] = []
+        finder = DETECTORS['quick'][1]
+        monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
+            'quick': (('chessboard',), lambda image, pattern: (
+                searched.append(image.shape), finder(image, pattern))[1])})
+        pose = poses(4, 2).take(0)
+        image, true = photograph(pose), true_corners(pose)
+        here = find_points(cv2.resize(image, None, fx=3, fy=3), PATTERN, 'quick', 3 * true)
+        assert not isinstance(here, str) and len(searched) == 1
+        assert np.abs((here.uv + 0.5) / 3 - 0.5 - true).max() < 0.2
+        find_points(np.zeros((800, 900), np.uint8), PATTERN, 'quick', 3 * true)
+        assert max(map(max, searched[:2])) == 350 and searched[2] == (800, 900)
 
     def test_a_board_of_another_size_is_no_board(self) -> None:
         assert isinstance(
