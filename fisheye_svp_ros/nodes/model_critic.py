@@ -59,11 +59,11 @@ class ModelCriticSettings(SolverSettings):
 
 
 class _Running(NamedTuple):
-    """A diagnosis under way, the stamp of its last frame, and the scenario of all of them."""
+    """A diagnosis under way, the stamp of its last frame, and the number of the question."""
 
     future: Future[Diagnosis]
     stamp: int
-    scenario: frozenset[tuple[str, str]]
+    question: int
 
 
 class ModelCritic(SolverNode):
@@ -81,7 +81,9 @@ class ModelCritic(SolverNode):
     def __init__(self) -> None:
         super().__init__()
         self._scenario: frozenset[tuple[str, str]] = frozenset()
-        self._simulation: Lens
+        self._latest: tuple[int, Items]
+        self._asked: tuple[object, ...] = ()
+        self._question = 0
         self._frames: dict[int, CollectedSet] = {}
         self._new = 0
         self._judged = False
@@ -107,40 +109,50 @@ class ModelCritic(SolverNode):
         return super().prepare(settings)
 
     def configure(self, settings: Any) -> None:
-        """Judge what has come so far anew, with other settings."""
+        """Judge what has come so far anew where other settings make that another question."""
         super().configure(settings)
-        self._judged = False
+        asked = (settings.lens, settings.svp, settings.sigma_px, settings.free_intrinsics,
+                 settings.max_frames)
+        if asked != self._asked:
+            self._asked = asked
+            self._ask_anew()
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
         seen = collected_set(stamp, landmarks, items, self.cameras)
-        lens, scenario = self.lens(stamp, items), scenario_of(items)
+        self.lens(stamp, items)  # raises where nobody names one
+        scenario = scenario_of(items)
         if scenario != self._scenario:
-            self._scenario, self._frames, self._judged = scenario, {}, False
-            self._verdict = None
-        self._simulation = lens
+            self._scenario, self._frames = scenario, {}
+            self._ask_anew()
+        self._latest = stamp, items
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
         for old in list(self._frames)[: -self.settings.max_frames]:
             del self._frames[old]
 
+    def _ask_anew(self) -> None:
+        self._question += 1
+        self._judged, self._verdict = False, None
+
     def _tick(self) -> None:
         if self._running is not None:
             if self._running.future.done():
                 done, self._running = self._running, None
-                if done.scenario is self._scenario:
+                if done.question == self._question:
                     self._finish(done)
             return
         wanted = self.settings.every_frames if self._judged else 0
         if len(self._frames) >= self.settings.min_frames and self._new >= wanted:
             self._new, self._judged = 0, True
-            table, lens = self._table(), self._simulation
+            table, lens = self._table(), self.lens(*self._latest)
             free = self.settings.free_intrinsics or lens.calibration is not None
             work = in_background(lambda: judge(table, lens, free))
-            self._running = _Running(work, next(reversed(self._frames)), self._scenario)
+            self._running = _Running(work, self._latest[0], self._question)
 
     def _table(self) -> Observations:
-        table = table_of(list(self._frames.values()), self.cameras)
+        window = list(self._frames.values())[-self.settings.max_frames :]
+        table = table_of(window, self.cameras)
         sigma = self.settings.sigma_px
         return replace(table, sigma=np.full(len(table), sigma)) if sigma else table
 

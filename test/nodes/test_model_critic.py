@@ -31,6 +31,7 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import model_critic
+from fisheye_svp_ros.nodes.base import Finished
 from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -140,6 +141,33 @@ def test_one_diagnosis_is_at_work_at_a_time_however_soon_scenarios_change(
     g.start(SyntheticCamera)
     g.until(lambda: len(seen) > 2)
     assert all(seen) and not results
+
+
+def test_other_settings_are_judged_anew_where_they_make_a_difference(
+    graph: Callable[..., Graph], scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[tuple[int, str]] = []
+
+    def judge(table: Any, lens: Lens, _: bool) -> None:
+        seen.append((len(table.frames), lens.name))
+        raise GeometryError('asked for nothing else')
+
+    monkeypatch.setattr(model_critic, 'judge', judge)
+    g = graph('repeat:=false', f'synthetic_camera:lens:={scene}/hidden.yaml')
+    critic = g.start(ModelCritic)
+    camera = g.start(SyntheticCamera)
+    with pytest.raises(Finished):
+        g.until(lambda: False)
+    g.executor.remove_node(camera)
+    g.until(lambda: seen)
+    for name, value in (('patience', 1.0), ('backlog', 7), ('every_frames', 9)):
+        assert set_parameter(critic, name, value).successful
+    g.idle(0.6)
+    assert len(seen) == 1
+    for name, value in (('lens', 'fish214'), ('min_frames', 5), ('max_frames', 7)):
+        assert set_parameter(critic, name, value).successful
+    g.until(lambda: len(seen) == 2)
+    assert seen == [(FRAMES, 'given'), (7, 'fish214')]
 
 
 def test_a_rig_is_judged_as_one(graph: Callable[..., Graph], scene: Path) -> None:
