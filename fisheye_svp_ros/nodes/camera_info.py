@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.decoding import CameraModel
 from fisheye_svp_ros.io.lens_formats.ros import lens_of
 from fisheye_svp_ros.optics.lens import Lens
@@ -33,18 +34,28 @@ class CameraInfos:
         if len(heard) > _KEPT:
             del heard[next(iter(heard))]
 
+    def size(self, topic: str, stamp: int) -> tuple[int, int] | None:
+        """Return width and height, px, of the images, where somebody has told of them."""
+        with suppress(FisheyeSvpError):
+            return self._model(topic, stamp).size
+        return None
+
     def lens(self, topic: str, stamp: int) -> Lens:
         """Return the lens of a set; raise FisheyeSvpError where nobody has told a usable one."""
-        heard = self._heard.get(topic)
-        if not heard:
-            raise ParameterError(f'{topic}: none has come; set the parameter lens')
-        key = stamp if stamp in heard else next(reversed(heard))
-        if not isinstance(heard[key], CameraModel):
-            heard[key] = heard[key].read()
-        known: CameraModel = heard[key]
+        known = self._model(topic, stamp)
         lens, worst = lens_of(*known, topic.replace('/', '_'), topic)
         if self._told.get(topic) != known:
             self._told[topic] = known
             off = f', {worst:.2g} px off at worst' if worst else ''
             self._tell(f'{topic}: {known.model} of {lens.width}x{lens.height} px{off}')
         return lens
+
+    def _model(self, topic: str, stamp: int) -> CameraModel:
+        heard = self._heard.get(topic)
+        if not heard:
+            raise ParameterError(f'{topic}: none has come; set the parameter lens')
+        key = stamp if stamp in heard else next(reversed(heard))
+        if not isinstance(heard[key], CameraModel):
+            heard[key] = heard[key].read()
+        model: CameraModel = heard[key]
+        return model

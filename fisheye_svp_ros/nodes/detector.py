@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
@@ -20,10 +20,12 @@ from fisheye_svp_ros.detect.points import Points, search
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late
 from fisheye_svp_ros.diagnosis.guide import NUMBERS
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED, SENSOR_INPUT, BaseNode, run
+from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, SENSOR_INPUT, BaseNode, run
+from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.scene.landmarks import Landmarks
@@ -99,6 +101,8 @@ class Detector(BaseNode):
         self._taken: deque[tuple[int, str]] = deque(maxlen=_LATEST)
         self._waiting: tuple[int, Unread] | None = None
         self._searched: tuple[int, str, Pixels] | None = None
+        self._infos = CameraInfos(self.get_logger().info)
+        self._misfit = ''
         self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
         if self.settings.detections:
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
@@ -106,9 +110,11 @@ class Detector(BaseNode):
             return
         for kind, topic in ((Image, 'image'), (CompressedImage, 'image/compressed')):
             self.collect(kind, topic, partial(_read, kind), self._take, SENSOR_INPUT)
+        self.collect(CameraInfo, CAMERA_INFO, read_camera_info,
+                     partial(self._infos.hear, CAMERA_INFO), LATCHED_INPUT, SENSOR_INPUT)
         self.start()
         if self.settings.guide:
-            self._guiding = Guiding(self, self.settings, self._pattern)
+            self._guiding = Guiding(self, self.settings, self._pattern, self._infos)
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
@@ -147,9 +153,9 @@ class Detector(BaseNode):
     def report(self) -> tuple[dict[str, object], str]:
         """Return how many images were overtaken, and how many showed no board."""
         if self._guiding is None:
-            return dict(self._counts), ''
+            return dict(self._counts), self._misfit
         guide, trouble = self._guiding.report()
-        return {**self._counts, **guide}, trouble
+        return {**self._counts, **guide}, self._misfit or trouble
 
     def _take(self, stamp: int, image: Unread) -> None:
         """Keep the newest image, if anybody wants to know what is in it."""
@@ -198,6 +204,7 @@ class Detector(BaseNode):
         except ObservationError as error:
             self.drop(image.topic, error)
             return
+        self._compare(self._infos.size(CAMERA_INFO, stamp), pixels)
         self._searched = stamp, frame, pixels
         task = pixels, self._pattern, self._detector, self._near
         self._searches.start(task, self.settings.longest_search)
@@ -242,6 +249,15 @@ class Detector(BaseNode):
             raise ObservationError(
                 f'image: {pixels.shape[1]}x{pixels.shape[0]} px, but it was '
                 f'{self._size[1]}x{self._size[0]}; start the node anew for another camera')
+
+    def _compare(self, told: tuple[int, int] | None, pixels: Pixels) -> None:
+        """Take note where the camera_info is not of these images: the solvers cannot know."""
+        height, width = pixels.shape
+        self._misfit = '' if told in (None, (width, height)) else (
+            f'image: {width}x{height} px, but {CAMERA_INFO} is of {told[0]}x{told[1]} px, and no '
+            'lens fits both: have the driver send the calibration of the images it sends')
+        if self._misfit:
+            self.get_logger().warning(self._misfit, throttle_duration_sec=10.0)
 
 
 def _read(kind: Any, message: Any, topic: str) -> tuple[str, Pixels]:

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import Image
 from std_msgs.msg import Float64
 
 from fisheye_svp_ros.arrays import Array
@@ -30,7 +30,6 @@ from fisheye_svp_ros.diagnosis.guide import (
 )
 from fisheye_svp_ros.diagnosis.plan import nominal_lens
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, OutputError, ParameterError
-from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.files import replacing
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.observations_csv import write_observations
@@ -54,7 +53,9 @@ class Guiding:
     What is wanted next is chosen in a process of its own, which is ended where it takes too long.
     """
 
-    def __init__(self, node: BaseNode, settings: Any, pattern: Pattern) -> None:
+    def __init__(
+        self, node: BaseNode, settings: Any, pattern: Pattern, infos: CameraInfos
+    ) -> None:
         """Announce the topics; raise ParameterError for a lens or folder that cannot be used."""
         self._node, self._settings, self._pattern = node, settings, pattern
         self._folder = Path(settings.guide_output).absolute()
@@ -64,12 +65,9 @@ class Guiding:
                 self._folder.iterdir()):
             raise ParameterError(f'guide_output: {self._folder} is not an empty folder that can '
                                  'be written; choose another for these photographs')
-        self._infos = CameraInfos(node.get_logger().info)
+        self._infos = infos
         self._lens: Lens | None = None
-        if settings.lens == CAMERA_INFO:
-            node.collect(CameraInfo, CAMERA_INFO, read_camera_info, lambda stamp, unread:
-                         self._infos.hear(CAMERA_INFO, stamp, unread), LATCHED)
-        elif settings.lens:
+        if settings.lens not in ('', CAMERA_INFO):
             self._lens = load_lens(lens_path(settings.lens))
         self._pictures = node.announce(Image, '~/guide', _PICTURES)
         self._wanted = node.announce(PoseStamped, '~/wanted', LATCHED)

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2  # isort: skip
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2  # isort: skip
 
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import (
@@ -99,6 +99,28 @@ def test_compressed_and_bad_images(detecting: Graph) -> None:
     assert not any(p.header.stamp.nanosec in (6, 7) for p in points[heard:])
     detecting.until(lambda: (images.publish(raw(image, 8)),
                          any(p.header.stamp.nanosec == 8 for p in points))[1])
+
+
+def test_a_camera_info_of_another_size_is_told_of(detecting: Graph) -> None:
+    image = photograph(poses(1, 4).take(0))
+    detecting.hear(PointCloud2, 'image_points')
+    reports = detecting.hear(DiagnosticArray, '/diagnostics')
+    images, told = detecting.tell(Image, 'image', SENSOR), detecting.tell(
+        CameraInfo, 'camera_info', SENSOR)
+
+    def says(width: int, text: str) -> Any:
+        message = CameraInfo(width=width, height=image.shape[0], distortion_model='equidistant')
+        message.k, message.d = [300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0], [0.0] * 4
+        detecting.until(lambda: (told.publish(message), images.publish(raw(image, 5)), next(
+            (m for m in reports if text in m.status[0].message), None))[-1])
+        status = reports[-1].status[0]
+        reports.clear()
+        return status
+
+    status = says(848, 'image: 424x400 px, but camera_info is of 848x400 px')
+    assert status.level == status.WARN
+    status = says(424, 'all inputs usable')
+    assert status.level == status.OK
 
 
 def test_an_image_that_comes_raw_and_compressed_is_searched_once(detecting: Graph) -> None:
