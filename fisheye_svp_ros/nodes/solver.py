@@ -284,8 +284,6 @@ class SolverNode(ManagedNode):
 
     def _work(self) -> None:
         """Do one thing: take all in that has come, then solve a set, then look at the rest."""
-        if not self.has_listeners():
-            return
         now, patience = time.monotonic(), self.settings.patience
         if self._arrivals.go_on(now):
             self._wake.trigger()
@@ -296,6 +294,8 @@ class SolverNode(ManagedNode):
         while len(self._backlog) > self.settings.backlog:
             self._backlog.popleft()
             self._counts.dropped += 1
+        if not self.has_listeners():
+            return
         if self._backlog:
             one = self._backlog.popleft()
             self._attempt(one)

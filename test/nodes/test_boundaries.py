@@ -232,6 +232,21 @@ def test_overload_drops_whole_sets_keeps_the_newest_and_says_so(
     assert 'cannot keep up' not in texts[-1]
 
 
+def test_what_nobody_listens_to_yet_is_held_back_no_further_than_the_backlog(
+    graph: Callable[..., Graph]
+) -> None:
+    parameters = ('patience:=0.3', 'lens:=fish214', 'svp:=true', 'backlog:=5')
+    attack = Attack(graph(*parameters, 'wait_for_subscribers:=2'))
+    attack.landmarks.publish(attack.cloud)
+    for stamp in range(1, 21):
+        attack.tell_points(stamp)
+    attack.graph.until(lambda: attack.counts()['sets: taken'] == '20')
+    attack.graph.until(lambda: attack.counts()['sets: waiting'] == '5')
+    attack.graph.hear(DiagnosticArray, 'localizer/result')
+    attack.graph.until(lambda: len(attack.results) == 5)
+    assert [stamp_of(m) for m in attack.results] == [16, 17, 18, 19, 20]
+
+
 def test_landmarks_that_are_not_latched_are_heard(
     graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
 ) -> None:
