@@ -1,9 +1,11 @@
 """Two engines, one formula: they agree to rounding, and nobody notices which one runs."""
 
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -310,6 +312,24 @@ def test_a_numba_that_does_not_go_with_this_numpy(unsettled, monkeypatch, name):
     else:
         with pytest.raises(ParameterError, match='the engine numba cannot be loaded'):
             engines.use(name)
+
+
+def test_what_another_installation_compiled_is_not_there(tmp_path):
+    pytest.importorskip('numba', reason='the engine numba comes with the extra `fast`')
+    here, there = Path(engines.__file__).parents[3], tmp_path / 'elsewhere'
+    shutil.copytree(here / 'fisheye_svp_ros', there / 'fisheye_svp_ros')
+    code = ('from fisheye_svp_ros.optics.engines import cache\n'
+            'cache.folder().mkdir(parents=True, exist_ok=True)\n'
+            '{} or print(cache.filled())')
+
+    def run(where, line):
+        environment = os.environ | {'XDG_CACHE_HOME': str(tmp_path), 'PYTHONPATH': str(where)}
+        return subprocess.run([sys.executable, '-c', code.format(line)], env=environment,
+                              cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+
+    assert run(here, 'cache.mark_filled()') == 'True\n'
+    assert run(there, 'None') == 'False\n'
+    assert run(here, 'None') == 'True\n'
 
 
 def test_small_work_never_loads_numba():

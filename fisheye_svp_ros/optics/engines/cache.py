@@ -29,12 +29,19 @@ def folder() -> Path:
 
 
 def filled() -> bool:
-    """Say whether all of it has been compiled before."""
-    return (folder() / 'complete').exists()
+    """Say whether all of it has been compiled before, by this installation."""
+    return _mark().exists()
 
 
 @cache
 def mark_filled() -> None:
     """Remember that all of it has been compiled, where that can be kept."""
     with suppress(OSError):
-        (folder() / 'complete').touch()
+        _mark().touch()
+
+
+def _mark() -> Path:
+    # Numba finds what it compiled by the place and the time of the source.
+    source = Path(__file__).with_name('entries.py')
+    told = f'{source} {source.stat().st_mtime_ns}'
+    return folder() / f'complete-{hashlib.sha256(told.encode()).hexdigest()[:16]}'
