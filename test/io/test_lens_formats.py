@@ -135,6 +135,14 @@ def test_kalibr(tmp_path: Path) -> None:
         load_lens(f'{path}#cam7')
 
 
+BASALT = json.dumps({'value0': {
+    'T_imu_cam': [{'px': place, 'py': 0, 'pz': 0, 'qx': 0, 'qy': 0, 'qz': 0, 'qw': 1}
+                  for place in (0.1, 0.3)],
+    'intrinsics': 2 * [{'camera_type': 'ds', 'intrinsics': {
+        'fx': 158.0, 'fy': 158.0, 'cx': 255.0, 'cy': 257.0, 'xi': -0.2, 'alpha': 0.59}}],
+    'resolution': [[512, 512], [512, 512]]}})
+
+
 def test_opencv_xml_and_basalt(tmp_path: Path) -> None:
     import cv2
 
@@ -148,12 +156,7 @@ def test_opencv_xml_and_basalt(tmp_path: Path) -> None:
     lens = load_lens(path)
     assert (lens.fy, lens.cx, lens.parameters['k4']) == (301.0, 320.0, -0.001)
     json_path = tmp_path / 'calibration.json'
-    pose = {'px': 0.1, 'py': 0, 'pz': 0, 'qx': 0, 'qy': 0, 'qz': 0, 'qw': 1}
-    camera = {'camera_type': 'ds', 'intrinsics': {
-        'fx': 158.0, 'fy': 158.0, 'cx': 255.0, 'cy': 257.0, 'xi': -0.2, 'alpha': 0.59}}
-    json_path.write_text(json.dumps({'value0': {
-        'T_imu_cam': [pose, {**pose, 'px': 0.3}], 'intrinsics': [camera, camera],
-        'resolution': [[512, 512], [512, 512]]}}))
+    json_path.write_text(BASALT)
     foreign = read_lens_file(json_path)
     assert list(foreign.lenses) == ['cam0', 'cam1']
     assert foreign.rigs[0].position == pytest.approx([-0.2, 0, 0])
@@ -340,6 +343,9 @@ def test_a_robot_is_shown_and_is_no_lens(tmp_path: Path, capsys: pytest.CaptureF
     ('child_frame_id: a\ntranslation: 1\n', 'not a whole transform'),
     ('left_in_right: {position: [0, 0], quaternion: [0, 0, 0, 1]}', 'position must be'),
     ('left_in_right: {position: [0, 0, 0], quaternion: [0, 0, 0, 0]}', 'unit length'),
+    (CAMCHAIN.replace('0.99998854', '1.99998854'), 'cam1: T_cn_cnm1: .* rotation matrix'),
+    (BASALT.replace('"qw": 1', '"qw": 0'), 'T_imu_cam: .* unit length'),
+    (BASALT.replace('"px": 0.1', '"px": NaN'), 'T_imu_cam: a translation'),
     ('name: lens', 'left_in_right'),
 ])
 def test_what_is_no_rig_is_refused(tmp_path: Path, text: str, said: str) -> None:

@@ -6,13 +6,11 @@ import itertools
 import json
 from typing import Any
 
-import numpy as np
-
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
+from fisheye_svp_ros.pose import Pose
 
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
 
@@ -32,7 +30,7 @@ def read(text: str, where: str) -> Foreign:
         for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
             lens, off = _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
             lenses[f'cam{i}'], worst[f'cam{i}'] = lens, off
-        rigs = _rigs(document.get('T_imu_cam', []))
+        rigs = _rigs(document.get('T_imu_cam', []), where)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole Basalt calibration ({cause!r})') from cause
     return Foreign('basalt', lenses, rigs, worst)
@@ -52,9 +50,9 @@ def _lens(
     raise LensError(f'{where}: camera_type is {kind!r}; kb4 and ds can be read')
 
 
-def _rigs(entries: list[dict[str, float]]) -> tuple[Pose, ...]:
+def _rigs(entries: list[dict[str, float]], where: str) -> tuple[Pose, ...]:
     table = [[float(entry[name]) for name in _NAMES] for entry in entries]
-    places = [Pose(rotation_from_quaternion(row[3:]), np.array(row[:3])) for row in table]
+    places = [radial.pose(row[:3], row[3:], f'{where}: T_imu_cam') for row in table]
     return tuple(later.inverse().compose(earlier)
                  for earlier, later in itertools.pairwise(places))
 

@@ -11,7 +11,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, nearest_rotation
+from fisheye_svp_ros.pose import Pose
 
 _INTRINSICS = {'pinhole': 4, 'omni': 5, 'ds': 6, 'eucm': 6}
 
@@ -63,9 +63,7 @@ def _rig(rows: Any, where: str) -> Pose:
         matrix = np.array(rows, dtype=float).reshape(4, 4)
     except (TypeError, ValueError) as cause:
         raise LensError(f'{where}: T_cn_cnm1 must be a matrix of 4 x 4') from cause
-    if not np.isfinite(matrix).all():
-        raise LensError(f'{where}: T_cn_cnm1 holds what is no number')
-    return Pose(nearest_rotation(matrix[:3, :3]), matrix[:3, 3])
+    return radial.pose(matrix[:3, 3], matrix[:3, :3], f'{where}: T_cn_cnm1')
 
 
 def write(lens: Lens) -> str:

@@ -15,7 +15,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, nearest_rotation
+from fisheye_svp_ros.pose import Pose
 
 _MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1', 'cameraMatrix1')
 _COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D', 'D1',
@@ -65,7 +65,7 @@ def read(text: str, where: str) -> Foreign:
     if 'R' in document or 'T' in document:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
         place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
-        rigs = (Pose(nearest_rotation(turn), np.array(place)),)
+        rigs = (radial.pose(place, turn, f'{where}: R, T'),)
     return Foreign('opencv', pair, rigs, {})
 
 

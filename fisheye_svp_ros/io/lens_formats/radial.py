@@ -8,6 +8,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
@@ -15,11 +16,13 @@ from fisheye_svp_ros.io.documents import LARGEST_YAML
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
 
 Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
 
 _GRID = 600
 _LARGEST = 1e12  # any number of a lens
+_SLACK = 1e-3  # of the elements of a rotation
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 
 
@@ -136,6 +139,23 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
+
+
+def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
+    """Return the pose of a place, m, and a quaternion x, y, z, w or a matrix (3, 3).
+
+    Raises LensError where these are no numbers, or the turn is none.
+    """
+    place, given = np.array(place), np.array(turn)
+    length = np.linalg.norm(given)
+    if np.isfinite([*place, length]).all() and length > 0.5:
+        if given.ndim == 1:
+            return Pose(rotation_from_quaternion(given), place)
+        rotation = nearest_rotation(given)
+        if np.allclose(rotation, given, atol=_SLACK):
+            return Pose(rotation, place)
+    raise LensError(f'{where}: a translation and a quaternion of unit length or a rotation matrix '
+                    'are needed')
 
 
 def xml(text: str, where: str, form: str) -> ElementTree.Element:

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
-from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
 
 _FIRST_IN_SECOND = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
 
@@ -27,6 +24,4 @@ def read(text: str, where: str) -> Foreign:
     where = f'{where}: {name}'
     place = radial.numbers(entry, 'position', 3, where)
     turn = radial.numbers(entry, 'quaternion', 4, where)
-    if not np.linalg.norm(turn) > 0.5:
-        raise LensError(f'{where}: quaternion is {turn}; one of unit length is needed')
-    return Foreign('rig', {}, (Pose(rotation_from_quaternion(turn), np.array(place)),), {})
+    return Foreign('rig', {}, (radial.pose(place, turn, where),), {})

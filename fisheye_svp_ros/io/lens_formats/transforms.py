@@ -16,7 +16,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
-from fisheye_svp_ros.pose import Pose, identity, rotation_from_quaternion, rotation_from_vector
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
 _Joint = tuple[str, str, Pose]  # parent, child, child in parent
 _OPTICAL = 'optical'
@@ -97,7 +97,4 @@ def _messages(text: str, where: str) -> Iterator[_Joint]:
                 ends = str(entry['header']['frame_id']), str(entry['child_frame_id'])
             except (KeyError, TypeError, ValueError) as cause:
                 raise LensError(f'{where}: not a whole transform ({cause!r})') from cause
-            if not np.isfinite([*place, *turn]).all() or not np.linalg.norm(turn) > 0.5:
-                raise LensError(f'{where}: {ends[1]}: a translation and a unit quaternion are '
-                                'needed')
-            yield (*ends, Pose(rotation_from_quaternion(turn), np.array(place)))
+            yield (*ends, radial.pose(place, turn, f'{where}: {ends[1]}'))
