@@ -28,6 +28,9 @@ def read(path: str | Path) -> Observations:
     frame, landmark = table.whole('frame'), table.whole('landmark', MOST_LANDMARK)
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
+    # Results of a camera go to a folder of its name, in that of all.
+    table.refuse([name.startswith('/') or '..' in name.split('/') for name in names], 'camera',
+                 'a name without .. that does not begin with /')
     camera = np.array([cameras.index(name) for name in names], dtype=np.int64)
     table.refuse_repeats(
         np.stack([frame, camera, landmark], axis=-1), 'frame, camera and landmark'

@@ -147,6 +147,8 @@ class TestObservationsCsv:
         assert table.xyz[0].tolist() == [-1e12, 4.0, 1e12]
 
     @pytest.mark.parametrize(('name', 'cell', 'says'), [
+        ('camera', '../left', "camera is '../left'; a name without .."),
+        ('camera', '/left', "camera is '/left'; a name without .."),
         ('sigma', '0', "sigma is '0'; a number above 0"),
         ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),
         ('sigma', '', "sigma is ''; a number"),
