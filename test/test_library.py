@@ -149,6 +149,13 @@ def test_an_unknown_parameter_is_refused() -> None:
         fsvp.sweep({'radius': [1.0]}, solver={})
 
 
+def test_points_of_another_shape_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r'points has the shape \(4, 2\)'):
+        fsvp.project('fish180', np.zeros((4, 2)))
+    with pytest.raises(ParameterError, match=r'uv has the shape \(3,\); \(\.\.\., 2\) is needed'):
+        fsvp.back_project('fish180', np.zeros(3))
+
+
 def test_columns(tmp_path: Path) -> None:
     columns = Columns({'frame': np.arange(2), 'x': [0.5, None]})
     assert columns == {'frame': [0, 1], 'x': [0.5, None]}
