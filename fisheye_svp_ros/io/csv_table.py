@@ -104,7 +104,8 @@ class CsvTable:
     def _check_header(self, required: Sequence[str]) -> None:
         wanted, there = ','.join(required), ','.join(self._header)
         if not any(self._header):
-            raise ObservationError(f'{self.path}: it is empty; a header with {wanted} is needed')
+            raise ObservationError(
+                f'{self.path}: it is empty; a header with {wanted or "names"} is needed')
         for name in required:
             if name not in self._header:
                 raise ObservationError(

@@ -52,6 +52,12 @@ def test_cells_are_numbers_where_all_are() -> None:
     assert typed(['1_000', '2']) == ['1_000', '2']
 
 
+def test_an_empty_table_is_said_to_be_one(tmp_path: Path) -> None:
+    (tmp_path / 'a.csv').touch()
+    with pytest.raises(OutputError, match='it is empty; a header with names is needed'):
+        read_columns(tmp_path / 'a.csv')
+
+
 def test_a_header_of_any_length_is_looked_at_once(tmp_path: Path) -> None:
     names = ','.join(f'c{i}' for i in range(40_000))
     (tmp_path / 'a.csv').write_text(f'{names},c7\n')
