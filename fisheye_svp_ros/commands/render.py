@@ -59,8 +59,11 @@ def run(args: argparse.Namespace) -> None:
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
         raise ParameterError(f'--board {args.board}: chessboards alone can be rendered')
-    if args.count < 1 or not 0 < args.ranges[0] <= args.ranges[1]:
+    if args.count < 1 or not 0 < args.ranges[0] <= args.ranges[1] < np.inf:
         raise ParameterError('--count must be above 0, --ranges two distances above 0 in order')
+    if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
+        raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
+                             'finite')
     lens, rng = load_lens(lens_path(args.lens)), np.random.default_rng(args.seed)
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:

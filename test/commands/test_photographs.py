@@ -212,6 +212,17 @@ def test_few_boards_may_be_another_board(
     assert f'most photographs show no {BOARD}: check kind and size of the board' in said
 
 
+@pytest.mark.parametrize('said', [
+    ('--seed', '-1'), ('--blur', 'nan'), ('--noise', 'inf'), ('--bow', 'nan'),
+    ('--ranges', '0.1', 'inf'),
+])
+def test_render_with_what_is_no_size(said, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    assert cli.main(['render', '--lens', 'fish180', '--board', BOARD, '-o', str(tmp_path / 'a'),
+                     '--count', '1', *said]) == 2
+    assert said[0] in capsys.readouterr().err
+    assert not (tmp_path / 'a').exists()
+
+
 def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
     for name in ('one', 'two'):
