@@ -69,6 +69,8 @@ class BaseNode(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         try:
             super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+        except NameValidationException:  # a ValueError, too
+            raise
         except ValueError as cause:  # an empty list has no type, and rclpy does not say which
             raise ParameterError(f'parameters: {cause}; a list must not be empty') from cause
         # The public way to learn what was given; what is known is declared anew, with its type.

@@ -71,6 +71,7 @@ def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
     told = [line for line in node.lines if line.startswith('localizer: ')]
     assert len(told) == 1 and len(told[0]) > 20, node.lines
     assert arguments != ['--nosuch'] or 'ROS arguments' in told[0]  # rclpy: a bare list
+    assert ('a list must' in told[0]) == (arguments == ['-p', 'lens:=[]'])
     assert 'Traceback' not in '\n'.join(node.lines)
 
 
