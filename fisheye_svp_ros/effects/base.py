@@ -218,7 +218,8 @@ class Effect(ABC):
     def from_dict(cls, entry: Mapping[str, Any], where: str) -> tuple[Effect, Array]:
         """Return the effect and its values; raise LensError naming `where` and the field."""
         structure = {name: value for name, value in entry.items() if name != 'parameters'}
-        for name in structure.keys() - {field.name for field in fields(cls)}:
+        known = {field.name for field in fields(cls)}
+        for name in (name for name in structure if name not in known):
             raise LensError(f'{where}: effect {cls.name} has {name}, which does not belong there; '
                             'its numbers are in a mapping, parameters')
         try:

@@ -107,7 +107,7 @@ def test_unknown_and_incomplete_effects_are_refused():
     with pytest.raises(LensError, match='skew has bend, which does not belong'):
         load_effects({'skew': {'parameters': {'shear': 0.1, 'bend': 1.0}}}, 'lens.yaml')
     with pytest.raises(LensError, match=r'skew has shear, .* in a mapping, parameters'):
-        load_effects({'skew': {'shear': 0.1}}, 'lens.yaml')
+        load_effects({'skew': {'shear': 0.1, 'bend': 1.0}}, 'lens.yaml')
 
 
 def test_flat_port_is_snells_law():
