@@ -14,7 +14,9 @@ import numpy as np
 from benchmark.fuzz.mutations import WORDS, mutated, nasty
 from benchmark.fuzz.surfaces import Surface, Trial
 from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import rows
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 _NUMBERS = (0.0, -0.0, 1e308, -1e308, 5e-324, 1e12, np.inf, -np.inf, np.nan, 1e-9, 1e9)
@@ -109,6 +111,7 @@ def seeds() -> dict[str, list[bytes]]:
         'TransformStamped': [messages.transform_message(pose, 7, 'a', 'b')],
         'DiagnosticArray': [messages.key_values_message(
             's', {'lens': 'fish214', 'shift_scale': 0.5, 'radius': 2.0, 'scenario': 1}, 7)],
+        'CameraInfo': [messages.camera_info_message(load_lens(lens_path('fish214')), 7, 'camera')],
         'Image': [Image(header=messages.header(7), height=48, width=64, encoding='mono8', step=64,
                         data=picture.tobytes())],
         'CompressedImage': [CompressedImage(header=messages.header(7), format='png', data=data)
