@@ -219,9 +219,9 @@ class Effect(ABC):
         """Return the effect and its values; raise LensError naming `where` and the field."""
         structure = {name: value for name, value in entry.items() if name != 'parameters'}
         known = {field.name for field in fields(cls)}
-        for name in (name for name in structure if name not in known):
-            raise LensError(f'{where}: effect {cls.name} has {name}, which does not belong there; '
-                            'its numbers are in a mapping, parameters')
+        if foreign := [name for name in structure if name not in known]:
+            raise LensError(f'{where}: effect {cls.name} has {foreign[0]}, which does not belong '
+                            'there; its numbers are in a mapping, parameters')
         try:
             effect = cls(**{name: _frozen(value) for name, value in structure.items()})
             names = [parameter.name for parameter in effect.parameters]
