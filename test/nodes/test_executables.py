@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -138,6 +138,15 @@ def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
     assert capfd.readouterr().err == ''
 
 
+@pytest.fixture
+def handler_kept() -> Iterator[None]:
+    """Give SIGINT back the handler that a node replaces."""
+    before = signal.getsignal(signal.SIGINT)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures('handler_kept')
 @pytest.mark.filterwarnings('error::pytest.PytestUnraisableExceptionWarning')
 def test_a_second_interrupt_does_not_disturb_what_the_first_one_ends(
     ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
@@ -154,14 +163,11 @@ def test_a_second_interrupt_does_not_disturb_what_the_first_one_ends(
         raise AssertionError(held)
 
     monkeypatch.setattr(base.BaseNode, 'announce', interrupt)
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        assert executables.run('localizer', []) == 0
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert executables.run('localizer', []) == 0
     assert capfd.readouterr().err == ''
 
 
+@pytest.mark.usefixtures('handler_kept')
 @pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
 def test_an_interrupt_that_was_lost_can_be_repeated(
     ros_domain: int, monkeypatch: pytest.MonkeyPatch
@@ -178,11 +184,7 @@ def test_an_interrupt_that_was_lost_can_be_repeated(
 
     went_on: list[bool] = []
     monkeypatch.setattr(base.BaseNode, 'announce', lose)
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        assert executables.run('localizer', []) == 0
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert executables.run('localizer', []) == 0
     assert not went_on
 
 
