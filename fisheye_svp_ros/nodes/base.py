@@ -1,4 +1,4 @@
-"""What every node shares: parameters, guarded inputs, diagnostics, main()."""
+"""What every node shares: parameters, guarded inputs, diagnostics, how it runs."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, SENSOR_INPUT, BaseNode, run
+from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, SENSOR_INPUT, BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.inputs import Unread
@@ -269,8 +269,3 @@ def _tag_array() -> Any:
         raise ParameterError('detections is true, but apriltag_msgs is not installed: '
                              'apt install ros-jazzy-apriltag-msgs')
     return import_module('apriltag_msgs.msg').AprilTagDetectionArray
-
-
-def main(args: list[str] | None = None) -> int:
-    """Run the node."""
-    return run(Detector, args)
