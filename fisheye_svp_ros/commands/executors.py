@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import signal
+import tempfile
 import threading
-from collections.abc import Iterator
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor
 from contextlib import contextmanager
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from fisheye_svp_ros.errors import SweepError
 from fisheye_svp_ros.study.sweep import InProcess
@@ -34,9 +37,8 @@ def local(count: int) -> Iterator[Workers]:
     if not count:
         yield Workers(InProcess(), 1)
         return
-    executor = ProcessPoolExecutor(
-        count, multiprocessing.get_context('spawn'), initializer=_end_with_parent
-    )
+    folder = tempfile.TemporaryDirectory(prefix='fisheye_svp_')
+    executor = _Processes(count, folder.name)
     try:
         yield Workers(executor, _AHEAD * count)
     except BrokenExecutor as cause:
@@ -49,6 +51,47 @@ def local(count: int) -> Iterator[Workers]:
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+        folder.cleanup()
+
+
+class _Processes(ProcessPoolExecutor):
+    """Processes whose results come in files of a folder.
+
+    All write to one pipe.  One that is killed in the middle of a long result would leave this
+    program waiting for the rest of it; the name of a file is written at once or not at all.
+    """
+
+    def __init__(self, count: int, folder: str) -> None:
+        super().__init__(
+            count, multiprocessing.get_context('spawn'), initializer=_end_with_parent)
+        self._folder = folder
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Return the future result of a function."""
+        result: Future[Any] = Future()
+
+        def done(written: Future[Path]) -> None:
+            if written.cancelled():
+                result.cancel()
+            elif error := written.exception():
+                result.set_exception(error)
+            else:
+                result.set_result(_taken(written.result()))
+
+        super().submit(_written, self._folder, fn, *args, **kwargs).add_done_callback(done)
+        return result
+
+
+def _written(folder: str, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Path:
+    with tempfile.NamedTemporaryFile(dir=folder, delete=False) as file:
+        pickle.dump(fn(*args, **kwargs), file)
+    return Path(file.name)
+
+
+def _taken(path: Path) -> Any:
+    value = pickle.loads(path.read_bytes())
+    path.unlink()
+    return value
 
 
 @contextmanager

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -100,6 +101,22 @@ def files_of(folder: Path) -> list[bytes]:
     """Return the tables of a finished sweep, byte by byte."""
     assert sorted(p.name for p in folder.iterdir()) == sorted([*FILES, 'sweep.json'])
     return [(folder / name).read_bytes() for name in FILES]
+
+
+def workers_of(process: subprocess.Popen[str]) -> list[Any]:
+    """Return the processes that work on a sweep."""
+    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
+    return [child for child in psutil.Process(process.pid).children()
+            if 'spawn_main' in ' '.join(child.cmdline())]
+
+
+def at_rest(process: Any) -> bool:
+    """Say whether a process waits for something, as often as one looks."""
+    def waits() -> bool:
+        time.sleep(0.05)
+        return bool(process.status() == 'sleeping')
+
+    return all(waits() for _ in range(20))
 
 
 def parts_in(folder: Path) -> int:
@@ -290,16 +307,31 @@ def test_it_goes_on_with_the_engine_that_it_was_begun_with(
 
 
 def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Path) -> None:
-    psutil = pytest.importorskip('psutil', reason='psutil finds the workers')
     out = tmp_path / 'out'
     process = start(write(LONG), '-o', out, '--workers', 2)
     until(lambda: parts_in(out) >= 1)
-    workers = [child for child in psutil.Process(process.pid).children()
-               if 'spawn_main' in ' '.join(child.cmdline())]
-    workers[0].kill()
+    workers_of(process)[0].kill()
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2 and 'a worker process died' in err
     assert parts_in(out) >= 1
+
+
+def test_workers_that_die_while_they_send_results_are_named(
+    write: Callable[[str], Path], tmp_path: Path
+) -> None:
+    out = tmp_path / 'out'
+    process = start(write(LONG), '-o', out, '--workers', 2)
+    until(lambda: parts_in(out) >= 1)
+    workers = workers_of(process)
+    process.send_signal(signal.SIGSTOP)  # nobody takes their results
+    try:
+        until(lambda: all(at_rest(worker) for worker in workers))
+        for worker in workers:
+            worker.kill()
+    finally:
+        process.send_signal(signal.SIGCONT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 2 and 'a worker process died' in err
 
 
 def test_workers_end_with_a_sweep_that_is_killed(
