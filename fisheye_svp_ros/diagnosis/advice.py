@@ -66,6 +66,11 @@ def advise(
     else:
         table = measured.test.observations
         advice += _set_aside(table, measured.test_gross, 'held-out ')
+        if measured.another_target:
+            advice.append(Advice(
+                'hold out photographs of the same target: these have landmarks of the same '
+                'numbers in other places, so that nothing of what stays with the target is '
+                'predicted there'))
         if measured.test_moved:
             advice.append(Advice(
                 'look at these held-out photographs: their cameras do not stand as in the '

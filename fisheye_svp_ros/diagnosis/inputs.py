@@ -19,6 +19,7 @@ from fisheye_svp_ros.solve.measured import posable_views
 
 _OUTSIDE = 0.02  # of the points of a camera: more than single gross errors
 _AGAIN = 0.5  # of the image points: no two photographs have so many alike to the last digit
+_ELSEWHERE = 1e-3  # of a target's extent: more than places that are written less exactly
 _MANY, _FEWEST = 1500, 24  # points of a thinned table, and of a view that stays whole
 
 
@@ -57,6 +58,14 @@ def check_other(observations: Observations, other: Observations) -> None:
     if len(seen & again) > _AGAIN * len(again):
         raise ObservationError(f'{other.source}: these image points are those of '
                                f'{observations.source}; other photographs are needed')
+
+
+def another_target(observations: Observations, other: Observations) -> bool:
+    """Whether landmarks of one number stand in different places of two tables."""
+    one, there = observations.landmarks(), other.landmarks()
+    _, mine, theirs = np.intersect1d(one.ids, there.ids, return_indices=True)
+    apart = np.abs(one.points[mine] - there.points[theirs])
+    return bool(apart.max(initial=0.0) > _ELSEWHERE * np.ptp(one.points, axis=0).max())
 
 
 def without_copies(observations: Observations) -> tuple[Observations, tuple[int, ...]]:

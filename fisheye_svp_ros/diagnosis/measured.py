@@ -17,9 +17,11 @@ from fisheye_svp_ros.diagnosis.budget import (
     noise_px,
     stage_of,
 )
+from fisheye_svp_ros.diagnosis.carried import of_target
 from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence
+from fisheye_svp_ros.diagnosis.inputs import another_target
 from fisheye_svp_ros.diagnosis.medium import Medium
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.moments import each_alone, stands_elsewhere, without_rig
@@ -87,8 +89,10 @@ class Measured:
             self.noise *= float(np.sqrt(1 - views.share))
         self.test: Data | None = None
         self.test_gross = NO_GROSS
-        self.test_moved = False
+        self.test_moved = self.another_target = False
         if held_out is not None:
+            observations = found.evidence.linear.data.observations
+            self.another_target = another_target(observations, held_out)
             # Held-out outliers are no measure of a model; the same points are left out for all.
             test = prepare(held_out)
             if without_rig(found.evidence.linear.data):
@@ -110,9 +114,11 @@ class Measured:
                 else honest_errors(evidence))
 
     def _there(self, test: Data, state: State) -> State:
-        """Return the state without what other frames had that the test has not."""
+        """Return the state without what other frames or their target had and the test has not."""
         t, known = (data.observations.t for data in (test, self.evidence.linear.data))
-        return replace(state, terms=tuple(e for e in state.terms if e[0].holds_for(t, known)))
+        return replace(state, terms=tuple(
+            term for term in state.terms
+            if term[0].holds_for(t, known) and not (self.another_target and of_target(term))))
 
     def held_out(self, without: Sequence[str] = (), local: Local | None = None) -> HeldOut:
         """Predict held-out frames without some causes, with or without local offsets."""
@@ -126,6 +132,8 @@ class Measured:
             state = self.found.state
         state = replace(self._there(self.test, state), pose=self.test_pose)
         near = replace(state, rig=self.found.state.rig)
+        if local is not None and self.another_target:
+            local = local.of_image
         return on_other_data(self.test, near, local)
 
     @cached_property

@@ -65,6 +65,11 @@ class Local(NamedTuple):
     grids: tuple[tuple[Grid, Array], ...]
     views: SimilarViews | None = None
 
+    @property
+    def of_image(self) -> Local:
+        """What of them another target has, too."""
+        return self._replace(offset=np.zeros_like(self.offset), views=None)
+
     def applied(self, data: Data) -> Data:
         """Return data with landmarks where they are predicted and the image field taken out.
 

@@ -8,6 +8,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.diagnosis.carried import Carried
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.prediction import HeldOut, Less, gain_between, less_between
 from fisheye_svp_ros.diagnosis.two_sets import Shared, TwoSets, diagnose_against
 from fisheye_svp_ros.diagnosis.wanted import Wanted
@@ -48,6 +49,16 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     assert abs(e0.apart) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
     assert 'holds in both sets' in sections(found)[0].sentence
     assert found.to_dict()['external']['sets']['against'] == 'set 32'
+
+
+def test_nothing_of_the_target_is_predicted_of_another_one():
+    one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.004 * k, frames=14)
+                  for k, seed in ((1, 31), (0, 32)))
+    found = diagnose(one, lens(), free_intrinsics=True, held_out=other)
+    assert {'viewpoint_shift', 'target_shape'} <= {cause.effect for cause in found.causes}
+    assert found.extended.heldout_rms_px < found.named.heldout_rms_px < 0.18
+    assert found.base.heldout_rms_px > 0.2
+    assert 'the same target' in ' '.join(advice.what for advice in found.advice)
 
 
 def test_what_the_other_set_refutes_is_withdrawn():
