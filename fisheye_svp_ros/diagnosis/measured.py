@@ -17,7 +17,6 @@ from fisheye_svp_ros.diagnosis.budget import (
     noise_px,
     stage_of,
 )
-from fisheye_svp_ros.diagnosis.carried import of_target
 from fisheye_svp_ros.diagnosis.causes import Cause, mean_causes
 from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.evidence import Evidence
@@ -117,8 +116,8 @@ class Measured:
         """Return the state without what other frames or their target had and the test has not."""
         t, known = (data.observations.t for data in (test, self.evidence.linear.data))
         return replace(state, terms=tuple(
-            term for term in state.terms
-            if term[0].holds_for(t, known) and not (self.another_target and of_target(term))))
+            term for term in state.terms if term[0].holds_for(t, known)
+            and not (self.another_target and term[0].place == 'target')))
 
     def held_out(self, without: Sequence[str] = (), local: Local | None = None) -> HeldOut:
         """Predict held-out frames without some causes, with or without local offsets."""

@@ -98,6 +98,23 @@ def test_hidden_effect_is_named_and_measured(name, values):
         assert abs(parameter['value'] - true) < 5 * parameter['stderr']
 
 
+@pytest.mark.parametrize('axes', [(0, 1, 2), (1, 2, 0)])
+def test_a_flat_board_is_stretched_in_whatever_plane_it_lies(axes):
+    """Along and across it, and along its diagonals; on a wall z may be one of its directions."""
+    rng = np.random.default_rng(14)
+    pose, views = scene(rng)
+    views = views._replace(points=views.points * [1, 1, 0], board=np.zeros_like(views.board))
+    truth = views.points + views.points[..., [1, 0, 2]] * [0.002, 0.002, 0]
+    seen = observe(lens(), (), pose, views._replace(points=truth), SIGMA, rng)
+    said = views.points[0][seen.landmark][:, axes]
+    found = diagnose(replace(seen, xyz=said), lens())
+    cause, = found.causes
+    assert (found.verdict, cause.effect) == ('explained', 'landmark_scale')
+    stretch, shear = cause.parameters['x_over_y'], cause.parameters['xy_shear']
+    assert shear['value'] == pytest.approx(0.004, abs=4 * shear['stderr'])
+    assert abs(stretch['value']) < 4 * stretch['stderr'] < 0.0008
+
+
 def test_true_poses_reveal_what_free_poses_hide():
     rng = np.random.default_rng(13)
     pose, views = scene(rng)

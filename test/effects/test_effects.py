@@ -90,6 +90,29 @@ def test_lens_file_keeps_effects(name, linearised, tmp_path):
         )
 
 
+@pytest.mark.parametrize('normal', [0, 1, 2])
+def test_a_flat_target_is_stretched_within_its_plane(normal, linearised, tmp_path):
+    model, _, views, _, scene_ = linearised
+    views = views._replace(points=np.where(np.arange(3) == normal, 0.3, views.points))
+    whole, plane = CATALOGUE['landmark_scale'].candidates(replace(scene_, views=views))
+    moved = plane.displacement(replace(scene_, views=views), np.array([0.01, 0.004]))
+    arm = views.points[0] - np.array(plane.centre)
+    stretch = np.linalg.lstsq(arm, moved[0], rcond=None)[0]
+    assert np.abs(stretch[normal]).max() < 1e-12 and np.abs(moved[..., normal]).max() < 1e-12
+    np.testing.assert_allclose(np.linalg.eigvalsh(stretch), np.hypot(0.005, 0.002) * np.array(
+        [-1, 0, 1]), atol=1e-12)
+    assert whole.key == 'landmark_scale(axes=1)' and plane.key == 'landmark_scale(axes=2)'
+    extended = extend_lens(model.lens, [(plane, np.array([0.01, 0.004]))])
+    save_lens(extended, tmp_path / 'lens.yaml')
+    assert load_lens(tmp_path / 'lens.yaml') == extended
+
+
+def test_a_stretch_of_an_older_lens_file_is_read():
+    entry = {'axes': 2, 'centre': [0.0, 0.0, 0.0], 'parameters': {'x_over_y': 0.01}}
+    (effect, values), = load_effects({'landmark_scale': entry}, 'lens.yaml')
+    assert effect.axes == 2 and not effect.plane and values.tolist() == [0.01]
+
+
 @pytest.mark.parametrize('name', sorted(DESIGN_NAMES))
 def test_no_views_are_no_trouble(name, linearised):
     model, pose, views, _, scene_ = linearised
