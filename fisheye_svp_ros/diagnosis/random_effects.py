@@ -222,7 +222,8 @@ def _board_fields(points: GatheredPoints) -> list[BoardField]:
         stretch = np.zeros((len(points.at), 2))
         stretch[mine] = at - at.mean(axis=0)
         fields.append(BoardField('board_stretch', (0, 1), stretch))
-        for name, axes, degree in (('board_in_plane', (0, 1), 1), ('board_normal', (2,), 4)):
+        smooth = ('board_in_plane', (0, 1), 1), ('board_normal', (2,), board.highest_degree)
+        for name, axes, degree in smooth:
             values = np.zeros((len(points.at), len(centres)))
             values[mine] = _outside_powers(bumps, at, degree)
             kept = np.sqrt((values**2).sum(axis=0)) > 0.05

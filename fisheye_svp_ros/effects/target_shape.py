@@ -15,6 +15,8 @@ from fisheye_svp_ros.scene.boards import Board
 # id, centre (3), axis a (3), axis b (3), size: what places a board in the target frame.
 BoardAxes = tuple[float, ...]
 
+_DEGREES = (2, 3, 4, 6)
+
 
 @dataclass(frozen=True)
 class TargetShapeEffect(Effect):
@@ -40,7 +42,8 @@ class TargetShapeEffect(Effect):
         if not boards:
             raise Untestable('no landmarks lie on a flat board that could be bowed')
         every = tuple(_axes(board) for board in boards)
-        forms: list[Effect] = [cls(degree, every) for degree in (2, 3, 4)]
+        highest = min(board.highest_degree for board in boards)
+        forms: list[Effect] = [cls(degree, every) for degree in _DEGREES if degree <= highest]
         if len(every) > 1:
             forms.extend(cls(2, (one,)) for one in every)
         return forms

@@ -8,11 +8,14 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 
+_MANY = 100  # landmarks: four for each coefficient from degree 2 to 6
+
 
 class Board(NamedTuple):
     """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
 
-    size: half the extent along its longer side; flat: four or more landmarks, all in one plane.
+    size: half the extent along its longer side; flat: four or more landmarks, all in one plane;
+    landmarks: how many it has.
     """
 
     id: int
@@ -20,6 +23,12 @@ class Board(NamedTuple):
     axes: Array
     size: float
     flat: bool
+    landmarks: int
+
+    @property
+    def highest_degree(self) -> int:
+        """The highest degree of a polynomial over the board that its landmarks can tell."""
+        return 6 if self.landmarks >= _MANY else 4
 
     def local(self, points: Array) -> Array:
         """Return points (..., 3) in the board's axes, over its size."""
@@ -44,4 +53,4 @@ def _board(label: int, points: Array) -> Board:
     size = float(np.abs(along).max(initial=1e-9))
     off = np.abs(along[:, 2] - along[:, 2].mean()).max(initial=0.0)
     flat = len(distinct) > 3 and bool(off < 1e-6 + 1e-3 * size)
-    return Board(label, centre, axes, size, flat)
+    return Board(label, centre, axes, size, flat, len(distinct))

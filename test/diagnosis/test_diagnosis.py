@@ -24,7 +24,7 @@ from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, views_of
 
 SIGMA = 0.2
 
@@ -113,6 +113,21 @@ def test_a_flat_board_is_stretched_in_whatever_plane_it_lies(axes):
     stretch, shear = cause.parameters['x_over_y'], cause.parameters['xy_shear']
     assert shear['value'] == pytest.approx(0.004, abs=4 * shear['stderr'])
     assert abs(stretch['value']) < 4 * stretch['stderr'] < 0.0008
+
+
+def test_a_finely_warped_board_of_many_landmarks_has_a_name():
+    rng = np.random.default_rng(15)
+    pose, views = scene(rng, frames=12)
+    x, y = (np.ravel(one) for one in np.meshgrid(np.linspace(-1, 1, 13), np.linspace(-1, 1, 10)))
+    said = np.column_stack([0.5 * x, 0.4 * y, 0 * x])
+    truth = said + 0.001 * np.outer(np.cos(6 * np.arccos(x)), [0, 0, 1])
+    views = views_of(truth, np.zeros((12, len(x), 2)))._replace(frame=views.frame)
+    seen = observe(lens(), (), pose, views, SIGMA, rng)
+    found = diagnose(replace(seen, xyz=said[seen.landmark]), lens())
+    assert (found.verdict, *(cause.effect for cause in found.causes)) == (
+        'explained', 'target_shape')
+    assert found.base.heldout_rms_px > 1.15 * found.named.heldout_rms_px
+    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
 
 def test_true_poses_reveal_what_free_poses_hide():
