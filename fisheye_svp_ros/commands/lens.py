@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
-from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
@@ -41,6 +42,9 @@ def run(args: argparse.Namespace) -> None:
             save_rig(foreign.rigs[0], args.output)
         return
     lens = load_lens(path)
+    if several := cameras_in(path):
+        say(f'{path}: it holds {", ".join(several)}; this is the first, {path}#{several[1]} is '
+            'another')
     print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
           ' deg')
     for name, value in lens.parameters.items():

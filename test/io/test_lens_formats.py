@@ -193,6 +193,8 @@ def test_boofcv() -> None:
                       'T_cn_cnm1:\n  - [{}, 0.00216014, 0.00427195,-0.11003785]'),
      'T_cn_cnm1 must be a matrix of 4 x 4'),
     (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
+    (CAMCHAIN + CAMCHAIN[CAMCHAIN.index('cam1'):CAMCHAIN.index('cam2')].replace('cam1', 'cam3', 1),
+     'cam2 has no T_cn_cnm1, and cam3 after it has one'),
     ('{"camera_type": 1}', 'not a whole Basalt'),
     ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
@@ -212,6 +214,28 @@ def test_refused_in_one_line(text: str, said: str, tmp_path: Path) -> None:
         load_lens(path)
     assert '\n' not in str(error.value)
     assert str(path) in str(error.value)
+
+
+def test_cameras_of_a_chain_are_in_the_order_of_their_numbers(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chain = {}
+    for number in range(11):
+        matrix = np.eye(4)
+        matrix[0, 3] = number
+        camera = yaml.safe_load(CAMCHAIN)['cam1']
+        chain[f'cam{number}'] = {**camera, 'T_cn_cnm1': matrix.tolist()}
+    path, out = tmp_path / 'camchain.yaml', tmp_path / 'out.yaml'
+    path.write_text(yaml.safe_dump(chain, sort_keys=True))
+    foreign = read_lens_file(path)
+    assert [*foreign.lenses] == [f'cam{number}' for number in range(11)]
+    assert [rig.position[0] for rig in foreign.rigs] == [*range(1, 11)]
+    assert cli.main(['lens', f'{path}#cam9', '-o', str(out)]) == 0
+    assert capsys.readouterr().err == ''
+    assert cli.main(['lens', str(path), '-o', str(out)]) == 0
+    assert capsys.readouterr().err == (
+        f'fisheye-svp: note: {path}: it holds {", ".join(foreign.lenses)}; this is the first, '
+        f'{path}#cam1 is another\n')
 
 
 def test_curves_that_a_form_cannot_say() -> None:

@@ -24,12 +24,18 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming camera and field."""
     document = parse_yaml(text, where, LensError)
-    cameras = {name: radial.section(document, name, where)
-               for name in map(str, document) if name.startswith('cam')}
-    lenses, rigs, worst = {}, [], {}
-    for name, camera in cameras.items():
+    # YAML libraries write cam10 before cam2.
+    names = sorted((name for name in map(str, document) if name.startswith('cam')),
+                   key=lambda name: (len(name), name))
+    lenses, worst = {}, {}
+    rigs: list[Pose] = []
+    for number, name in enumerate(names):
+        camera = radial.section(document, name, where)
         lenses[name], worst[name] = _lens(name, camera, f'{where}: {name}')
-        if 'T_cn_cnm1' in camera:
+        if number and 'T_cn_cnm1' in camera:
+            if len(rigs) < number - 1:
+                raise LensError(f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
+                                'after it has one; the chain is broken')
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
     return Foreign('kalibr', lenses, tuple(rigs), worst)
 
