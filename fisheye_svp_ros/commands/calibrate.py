@@ -296,7 +296,11 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
 def image_sizes(text: str) -> dict[str, tuple[int, int]]:
     """Return the image size of each camera, or of all under '', of a text such as 1280x800."""
     parts = [part.rpartition('=') for part in text.split(',')]
-    return {camera.strip(): image_size(size) for camera, _, size in parts}
+    sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
+    if len(sizes) < len(parts):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} has two sizes for one camera; left=1280x960,right=640x480 says whose')
+    return sizes
 
 
 def image_size(text: str) -> tuple[int, int]:

@@ -38,9 +38,10 @@ def port_of(args: argparse.Namespace) -> Port | None:
             raise ValueError
     except ValueError as cause:
         raise ParameterError(f'--port {args.port}: it must be of the form {_FORMS}') from cause
-    wrong = port.check()
-    if wrong:
-        raise ParameterError(f'--medium {args.medium or "water"}: {wrong}')
+    for option, given in ((f'--medium {args.medium}', FlatGlass(0.0, index)),
+                          (f'--port {args.port}', port)):
+        if wrong := given.check():
+            raise ParameterError(f'{option}: {wrong}')
     return port
 
 

@@ -268,8 +268,13 @@ class TestCalibrate:
         assert 'pinhole' in refused(capsys, *base[:3], 'pinhole', '--image-size', '9x9')
         for size in ('1280', '1280x', '0x960', '1280x960x3', '-1x5', '12.5x9', 'large'):
             assert 'form 1280x800' in refused(capsys, *base, f'--image-size={size}')
+        assert 'two sizes for one' in refused(capsys, *base, '--image-size', '9x9,9x9')
         assert 'check the image size' in refused(capsys, *base, '--image-size', '640x480')
         sized = (*base, '--image-size', '1280x960')
+        for port in ('flat:-1mm:1.5', 'flat:1mm:9', 'dome:-1mm'):
+            assert f': --port {port}: port: ' in refused(capsys, *sized, '--port', port)
+        assert ': --medium 9: port: medium_index' in refused(
+            capsys, *sized, '--medium', '9', '--port', 'flat:-1mm')
         assert "no parameter 'k1'" in refused(capsys, *sized, '--free', 'f,k1')
         assert 's0 cannot be told' in refused(capsys, *sized, '--free', 'f,s0')
         out = tmp_path / 'lens.yaml'
