@@ -20,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='a lens of the same type: a file, or the name of one that comes with '
                         'the package')
     parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='in place of a lens: its field of view over the width of the image')
+                        help='in place of a lens: its field of view, over the width of the image; '
+                        'corners beyond it are left alone')
     parser.add_argument('--image-size', metavar='WxH', help='with --fov: 1280x800')
     parser.add_argument('--board', required=True, metavar='SPEC',
                         help='the board: chessboard:9x6:25mm, charuco:..., aprilgrid:FILE, ...')

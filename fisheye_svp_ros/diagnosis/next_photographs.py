@@ -103,6 +103,12 @@ class Board:
         half = np.abs(local[:, :2]).max(axis=0)
         return np.asarray(middle + local * [*(1 + spacing / half), 1.0] @ self.facing)
 
+    @property
+    def corners(self) -> Index:
+        """Which of the points are its corners."""
+        x, y, _ = (self.points @ self.facing.T).T
+        return np.array([np.argmin(x + y), np.argmax(x + y), np.argmin(x - y), np.argmax(x - y)])
+
     @classmethod
     def seen_in(cls, observations: Observations, pose: Pose) -> Board:
         """Return the board of a table, its front the side that cameras (S,) saw.
@@ -305,22 +311,37 @@ def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Gener
 
 def _detectable(state: State, board: Board, shots: Shots, field: float) -> Mask:
     """Whether boards are in image and field as a whole, their points far enough apart (P,)."""
-    count, model = len(shots.distance), ForwardModel(state.lens, state.terms)
-    views = blank_views(board.landmark, board.points, count, board=board.board)
-    rim = blank_views(board.landmark, board.rim, count, board=board.board)
-    image, edge = (model.predict(shots.camera, part) for part in (views, rim))
-    size = np.array([state.lens.width, state.lens.height])
-    local, outer = (shots.camera.into_body(part.points) for part in (views, rim))
-    normal = np.swapaxes(shots.camera.rotation, -1, -2) @ board.facing[2]
+    model, found = ForwardModel(state.lens, state.terms), np.ones(len(shots.distance), dtype=bool)
+    size, rim = np.array([state.lens.width, state.lens.height]), board.rim
+    # Most boards do not fit by their corners, for which there is no need to look at all of them.
+    for some in (board.corners, np.arange(len(rim))):
+        left = np.flatnonzero(found)
+        if not left.size:
+            return found
+        camera = shots.camera.take(left)
+        views = blank_views(board.landmark[some], rim[some], left.size, board=board.board[some])
+        edge, outer = model.predict(camera, views), camera.into_body(views.points)
+        seen = outer[..., 2] > np.cos(field) * np.linalg.norm(outer, axis=-1)
+        with np.errstate(invalid='ignore'):
+            inside = ((edge.uv > _EDGE) & (edge.uv < size - _EDGE)).all(axis=-1)
+        found[left] = (edge.valid & seen & inside).all(axis=1)
+    left = np.flatnonzero(found)
+    found[left] = _told_apart(model, board, shots.camera.take(left))
+    return found
+
+
+def _told_apart(model: ForwardModel, board: Board, camera: Pose) -> Mask:
+    """Whether the points of boards are far enough apart in the image, and not too slanted (P,)."""
+    views = blank_views(board.landmark, board.points, len(camera.position), board=board.board)
+    image, local = model.predict(camera, views), camera.into_body(views.points)
+    normal = np.swapaxes(camera.rotation, -1, -2) @ board.facing[2]
     slant = (local @ normal[..., None])[..., 0] / np.linalg.norm(local, axis=-1)
-    seen = outer[..., 2] > np.cos(field) * np.linalg.norm(outer, axis=-1)
+    many = min(_NEIGHBOURS, len(board.points) - 1)
+    near = np.asarray(KDTree(board.points).query(board.points, many + 1)[1])[:, 1:]
     with np.errstate(invalid='ignore'):
-        inside = ((edge.uv > _EDGE) & (edge.uv < size - _EDGE)).all(axis=-1)
-        many = min(_NEIGHBOURS, len(board.points) - 1)
-        near = np.asarray(KDTree(board.points).query(board.points, many + 1)[1])[:, 1:]
         apart = np.linalg.norm(image.uv[:, near] - image.uv[:, :, None], axis=-1)
-        found = (apart > _SPACING).all(axis=(1, 2)) & (slant > _SLANT).all(axis=1)
-        return np.asarray(found & (image.valid & edge.valid & seen & inside).all(axis=1))
+        told = (apart > _SPACING).all(axis=(1, 2)) & (slant > _SLANT).all(axis=1)
+        return np.asarray(told & image.valid.all(axis=1))
 
 
 def _unit(name: str) -> str:

@@ -62,8 +62,11 @@ def plan(
 
 
 def nominal_lens(image_size: tuple[int, int], field: float) -> Lens:
-    """Return an equidistant lens of a type: its field over the width of the image, rad."""
+    """Return an equidistant lens of a type: its field over the width of the image, rad.
+
+    Where its image is a circle, corners beyond that hold nothing.
+    """
     width, height = image_size
     lens = Lens('lens', width, height, width / field, width / field, (width - 1) / 2,
                 (height - 1) / 2, KannalaBrandt(), 1.0)
-    return replace(lens, max_incidence=field_of_view(lens))
+    return replace(lens, max_incidence=min(field / 2, field_of_view(lens)))

@@ -8,6 +8,7 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
@@ -182,6 +183,30 @@ def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
     assert main([*command, '--for', 'e0']) == 2
 
 
+def test_no_planned_view_needs_more_than_the_field_of_view(tmp_path):
+    assert main(['plan', '--fov', '150', '--image-size', '640x480', '--board',
+                 'chessboard:6x4:25mm', '--room', '0.1', '0.6', '--count', '6', '-o',
+                 str(tmp_path)]) == 0
+    camera = read_poses(tmp_path / 'poses.csv').pose
+    points = camera.into_body(np.tile(parse_pattern('chessboard:6x4:25mm').points, (6, 1, 1)))
+    angle = np.arccos(points[..., 2] / np.linalg.norm(points, axis=-1))
+    assert 60 < np.degrees(angle).max() < 75
+
+
+def test_a_board_that_never_fits_is_refused_by_its_corners(monkeypatch, capsys):
+    looked_at, predict = [], ForwardModel.predict
+
+    def counted(model, pose, views):
+        looked_at.append(views.uv[..., 0].size)
+        return predict(model, pose, views)
+
+    monkeypatch.setattr(ForwardModel, 'predict', counted)
+    assert main(['plan', '--lens', 'fish180', '--board', 'chessboard:40x30:100mm', '--room', '0.1',
+                 '0.5']) == 2
+    assert 'does not see the whole board from 0.1 to 0.5 m' in capsys.readouterr().err
+    assert sum(looked_at) < 100_000
+
+
 def test_a_plan_before_the_first_photograph(tmp_path, capsys):
     command = ['plan', '--fov', '170', '--image-size', '640x480', '--board',
                'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '4']
@@ -190,7 +215,6 @@ def test_a_plan_before_the_first_photograph(tmp_path, capsys):
     planned = json.loads((tmp_path / 'plan.json').read_text())
     assert len(planned['photographs']) == 4 and planned['stderr']['e0'] < 0.002
     assert (tmp_path / 'plan.pdf').read_bytes().startswith(b'%PDF')
-    assert len(read_poses(tmp_path / 'poses.csv').frame) == 4
     assert main([*command, '--lens', 'fish180']) == 2
     assert main(['plan', '--lens', 'fish180', '--board', 'chessboard:9x6:25mm', '--room', '1',
                  '0.5']) == 2
