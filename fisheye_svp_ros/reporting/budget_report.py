@@ -20,6 +20,7 @@ _WORDS = {
     'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
     'epipolar': 'epipolar distance', 'depth': 'stereo points',
 }
+_KEPT = {True: 'yes', False: 'no', None: '-'}
 
 
 class Asked(NamedTuple):
@@ -64,7 +65,7 @@ def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
             _WORDS[point.quantity],
             *(f'{factor * value:.3g}' if np.isfinite(value) else '-'
               for value in (point.error, point.noise, *own, point.limit)),
-            unit, 'yes' if point.kept else 'no',
+            unit, _KEPT[point.kept],
             f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
             f'{np.degrees(point.largest_spread):.0f} deg'
             if np.isfinite(point.largest_spread) else 'nowhere',
@@ -77,21 +78,33 @@ def answer(points: Sequence[Point], asked: Asked) -> str:
     where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
              f'{asked.working_range:g} m')
     judged = asked.judged(points)
-    broken = [point for point in judged if not point.kept]
-    if not broken:
+    broken = [point for point in judged if point.kept is False]
+    unknown = [point for point in judged if point.kept is None]
+    if not broken and not unknown:
         return f'Yes: {where} {asked.model} keeps every limit.'
+    untold = ' and '.join(_WORDS[one.quantity] for one in unknown) + ' cannot be computed there'
+    if not broken:
+        return (f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '
+                f'{len(judged)} limits; {untold}.')
     worst = max(broken, key=lambda point: point.error / point.limit)
     unit, factor = _PEOPLE[UNITS[worst.quantity]]
     limit = 'what you allow' if asked.given else 'what noise causes'
-    needed = max(point.nearest_range for point in broken)
+    needed = max(point.nearest_range for point in (*broken, *unknown))
     neglected = 'will do' if asked.port else 'may be neglected'
     remedy = (f'it {neglected} from {needed:.2f} m on' if np.isfinite(needed)
               else 'no range within the budget helps')
     return (
         f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits, worst the '
         f'{_WORDS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
-        f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}.'
+        f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}'
+        + (f'; {untold}.' if unknown else '.')
     )
+
+
+def negligible(points: Sequence[Point]) -> bool | None:
+    """Return whether all limits are kept; None where that cannot be computed."""
+    kept = {point.kept for point in points}
+    return False if False in kept else None if None in kept else True
 
 
 def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str, Any]:
@@ -100,7 +113,7 @@ def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str,
         'lens': asked.lens,
         'spread_rad': asked.spread,
         'range_m': asked.working_range,
-        'negligible': all(point.kept for point in asked.judged(points)),
+        'negligible': negligible(asked.judged(points)),
         'answer': answer(points, asked),
         'at_point': [
             {**point._asdict(), 'unit': UNITS[point.quantity],
@@ -131,7 +144,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
             _draw_limit(axis, budget, point, point.quantity in asked.given)
             axis.plot(asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED,
                       markersize=11)
-            kept = 'kept' if point.kept else 'broken'
+            kept = {True: 'kept', False: 'broken', None: 'not known'}[point.kept]
             axis.set_title(f'{_WORDS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
                            f'{kept}', fontsize=9.5)
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')

@@ -69,6 +69,7 @@ class Budget(NamedTuple):
 class Point(NamedTuple):
     """One quantity where the user works: error and noise there; limit; whether SVP keeps it.
 
+    kept: None where nothing can be solved, as of stereo points that one camera alone sees.
     nearest_range: from which on SVP keeps the limit at this spread, m; largest_spread: the largest
     at which it keeps it at this range, rad; NaN where it does so nowhere.  parameters, misfit:
     what is wrong with the lens as it stands, see `Budget.own`; NaN where unknown.
@@ -78,7 +79,7 @@ class Point(NamedTuple):
     error: float
     noise: float
     limit: float
-    kept: bool
+    kept: bool | None
     nearest_range: float
     largest_spread: float
     parameters: float
@@ -179,7 +180,7 @@ def at_point(
             _value(budget, error, spread, working_range),
             _value(budget, noise, spread, working_range),
             _value(budget, allowed, spread, working_range),
-            bool(here <= 0),
+            None if np.isnan(here) else bool(here <= 0),
             float(np.exp(_kept_from(np.log(budget.ranges), by_range))),
             _largest_kept(budget.spreads, by_spread),
             *(_value(budget, budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan)),

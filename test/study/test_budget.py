@@ -171,6 +171,23 @@ def test_the_command_says_yes_and_no(tmp_path, capsys):
     assert (folder / 'budget.png').read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.parametrize(('limits', 'negligible', 'answer'), [
+    ([], None, 'Not known: {} SVP keeps 3 of 5 limits; epipolar distance and stereo'),
+    (['--max-axis', '1e-9', '--max-depth', '1'], False, 'No: {} SVP breaks 1 of 2 limits, worst'),
+    (['--max-axis', '1'], True, 'Yes: {} SVP keeps every limit.'),
+])
+def test_what_no_camera_pair_sees_breaks_no_limit(limits, negligible, answer, tmp_path, capsys):
+    """Left and right look away from each other, 5 m apart."""
+    assert main(['budget', '--lens', 'fish180', '--style', 'divergent', '--baseline', '5', *limits,
+                 '-o', str(tmp_path)]) == 0
+    said = ' '.join(capsys.readouterr().out.split())
+    where = 'for landmarks within 89 degrees of the axis at 0.5 m'
+    assert answer.format(where) in said and 'nan' not in said
+    written = json.loads((tmp_path / 'budget.json').read_text(encoding='utf-8'))
+    assert written['negligible'] is negligible
+    assert [row['kept'] for row in written['at_point']][-1] is None
+
+
 @pytest.mark.parametrize(('arguments', 'reason'), [
     (['--lens', 'none.yaml'], 'none.yaml: cannot be read'),
     (['--lens', 'fish180', '--style', 'crossed'], "style 'crossed' is unknown"),
