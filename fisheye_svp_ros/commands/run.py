@@ -27,10 +27,10 @@ def run(args: argparse.Namespace) -> None:
     """Spin the node until it ends; exit with its status.  With --help, tell its parameters."""
     with executables.ending_quietly():
         supply_rclpy()
-    first = next(iter(args.arguments), '--ros-args')
-    if first in ('-h', '--help'):
+    if {'-h', '--help'} & set(args.arguments):
         _print_parameters(args.node)
         return
+    first = next(iter(args.arguments), '--ros-args')
     if first != '--ros-args':
         raise ParameterError(f'run {args.node}: {first!r} stands before --ros-args; ROS arguments '
                              f'come after it: fisheye-svp run {args.node} --ros-args ...')

@@ -6,9 +6,11 @@ import argparse
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rich.table import Table
+    from rich.console import RenderableType
 
     from fisheye_svp_ros.nodes.watcher import Watcher
+
+_LEAST = 64  # columns: three numbers, and some of the names, which are broken into lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,19 +34,23 @@ def run(args: argparse.Namespace) -> None:
     try:
         watcher = Watcher()
         with Live(console=console(), refresh_per_second=4) as live:
-            watcher.spin(lambda: live.update(_table(watcher)))
+            watcher.spin(lambda: live.update(_shown(watcher, live.console.width)))
         watcher.destroy_node()
     finally:
         rclpy.try_shutdown()
 
 
-def _table(watcher: Watcher) -> Table:
+def _shown(watcher: Watcher, width: int) -> RenderableType:
     from rich import box
     from rich.table import Table
 
+    if width < _LEAST:
+        return f'a terminal {_LEAST} columns wide is needed; this one has {width}'
     table = Table(box=box.SIMPLE_HEAD)
-    for name in ('node', 'metric', 'latest', 'mean', 'largest'):
-        table.add_column(name, justify='left' if name in ('node', 'metric') else 'right')
+    for name in ('node', 'metric'):
+        table.add_column(name, overflow='fold')
+    for name in ('latest', 'mean', 'largest'):
+        table.add_column(name, justify='right', no_wrap=True)
     for node, results in sorted(watcher.results.items()):
         lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
         table.add_row(node, f'{results.sets} sets{lost}')

@@ -78,10 +78,11 @@ def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
 def test_help_tells_the_parameters_of_a_node(capsys: pytest.CaptureFixture[str]) -> None:
     from fisheye_svp_ros import cli
 
-    assert cli.main(['run', 'stereo_depth', '--help']) == 0
-    told = capsys.readouterr().out
-    for row in executables.parameters('stereo_depth'):
-        assert f'  {row.name} ' in told
+    for words in (['--help'], ['--ros-args', '--help']):
+        assert cli.main(['run', 'stereo_depth', *words]) == 0
+        told = capsys.readouterr().out
+        for row in executables.parameters('stereo_depth'):
+            assert f'  {row.name} ' in told
 
 
 def test_ros_arguments_without_ros_args_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,20 +2,39 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from helpers.nodes import ROOT, TIMEOUT, hears_sigint
+from rich.console import Console
 
 from fisheye_svp_ros import standalone
+from fisheye_svp_ros.commands import watch
 
 if not standalone.is_genuine():
     pytest.importorskip('cyclonedds')
+
+
+@pytest.mark.parametrize(('width', 'shown'), [
+    (24, 'a terminal 64 columns wide is needed; this one has 24'),
+    (64, '-1.23457e-05 -1.23457e-05 1.23457e-05')])
+def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
+    from fisheye_svp_ros.nodes.watcher import Followed, Results
+
+    results = Results(sets=3, lost=1, note='few', metrics={'position_error_x_m': Followed()})
+    results.metrics['position_error_x_m'].add(-1.23456789e-5)
+    watcher = SimpleNamespace(results={'/here/localizer': results})
+    out = Console(width=width, file=io.StringIO(), record=True)
+    out.print(watch._shown(cast('Any', watcher), width))
+    assert shown in ' '.join(out.export_text().split())
 
 
 def test_results_are_shown_with_their_metrics(ros_domain: int, tmp_path: Path) -> None:
@@ -34,19 +53,19 @@ def test_results_are_shown_with_their_metrics(ros_domain: int, tmp_path: Path) -
     try:
         start('run', 'localizer', '--ros-args', '-r', '__ns:=/here', '-p',
               'wait_for_subscribers:=2')
-        watch = start('watch')
+        shown = start('watch')
         camera = start(
             'run', 'synthetic_camera', '--ros-args', '-r', '__ns:=/here', '-p',
             f'sweep.environment:=[whole, {few}]', '-p', 'wait_for_subscribers:=1', '-p',
             'repeat:=false', '-p', 'lock_step:=localizer/result')
         assert camera.wait(TIMEOUT) == 0
         time.sleep(0.5)
-        watch.send_signal(signal.SIGINT)
-        text, _ = watch.communicate(timeout=TIMEOUT)
+        shown.send_signal(signal.SIGINT)
+        text, _ = shown.communicate(timeout=TIMEOUT)
     finally:
         for process in processes:
             process.kill()
             process.wait()
-    assert watch.returncode == 0, text
+    assert shown.returncode == 0, text
     assert '/here/localizer' in text and '2 sets, 1 not solved' in text
     assert 'position_error_m' in text
