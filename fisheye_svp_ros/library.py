@@ -364,9 +364,8 @@ def diagnose(
     from fisheye_svp_ros.diagnosis.inputs import posable
 
     known = load_lens(lens)
-    table, test = (None if one is None else posable(_table(one), known)[0]
-                   for one in (observations, held_out))
-    assert table is not None
+    table, _ = posable(_table(observations), known)
+    test = None if held_out is None else posable(_table(held_out), known)[0]
     found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test)
     return Diagnosed(found.verdict, found.to_dict(), found.lens)
 

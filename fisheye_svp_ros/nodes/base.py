@@ -305,7 +305,7 @@ class BaseNode(Node):  # type: ignore[misc]
 
 def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
     """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
-    signal.signal(signal.SIGINT, _interrupting_once())
+    signal.signal(signal.SIGINT, _interrupting_without_echo())
     try:
         try:
             rclpy.init(args=args)
@@ -316,7 +316,7 @@ def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
         return 0
 
 
-def _interrupting_once() -> Callable[..., None]:
+def _interrupting_without_echo() -> Callable[..., None]:
     """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
 
     The second one would end what the first one has begun to put away.  A later one counts again:

@@ -8,7 +8,7 @@ from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -52,7 +52,7 @@ def _lens(
 
 def _rigs(entries: list[dict[str, float]], where: str) -> tuple[Pose, ...]:
     table = [[float(entry[name]) for name in _NAMES] for entry in entries]
-    places = [radial.pose(row[:3], row[3:], f'{where}: T_imu_cam') for row in table]
+    places = [fields.pose(row[:3], row[3:], f'{where}: T_imu_cam') for row in table]
     return tuple(later.inverse().compose(earlier)
                  for earlier, later in itertools.pairwise(places))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -30,7 +30,7 @@ def read(text: str, where: str) -> Foreign:
     lenses, worst = {}, {}
     rigs: list[Pose] = []
     for number, name in enumerate(names):
-        camera = radial.section(document, name, where)
+        camera = fields.section(document, name, where)
         lenses[name], worst[name] = _lens(name, camera, f'{where}: {name}')
         if number and 'T_cn_cnm1' in camera:
             if len(rigs) < number - 1:
@@ -44,12 +44,12 @@ def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float
     model, distortion = str(camera.get('camera_model')), camera.get('distortion_model', 'none')
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
-    *own, fx, fy, cx, cy = radial.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
-    size, pinhole = radial.numbers(camera, 'resolution', 2, where), (fx, fy, cx, cy)
+    *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
+    size, pinhole = fields.numbers(camera, 'resolution', 2, where), (fx, fy, cx, cy)
     if model == 'pinhole' and distortion == 'equidistant':
-        k = radial.numbers(camera, 'distortion_coeffs', 4, where)
+        k = fields.numbers(camera, 'distortion_coeffs', 4, where)
         return radial.kannala_brandt(name, size, pinhole, k, where), 0.0
-    k = [] if distortion == 'none' else radial.numbers(camera, 'distortion_coeffs', 4, where)
+    k = [] if distortion == 'none' else fields.numbers(camera, 'distortion_coeffs', 4, where)
     if distortion not in ('none', 'radtan') or (k and model in ('ds', 'eucm') and any(k)):
         raise LensError(f'{where}: {model} with {distortion} is not a form that can be read')
     if model == 'ds':
@@ -69,7 +69,7 @@ def _rig(rows: Any, where: str) -> Pose:
         matrix = np.array(rows, dtype=float).reshape(4, 4)
     except (TypeError, ValueError) as cause:
         raise LensError(f'{where}: T_cn_cnm1 must be a matrix of 4 x 4') from cause
-    return radial.pose(matrix[:3, 3], matrix[:3, :3], f'{where}: T_cn_cnm1')
+    return fields.pose(matrix[:3, 3], matrix[:3, :3], f'{where}: T_cn_cnm1')
 
 
 def write(lens: Lens) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json, parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -49,9 +49,9 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: it has none of {", ".join(names)}')
 
     if any(name in document for name in _SIZE):
-        size = radial.numbers({'size': value(_SIZE)}, 'size', 2, where)
+        size = fields.numbers({'size': value(_SIZE)}, 'size', 2, where)
     else:
-        size = radial.numbers({'size': [value(_WIDTH), value(_HEIGHT)]}, 'size', 2, where)
+        size = fields.numbers({'size': [value(_WIDTH), value(_HEIGHT)]}, 'size', 2, where)
 
     def lens(name: str, matrix: tuple[str, ...], coefficients: tuple[str, ...]) -> Lens:
         k = _matrix(value(matrix), ((3, 3),), where)
@@ -65,7 +65,7 @@ def read(text: str, where: str) -> Foreign:
     if 'R' in document or 'T' in document:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
         place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
-        rigs = (radial.pose(place, turn, f'{where}: R, T'),)
+        rigs = (fields.pose(place, turn, f'{where}: R, T'),)
     return Foreign('opencv', pair, rigs, {})
 
 
@@ -74,7 +74,7 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
     if not isinstance(value, dict) or (value.get('rows'), value.get('cols')) not in shapes:
         raise LensError(f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
                         'needed (of a rig R, 3 x 3, and T, 3 x 1)')
-    return radial.numbers(value, 'data', int(np.prod(shapes[0])), where)
+    return fields.numbers(value, 'data', int(np.prod(shapes[0])), where)
 
 
 def _from_xml(text: str, where: str) -> dict[str, Any]:
@@ -82,7 +82,7 @@ def _from_xml(text: str, where: str) -> dict[str, Any]:
     return {
         one.tag: {part.tag: _from_words(part.text, part.tag == 'data') for part in one}
         if one.get('type_id') == 'opencv-matrix' else _from_words(one.text, False)
-        for one in radial.xml(text, where, 'OpenCV file')
+        for one in fields.xml(text, where, 'OpenCV file')
     }
 
 

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML
+from fisheye_svp_ros.io.lens_formats.fields import LARGEST
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
-from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
 
 Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
 
 _GRID = 600
-_LARGEST = 1e12  # any number of a lens
-_SLACK = 1e-3  # of the elements of a rotation
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 
 
@@ -39,7 +33,7 @@ def kannala_brandt(
         curve = KannalaBrandt(*map(float, k))
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
-    if not all(abs(value) < _LARGEST for value in curve.coefficients):
+    if not all(abs(value) < LARGEST for value in curve.coefficients):
         raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no lens has these')
     if not (width.is_integer() and height.is_integer()):
         raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
@@ -121,52 +115,6 @@ def nearest(lens: Lens) -> Lens:
 def coefficients(lens: Lens) -> list[float]:
     """Return k1 to k4 of a Kannala-Brandt lens."""
     return list(lens.image_height.coefficients)
-
-
-def section(mapping: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
-    """Return a mapping in a mapping; raise LensError naming the field."""
-    found = mapping.get(name)
-    if not isinstance(found, dict):
-        raise LensError(f'{where}: {name} is {found!r}; a mapping is needed')
-    return found
-
-
-def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
-    """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
-    values = mapping.get(name)
-    if not isinstance(values, list) or len(values) != count or not all(
-        isinstance(value, int | float) and abs(value) < _LARGEST for value in values
-    ):
-        raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
-    return [float(value) for value in values]
-
-
-def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
-    """Return the pose of a place, m, and a quaternion x, y, z, w or a matrix (3, 3).
-
-    Raises LensError where these are no numbers, or the turn is none.
-    """
-    place, given = np.array(place), np.array(turn)
-    length = np.linalg.norm(given)
-    if np.isfinite([*place, length]).all() and length > 0.5:
-        if given.ndim == 1:
-            return Pose(rotation_from_quaternion(given), place)
-        rotation = nearest_rotation(given)
-        if np.allclose(rotation, given, atol=_SLACK):
-            return Pose(rotation, place)
-    raise LensError(f'{where}: a translation and a quaternion of unit length or a rotation matrix '
-                    'are needed')
-
-
-def xml(text: str, where: str, form: str) -> ElementTree.Element:
-    """Return the root of an XML text; raise LensError for one that is no whole file of a form."""
-    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
-        raise LensError(f'{where}: not a whole {form} (document types are not read, nor more than '
-                        f'{LARGEST_YAML >> 20} MB)')
-    try:
-        return ElementTree.fromstring(text.lstrip().encode())
-    except (ElementTree.ParseError, ValueError, LookupError) as cause:
-        raise LensError(f'{where}: not a whole {form} ({cause})') from cause
 
 
 def unified(alpha: float, beta: float) -> tuple[Curve, float]:

@@ -6,7 +6,7 @@ import re
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields
 
 _FIRST_IN_SECOND = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
 
@@ -20,8 +20,8 @@ def read(text: str, where: str) -> Foreign:
     """Read position, m, and quaternion x, y, z, w; raises LensError, naming the field."""
     document = parse_yaml(text, where, LensError)
     name = next((name for name in map(str, document) if '_in_' in name), 'left_in_right')
-    entry = radial.section(document, name, where)
+    entry = fields.section(document, name, where)
     where = f'{where}: {name}'
-    place = radial.numbers(entry, 'position', 3, where)
-    turn = radial.numbers(entry, 'quaternion', 4, where)
-    return Foreign('rig', {}, (radial.pose(place, turn, where),), {})
+    place = fields.numbers(entry, 'position', 3, where)
+    turn = fields.numbers(entry, 'quaternion', 4, where)
+    return Foreign('rig', {}, (fields.pose(place, turn, where),), {})

@@ -15,7 +15,7 @@ from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
@@ -36,12 +36,12 @@ def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
     document = parse_yaml(text, where, LensError)
     try:
-        k = radial.numbers(document['camera_matrix'], 'data', 9, where)
+        k = fields.numbers(document['camera_matrix'], 'data', 9, where)
         size = document['image_width'], document['image_height']
         name = str(document.get('camera_name', 'camera'))
         model = str(document['distortion_model'])
         d = document['distortion_coefficients']['data']
-        d = radial.numbers({'data': d}, 'data', len(d), where)
+        d = fields.numbers({'data': d}, 'data', len(d), where)
     except (KeyError, TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     lens, worst = lens_of(model, size, (k[0], k[4], k[2], k[5]), tuple(d), name, where)

@@ -15,7 +15,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, fields
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
 _Joint = tuple[str, str, Pose]  # parent, child, child in parent
@@ -60,7 +60,7 @@ def _rooted(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:
 
 
 def _urdf(text: str, where: str) -> Iterator[_Joint]:
-    for joint in radial.xml(text, where, 'URDF').iter('joint'):
+    for joint in fields.xml(text, where, 'URDF').iter('joint'):
         ends = joint.find('parent'), joint.find('child')
         if joint.get('type') == 'fixed' and ends[0] is not None and ends[1] is not None:
             origin = joint.find('origin')
@@ -75,7 +75,7 @@ def _numbers(text: str, where: str) -> Array:
     words: list[Any] = text.split()
     with suppress(ValueError):
         words = [float(word) for word in words]
-    return np.array(radial.numbers({'origin': words}, 'origin', 3, where))
+    return np.array(fields.numbers({'origin': words}, 'origin', 3, where))
 
 
 def _turned(angles: Array) -> Array:
@@ -97,4 +97,4 @@ def _messages(text: str, where: str) -> Iterator[_Joint]:
                 ends = str(entry['header']['frame_id']), str(entry['child_frame_id'])
             except (KeyError, TypeError, ValueError) as cause:
                 raise LensError(f'{where}: not a whole transform ({cause!r})') from cause
-            yield (*ends, radial.pose(place, turn, f'{where}: {ends[1]}'))
+            yield (*ends, fields.pose(place, turn, f'{where}: {ends[1]}'))

@@ -1,0 +1,63 @@
+"""Parts of other tools' files: sections, numbers, poses, XML, with errors that name the field."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.documents import LARGEST_YAML
+from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
+
+LARGEST = 1e12  # any number of a lens
+_SLACK = 1e-3  # of the elements of a rotation
+
+
+def section(mapping: Mapping[str, Any], name: str, where: str) -> Mapping[str, Any]:
+    """Return a mapping in a mapping; raise LensError naming the field."""
+    found = mapping.get(name)
+    if not isinstance(found, dict):
+        raise LensError(f'{where}: {name} is {found!r}; a mapping is needed')
+    return found
+
+
+def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
+    """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
+    values = mapping.get(name)
+    if not isinstance(values, list) or len(values) != count or not all(
+        isinstance(value, int | float) and abs(value) < LARGEST for value in values
+    ):
+        raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
+    return [float(value) for value in values]
+
+
+def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:
+    """Return the pose of a place, m, and a quaternion x, y, z, w or a matrix (3, 3).
+
+    Raises LensError where these are no numbers, or the turn is none.
+    """
+    place, given = np.array(place), np.array(turn)
+    length = np.linalg.norm(given)
+    if np.isfinite([*place, length]).all() and length > 0.5:
+        if given.ndim == 1:
+            return Pose(rotation_from_quaternion(given), place)
+        rotation = nearest_rotation(given)
+        if np.allclose(rotation, given, atol=_SLACK):
+            return Pose(rotation, place)
+    raise LensError(f'{where}: a translation and a quaternion of unit length or a rotation matrix '
+                    'are needed')
+
+
+def xml(text: str, where: str, form: str) -> ElementTree.Element:
+    """Return the root of an XML text; raise LensError for one that is no whole file of a form."""
+    if '<!' in text.replace('<!--', '') or len(text) > LARGEST_YAML:
+        raise LensError(f'{where}: not a whole {form} (document types are not read, nor more than '
+                        f'{LARGEST_YAML >> 20} MB)')
+    try:
+        return ElementTree.fromstring(text.lstrip().encode())
+    except (ElementTree.ParseError, ValueError, LookupError) as cause:
+        raise LensError(f'{where}: not a whole {form} ({cause})') from cause
