@@ -49,13 +49,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.share import lens_path
-    from fisheye_svp_ros.reporting.budget_report import (
-        Asked,
-        answer,
-        document,
-        draw,
-        rows,
-    )
+    from fisheye_svp_ros.reporting.budget_report import Asked, answer, document, draw, rows
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.scene.rigs import rig

@@ -16,12 +16,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals
 from fisheye_svp_ros.detect.patterns import Pattern
-from fisheye_svp_ros.detect.photographs import (
-    Photograph,
-    Pixels,
-    caught_stderr,
-    exif_turned,
-)
+from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError

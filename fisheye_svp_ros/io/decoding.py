@@ -14,14 +14,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.clouds import (
-    IMAGE_POINTS,
-    LANDMARKS,
-    LARGEST,
-    RESIDUALS,
-    Points,
-    unpack,
-)
+from fisheye_svp_ros.io.clouds import IMAGE_POINTS, LANDMARKS, LARGEST, RESIDUALS, Points, unpack
 from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
 from fisheye_svp_ros.scene.landmarks import Landmarks
 

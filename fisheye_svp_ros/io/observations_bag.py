@@ -10,12 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
-from fisheye_svp_ros.io.decoding import (
-    ImagePoints,
-    read_image_points,
-    read_landmarks,
-    stamp_of,
-)
+from fisheye_svp_ros.io.decoding import ImagePoints, read_image_points, read_landmarks, stamp_of
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 

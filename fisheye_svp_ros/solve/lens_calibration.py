@@ -25,12 +25,7 @@ from fisheye_svp_ros.optics.ports import Port
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.lens_adjustment import (
-    Adjusted,
-    adjust,
-    adjust_batch,
-    parameter_values,
-)
+from fisheye_svp_ros.solve.lens_adjustment import Adjusted, adjust, adjust_batch, parameter_values
 from fisheye_svp_ros.solve.lens_start import focal_candidates, thinned
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import posable_views, rms_px, sigma_known

@@ -17,11 +17,7 @@ from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
-from fisheye_svp_ros.solve.stereo_depth import (
-    epipolar_offset,
-    triangulate,
-    triangulate_optimally,
-)
+from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
 from fisheye_svp_ros.study.metrics import (
     Metrics,
     localization_metrics,

@@ -8,13 +8,7 @@ import numpy as np
 from numba import config, njit, types
 
 from fisheye_svp_ros.optics.engines import cache
-from fisheye_svp_ros.optics.engines.adjustment import (
-    copy,
-    minimise,
-    normal_of,
-    pose_of,
-    workspace,
-)
+from fisheye_svp_ros.optics.engines.adjustment import copy, minimise, normal_of, pose_of, workspace
 from fisheye_svp_ros.optics.engines.kernels import (
     BARE,
     BEHIND,
