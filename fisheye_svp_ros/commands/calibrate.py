@@ -14,22 +14,28 @@ from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, note_le
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
+    image_sizes,
     measured,
     sizes_beside,
 )
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.progress import progress, stages
+from fisheye_svp_ros.reporting.tables import UNITS, interval, noise_text, print_table, with_error
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
+from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
+from fisheye_svp_ros.solve.measured import rms_px, sigma_known
+from fisheye_svp_ros.study.solutions import calibrated
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.calibration import Trust
-    from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 
@@ -103,8 +109,6 @@ def _calibrated(
 ) -> tuple[Calibration, Observations, Trust]:
     """Return the lens, the rows that it is of, without gross errors, and what may be trusted."""
     from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
-    from fisheye_svp_ros.reporting.progress import progress, stages
-    from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
 
     port = port_of(args)
     note_huge(table)
@@ -118,8 +122,12 @@ def _calibrated(
     with progress('calibrating'):
         result, kept, gross = calibrated_without_gross_errors(table, fitted)
     note_gross_errors(table, gross)
-    with stages('how far it may be trusted'):
-        return result, kept, trust(kept, result.adjusted.lens, result.adjusted.names)
+    try:
+        with stages('how far it may be trusted'):
+            return result, kept, trust(kept, result.adjusted.lens, result.adjusted.names)
+    except np.linalg.LinAlgError as cause:
+        raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
+                            f'({cause}); is what the camera looked through another?') from cause
 
 
 def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:
@@ -144,10 +152,6 @@ def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> Non
 
 def _report_image(result: Calibration) -> None:
     """Say where the image of the lens lies askew, or was not covered."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import say
-
     lens, views = result.adjusted.lens, result.views
     off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
     if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:
@@ -174,8 +178,6 @@ def _rig(
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
     from fisheye_svp_ros.diagnosis.moments import FEWEST, LOOSE
-    from fisheye_svp_ros.solve.measured import rms_px, sigma_known
-    from fisheye_svp_ros.study.solutions import calibrated
 
     left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
     try:
@@ -241,14 +243,6 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
 
 
 def _print(result: Calibration, trust: Trust) -> None:
-    from fisheye_svp_ros.reporting.tables import (
-        UNITS,
-        interval,
-        noise_text,
-        print_table,
-        with_error,
-    )
-
     lens = result.adjusted.lens
     figures = lens.calibration or {}
     errors, ranges = dict(trust.stderr), dict(trust.admissible)
@@ -276,8 +270,6 @@ def _print(result: Calibration, trust: Trust) -> None:
 
 def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
     """Return what scripts may want beside the lens itself."""
-    from fisheye_svp_ros.solve.lens_adjustment import parameter_values
-
     adjusted = result.adjusted
     return {
         **(adjusted.lens.calibration or {}),
@@ -291,24 +283,6 @@ def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
         'stderr': trust.stderr,
         'admissible': {name: asdict(range_) for name, range_ in trust.admissible.items()},
     }
-
-
-def image_sizes(text: str) -> dict[str, tuple[int, int]]:
-    """Return the image size of each camera, or of all under '', of a text such as 1280x800."""
-    parts = [part.rpartition('=') for part in text.split(',')]
-    sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
-    if len(sizes) < len(parts):
-        raise argparse.ArgumentTypeError(
-            f'{text!r} has two sizes for one camera; left=1280x960,right=640x480 says whose')
-    return sizes
-
-
-def image_size(text: str) -> tuple[int, int]:
-    """Return width and height, px, of a text such as 1280x800."""
-    width, _, height = text.lower().partition('x')
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f'{text!r} is not of the form 1280x800')
-    return int(width), int(height)
 
 
 def _names(text: str) -> tuple[str, ...]:

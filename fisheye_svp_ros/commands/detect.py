@@ -15,8 +15,6 @@ from fisheye_svp_ros.io.readers import write_observations
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
 
-_SHOWN = 12
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""

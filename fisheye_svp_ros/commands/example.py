@@ -5,6 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+import numpy as np
+
+from fisheye_svp_ros.commands.render import bowed, write_photographs
+from fisheye_svp_ros.io.files import together, write_text
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.simulate.render import Exposure, Print
+from fisheye_svp_ros.simulate.targets import board, board_views
+
 _README = """# Thirty photographs of a bent board
 
 Rendered, with noise, through a fisheye lens whose viewpoint moves (e0 = 4 mm), of a chessboard
@@ -28,16 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render the photographs, write the truth and a README."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.render import bowed, write_photographs
-    from fisheye_svp_ros.io.files import together, write_text
-    from fisheye_svp_ros.io.lens_files import save_lens
-    from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
-    from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.simulate.render import Exposure, Print
-    from fisheye_svp_ros.simulate.targets import board, board_views
-
     lens = Lens('example', 848, 800, 285.0, 285.3, 424.7, 398.2,
                 KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
     printed = Print(9, 6, 0.025)

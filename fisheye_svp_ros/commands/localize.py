@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,9 +15,9 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.readers import write_poses
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.solve.measured import MeasuredPoses
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.tables import noise_text, print_table
+from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured, rms_px
 
 _SHOWN = 40  # frames in the table for people
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
@@ -39,9 +38,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.solve.measured import localize_measured
-
     given = load_lenses(args.lens)
     observations, sizes = read(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
@@ -67,9 +63,6 @@ def run(args: argparse.Namespace) -> None:
 
 
 def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> None:
-    from fisheye_svp_ros.reporting.tables import noise_text, print_table
-    from fisheye_svp_ros.solve.measured import rms_px
-
     views, result = measured.views, measured.result
     worst = [
         np.sqrt(np.linalg.eigvalsh(result.covariance[:, part, part])[:, -1])
@@ -105,8 +98,6 @@ def _parts_text(uncertainty: _Parts) -> str:
 def _write(
     folder: Path, model: ForwardModel, measured: MeasuredPoses, uncertainty: _Parts | None
 ) -> None:
-    from fisheye_svp_ros.solve.measured import rms_px
-
     views, result = measured.views, measured.result
     write_poses(folder / 'poses.csv', views.frame, result.pose)
     used = views.used

@@ -78,6 +78,24 @@ def sizes_beside(path: Path) -> Sizes:
     return sizes
 
 
+def image_sizes(text: str) -> Sizes:
+    """Return the image size of each camera, or of all under '', of a text such as 1280x800."""
+    parts = [part.rpartition('=') for part in text.split(',')]
+    sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
+    if len(sizes) < len(parts):
+        raise argparse.ArgumentTypeError(
+            f'{text!r} has two sizes for one camera; left=1280x960,right=640x480 says whose')
+    return sizes
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Return width and height, px, of a text such as 1280x800."""
+    width, _, height = text.lower().partition('x')
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f'{text!r} is not of the form 1280x800')
+    return int(width), int(height)
+
+
 def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
     """Raise LensError where images are of another size than their lens.
 

@@ -7,11 +7,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from fisheye_svp_ros.commands.photographs import image_size
+from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.readers import write_poses
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.lens import Lens
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.next_photographs import Room
-    from fisheye_svp_ros.optics.lens import Lens
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,13 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
-    import numpy as np
-
-    from fisheye_svp_ros.detect.patterns import parse_pattern
     from fisheye_svp_ros.diagnosis.plan import plan
-    from fisheye_svp_ros.effects.forward import ForwardModel
-    from fisheye_svp_ros.io.files import together, write_json
-    from fisheye_svp_ros.io.readers import write_poses
     from fisheye_svp_ros.reporting import shot_list
     from fisheye_svp_ros.reporting.tables import UNITS, print_table
 
@@ -83,12 +86,7 @@ def room_of(given: Sequence[float]) -> Room:
 
 
 def _lens(args: argparse.Namespace) -> Lens:
-    import numpy as np
-
-    from fisheye_svp_ros.commands.calibrate import image_size
     from fisheye_svp_ros.diagnosis.plan import nominal_lens
-    from fisheye_svp_ros.io.lens_files import load_lens
-    from fisheye_svp_ros.io.share import lens_path
 
     if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
         raise ParameterError('which lens is it? Give --lens LENS, or --fov and --image-size')

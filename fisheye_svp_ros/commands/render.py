@@ -4,15 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import ParameterError
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.arrays import Array
-    from fisheye_svp_ros.optics.lens import Lens
-    from fisheye_svp_ros.pose import Pose
-    from fisheye_svp_ros.simulate.render import Exposure, Field, Placed
+from fisheye_svp_ros.io.files import together, write_bytes
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.simulate.render import Exposure, Field, Placed, Print, render
+from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,17 +54,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render the photographs, write them and the truth."""
-    import numpy as np
-
-    from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.detect.patterns import parse_pattern
-    from fisheye_svp_ros.io.files import together
-    from fisheye_svp_ros.io.lens_files import load_lens
-    from fisheye_svp_ros.io.readers import read_poses
-    from fisheye_svp_ros.io.share import lens_path
-    from fisheye_svp_ros.simulate.render import Exposure, Print
-    from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views
-
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
         raise ParameterError(f'--board {args.board}: chessboards alone can be rendered')
@@ -88,8 +86,6 @@ def run(args: argparse.Namespace) -> None:
 
 def bowed(corners: Array, height: float) -> Field:
     """Return a board's height, m: a parabola across its longer side, `height` from end to top."""
-    import numpy as np
-
     low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
     longer = int(np.argmax(high - low))
     middle, half = (low + high)[longer] / 2, (high - low)[longer] / 2
@@ -101,16 +97,6 @@ def write_photographs(
     folder: Path, truth: Path,
 ) -> None:
     """Write a photograph a pose (P,); the true corners, observations.csv, poses.csv to `truth`."""
-    import cv2
-    import numpy as np
-
-    from fisheye_svp_ros.io.files import write_bytes
-    from fisheye_svp_ros.io.readers import write_observations, write_poses
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.scene.observations import make_observations
-    from fisheye_svp_ros.simulate.render import render
-    from fisheye_svp_ros.simulate.targets import visible
-
     count = len(poses.position)
     uv: list[Array] = []
     seen: list[Array] = []

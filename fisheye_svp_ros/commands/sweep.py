@@ -5,16 +5,20 @@ from __future__ import annotations
 import argparse
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.commands.executors import dask, local
 from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
+from fisheye_svp_ros.io.columns import Parts, as_numbers, read_columns
+from fisheye_svp_ros.io.documents import read_json
 from fisheye_svp_ros.io.files import read_text, together, write_json, write_text, written
 from fisheye_svp_ros.io.share import sweep_path
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.io.columns import Parts
-    from fisheye_svp_ros.study.sweep import Plan
+from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.tables import print_table
+from fisheye_svp_ros.study.metrics import summarise
+from fisheye_svp_ros.study.sweep import Plan, column_types, fingerprint, solve_sweep, tasks, work
 
 _LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
@@ -41,10 +45,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Solve what is not solved yet; join the parts."""
-    from fisheye_svp_ros.commands.sweep_file import read_sweep
-    from fisheye_svp_ros.io.columns import Parts
-    from fisheye_svp_ros.study.sweep import column_types, fingerprint, tasks, work
-
     path = sweep_path(str(args.file))
     plan = read_sweep(path)
     if len(plan.sweep) > _LARGE and not args.large:
@@ -70,8 +70,6 @@ def run(args: argparse.Namespace) -> None:
 
 def _finished(folder: Path, mine: str) -> bool:
     """Say whether a folder holds the whole table of a sweep."""
-    from fisheye_svp_ros.io.documents import read_json
-
     summary = folder / _SUMMARY
     return summary.exists() and read_json(summary, OutputError).get('fingerprint') == mine
 
@@ -81,8 +79,6 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 
     Return the engine for all of the sweep: the one that it was begun with.
     """
-    from fisheye_svp_ros.optics import engines
-
     mark = parts.folder / _MARK
     if not mark.exists():
         engine = engines.settle(points)
@@ -99,10 +95,6 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
 
 
 def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> None:
-    from fisheye_svp_ros.commands.executors import dask, local
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.study.sweep import solve_sweep, tasks
-
     done = parts.numbers()
     remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
     count = sum(map(len, remaining))
@@ -119,11 +111,6 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
 
 def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     """Print and write what came out, metric by metric."""
-    from fisheye_svp_ros.io.columns import as_numbers, read_columns
-    from fisheye_svp_ros.reporting.tables import print_table
-    from fisheye_svp_ros.study.metrics import summarise
-    from fisheye_svp_ros.study.sweep import column_types
-
     table = read_columns(written(folder / 'sweep.csv'))
     metrics = [name for name, kind in column_types(plan).items()
                if kind is float and '.' in name]

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from fisheye_svp_ros.io.files import together
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.io.recording import Columns
+from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.errors import BagError
+from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.columns import write_columns
+from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.recording import STAMP, Columns, is_tabulated, tabulate
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.tables import console, print_table
 
 Cells = dict[str, list[str]]  # by column
 _SHOWN = 40  # rows for people
@@ -26,12 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Join the error topics by stamp, print what varies, write all of it."""
-    from fisheye_svp_ros.commands.notes import note_formats, say
-    from fisheye_svp_ros.errors import BagError
-    from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording import STAMP, is_tabulated, tabulate
-    from fisheye_svp_ros.reporting.progress import progress
-
     bag = Bag(args.bag)
     with progress('reading', bag.size) as passed:
         columns = tabulate(bag.records(is_tabulated, passed))
@@ -43,9 +41,6 @@ def run(args: argparse.Namespace) -> None:
                        '`fisheye-svp record` or `ros2 bag record`')
     _print(args.bag, columns)
     if args.output:
-        from fisheye_svp_ros.io.columns import write_columns
-        from fisheye_svp_ros.io.files import write_json
-
         with together():
             write_columns(args.output / 'table', columns)
             write_json(args.output / 'table.json', {
@@ -57,9 +52,6 @@ def run(args: argparse.Namespace) -> None:
 
 def _print(bag: str, columns: Columns) -> None:
     """Print the columns that differ from row to row; the others once, above the table."""
-    from fisheye_svp_ros.io.recording import STAMP
-    from fisheye_svp_ros.reporting.tables import print_table
-
     varying = [name for name, cells in columns.items() if len(set(cells)) > 1] or list(columns)
     for name in columns:
         if name not in varying:
@@ -79,8 +71,6 @@ def _print(bag: str, columns: Columns) -> None:
 
 def _blocks(tags: Cells, metrics: Cells) -> Iterator[Cells]:
     """Yield the tags and as many of the metrics as a line has room for, until all are told."""
-    from fisheye_svp_ros.reporting.tables import console
-
     def wide(columns: Cells) -> int:
         return sum(3 + max(map(len, (name, *cells))) for name, cells in columns.items())
 

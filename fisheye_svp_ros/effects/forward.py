@@ -88,7 +88,7 @@ class ForwardModel:
     def project(self, points: Array) -> Image:
         """Project points (..., 3), m, in the camera frame."""
         shape, flat = points.shape[:-1], points.reshape(1, -1, 3)
-        uv, valid = self.predict(identity(1), views_of(flat, np.zeros((1, flat.shape[1], 2))))
+        uv, valid = self.predict(identity(1), views_of(flat))
         return Image(uv.reshape(*shape, 2), valid.reshape(shape))
 
     def predict(self, pose: Pose, views: Views, limited: bool = True) -> Image:

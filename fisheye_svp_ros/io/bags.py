@@ -187,13 +187,10 @@ class Bag:
         Raises BagError where nothing can be read.
         """
         listed = [listed_topics(file) for file in self._files()]
-        if all(topics for topics in listed):
+        if all(listed):
             return set().union(*listed)
-
-        def ignore(_: object) -> None:
-            pass
-
-        return {(message.topic, message.typename) for message in self._raw(ignore, ignore)}
+        every = self._raw(lambda _: None, lambda _: None)
+        return {(message.topic, message.typename) for message in every}
 
     def _files(self) -> list[Path]:
         """Return the files of the recording, by the numbers in their names."""

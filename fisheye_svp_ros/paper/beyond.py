@@ -87,7 +87,7 @@ def calibrated_shift(lens: Lens) -> Lens:
         np.stack([landmarks_at('whole', radius) for radius in RADII]),
         len(poses[0].position), axis=0,
     )
-    exact = ForwardModel(lens).predict(right, views_of(points, np.zeros((*points.shape[:2], 2))))
+    exact = ForwardModel(lens).predict(right, views_of(points))
     noise = CALIBRATION_NOISE * np.random.default_rng(0).standard_normal(exact.uv.shape)
     views = views_of(points, exact.uv + noise)
     start = lens.svp()

@@ -110,8 +110,7 @@ def localize_environments(
     start (E,): poses to start from, the true one by default.
     """
     true = paper_pose(len(points))
-    blank = views_of(points, np.zeros((*points.shape[:2], 2)))
-    views = views_of(points, ForwardModel(lens).predict(true, blank).uv)
+    views = views_of(points, ForwardModel(lens).predict(true, views_of(points)).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
     found = localized(model, views, true, true if start is None else start)
     return LocalizedSpread(_rows(found.metrics), found.solution, views)
@@ -163,7 +162,7 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     right = Pose(home.rotation, home.position + ahead)
     left_in_right = rig(style)
     points = landmarks_at('whole', radius)
-    blank = views_of(points, np.zeros((1, len(points), 2)))
+    blank = views_of(points)
     model = ForwardModel(lens)
     uv_right = model.predict(right, blank).uv
     uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv

@@ -203,11 +203,14 @@ def _views(
     )
 
 
-def views_of(points: Array, uv: Array, weight: Array | None = None) -> Views:
+def views_of(points: Array, uv: Array | None = None, weight: Array | None = None) -> Views:
     """Wrap plain arrays as views: points (N, 3) or (S, N, 3), m; uv (S, N, 2), px, NaN = unseen.
 
-    weight: 1 / sigma (S, N), 1/px; 1 where left out.
+    uv: zeros where left out, as of points that are still to be predicted; weight: 1 / sigma
+    (S, N), 1/px; 1 where left out.
     """
+    if uv is None:
+        uv = np.zeros((*points[None].shape[-3:-1], 2))
     shape = uv.shape[:2]
     seen: Mask = np.asarray(np.isfinite(uv).all(axis=-1))
     unit = np.ones(shape) if weight is None else weight

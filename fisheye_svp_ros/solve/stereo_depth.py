@@ -261,4 +261,4 @@ class _Depth:
 
 def _linearise(model: ForwardModel, points: Array) -> LinearViews:
     """Linearise image points of points (M, 3) in the camera's own frame, as one view."""
-    return model.linearise(identity(1), views_of(points[None], np.zeros((1, len(points), 2))))
+    return model.linearise(identity(1), views_of(points))

@@ -19,7 +19,7 @@ from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.optics.camera import back_project, unique_range
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, axis_angle_between, identity
-from fisheye_svp_ros.scene.observations import Views, views_of
+from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
 from fisheye_svp_ros.study.metrics import known_mean
@@ -188,7 +188,7 @@ def at_point(
 def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     """Return error and noise (S,) of position, axis and residual for caps (S, N, 3)."""
     true = identity(len(points))
-    seen = ForwardModel(setup.lens).predict(true, _blank(points)).uv
+    seen = ForwardModel(setup.lens).predict(true, views_of(points)).uv
     solved = localize(ForwardModel(setup.lens.svp()), views_of(points, seen), true)
     variance = setup.noise**2 * np.diagonal(solved.covariance, axis1=-2, axis2=-1)
     # A Gaussian in the plane has this mean norm for a deviation of 1 in each direction.
@@ -203,8 +203,8 @@ def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
 def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     """Return error and noise (S,) of epipolar distance and depth for caps (S, N, 3)."""
     true, svp = ForwardModel(setup.lens), ForwardModel(setup.lens.svp())
-    right = true.predict(identity(len(points)), _blank(points)).uv
-    left = true.predict(setup.rig.broadcast_to(len(points)), _blank(points)).uv
+    right = true.predict(identity(len(points)), views_of(points)).uv
+    left = true.predict(setup.rig.broadcast_to(len(points)), views_of(points)).uv
     both: Mask = np.asarray(np.isfinite(left + right).all(axis=-1))
     pairs = (svp, svp, setup.rig, left[both], right[both])
     offset = epipolar_offset(*pairs)
@@ -230,10 +230,10 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
 
     errors, lens = LensErrors.of(setup.lens), ForwardModel(setup.lens)
     some = points[:, ::_FEWER]
-    left = lens.predict(setup.rig.broadcast_to(len(some)), _blank(some)).uv
+    left = lens.predict(setup.rig.broadcast_to(len(some)), views_of(some)).uv
     both: Mask = np.asarray(np.isfinite(left).all(axis=-1))
     depth = depth_errors(errors, errors, setup.rig, some[both])
-    poses = [errors.of_poses(_blank(caps), identity(len(caps)))
+    poses = [errors.of_poses(views_of(caps), identity(len(caps)))
              for caps in np.array_split(points, -(-len(points) // _AT_ONCE))]
     found = {}
     for part in _OWN:
@@ -256,10 +256,6 @@ def _caps(angles: Array) -> Array:
     cosine = 1 - (1 - cosine) * (1 - np.cos(angles[:, None])) / (1 - cosine[:, -1:])
     sine = np.sqrt(1 - cosine**2)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
-
-
-def _blank(points: Array) -> Views:
-    return views_of(points, np.zeros((*points.shape[:2], 2)))
 
 
 def _mean_by_cap(both: Mask, values: Array) -> Array:

@@ -281,6 +281,14 @@ class TestCalibrate:
         refused(capsys, *sized, '--free', 'f,s0', '-o', out)
         assert not out.exists()
 
+    def test_a_lens_without_rays_to_what_was_seen_is_one_line(self, scene, capsys, monkeypatch):
+        def trust(*_):
+            raise np.linalg.LinAlgError('SVD did not converge')
+
+        monkeypatch.setattr('fisheye_svp_ros.diagnosis.calibration.trust', trust)
+        assert 'observations.csv: the lens found has no rays to points that were seen' in refused(
+            capsys, 'calibrate', scene[0] / 'observations.csv', '--image-size', '1280x960')
+
 
 class TestCommandLine:
     def test_every_command_has_a_module_and_a_help(self, capsys):
