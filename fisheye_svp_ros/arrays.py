@@ -11,6 +11,13 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
+def placed(where: Mask, values: Array) -> Array:
+    """Return values (M, ...) at the M true places of a mask (...), NaN at the others."""
+    whole = np.full((*where.shape, *values.shape[1:]), np.nan)
+    whole[where] = values
+    return whole
+
+
 class Batch:
     """Methods of a named tuple whose fields, arrays or batches, share their leading axes."""
 

@@ -10,9 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.commands.lock_step import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
+from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.columns import write_columns
 from fisheye_svp_ros.io.files import together, write_json, write_text
+from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, tabulate
 from fisheye_svp_ros.paper.demonstration import (
     DEPTH_POSES,
     TASKS,
@@ -21,6 +26,8 @@ from fisheye_svp_ros.paper.demonstration import (
     residual_fields,
 )
 from fisheye_svp_ros.paper.tables import LENSES
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.tables import print_table
 from fisheye_svp_ros.scene.landmarks import RADII
 
 _MARK = '.demo'
@@ -41,11 +48,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Run the graph; make everything else from its recording."""
-    from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.columns import write_columns
-    from fisheye_svp_ros.io.recording import is_tabulated, tabulate
-    from fisheye_svp_ros.reporting.progress import progress
-
     bag = args.output / 'recording'
     with progress('running the nodes'):
         record(bag, args.output / 'logs', args.lenses, args.radii)
@@ -64,9 +66,6 @@ def run(args: argparse.Namespace) -> None:
 
 def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:
     """Run the node graph through its scenarios, in lock-step, into a recording."""
-    from fisheye_svp_ros.commands.lock_step import start_in_step, values
-    from fisheye_svp_ros.commands.processes import Processes
-
     mark = logs.parent / _MARK
     if bag.exists() and not mark.exists():
         raise OutputError(f'{bag}: it is there, and no demo has made it; choose another -o')
@@ -91,10 +90,10 @@ def _scenarios(
     task: str, lenses: Sequence[str], radii: Sequence[float]
 ) -> Iterator[tuple[str, Any]]:
     """Yield the camera's parameters for the scenarios of a task."""
-    swept, values = next((t.swept, t.values) for t in TASKS if t.name == task)
+    swept, over = next((t.swept, t.values) for t in TASKS if t.name == task)
     yield 'sweep.lens', _list(lenses)
     yield 'sweep.radius', _list(radii)
-    yield f'sweep.{swept}', _list(values)
+    yield f'sweep.{swept}', _list(over)
     if task == 'calibration':
         yield 'poses_file', 'calibration'
     if task == 'depth':
@@ -106,8 +105,6 @@ def _list(values: Sequence[Any]) -> str:
 
 
 def _print(rows: Sequence[DemoRow]) -> None:
-    from fisheye_svp_ros.reporting.tables import print_table
-
     for task in TASKS:
         mine = [row for row in rows if row.task == task.name]
         axis = () if task.name == 'depth' else ('axis deg', 'published')
@@ -132,8 +129,6 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
 
 
 def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
-    from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording import has_residuals
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 
     fields = residual_fields(Bag(bag).records(has_residuals))

@@ -4,10 +4,24 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from fisheye_svp_ros.io.recording import ResidualSet
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.errors import OutputError
+from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.columns import read_columns
+from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.recording import (
+    NAMESPACE,
+    ResidualSet,
+    has_residuals,
+    is_tabulated,
+    residual_sets,
+    tabulate,
+)
+from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 
 _FIELDS = 4  # residual fields a lens
 _TABLES = ('.csv', '.parquet')
@@ -24,11 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
-    from fisheye_svp_ros.errors import OutputError
-    from fisheye_svp_ros.io.files import together
-
+    table = _table_in(args.source)
     with together():
-        files = _of_table(args) if _table_in(args.source) else _of_bag(args)
+        files = _of_table(table, args.output) if table else _of_bag(args)
     if not files:
         raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '
                           'differ are needed, or residuals')
@@ -43,24 +55,12 @@ def _table_in(source: Path) -> Path | None:
     return table if table.exists() else None
 
 
-def _of_table(args: argparse.Namespace) -> list[Path]:
-    from fisheye_svp_ros.io.columns import read_columns
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.sweep_plots import draw_table
-
-    path = _table_in(args.source)
-    assert path is not None
+def _of_table(path: Path, folder: Path) -> list[Path]:
     with progress('drawing'):
-        return draw_table(read_columns(path), args.output)
+        return draw_table(read_columns(path), folder)
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:
-    from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.io.bags import Bag
-    from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, residual_sets, tabulate
-    from fisheye_svp_ros.reporting.progress import progress
-    from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
-
     bag = Bag(args.source)
     with progress('reading', 2 * bag.size) as passed:
         columns = tabulate(bag.records(is_tabulated, passed))
@@ -79,9 +79,6 @@ def _of_bag(args: argparse.Namespace) -> list[Path]:
 
 def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
     """Draw the residuals over the image, once a lens and range, where a scenario names these."""
-    from fisheye_svp_ros.io.recording import residual_field
-    from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
-
     named: dict[Any, ResidualSet] = {}
     for one in found:
         key = one.tags.get('lens'), one.tags.get('radius')
@@ -90,14 +87,12 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
             named.setdefault(key, one)
     if not named:
         return []
-    draw_residual_fields([residual_field(one) for one in named.values()], path)
+    draw_residual_fields(list(named.values()), path)
     return [path]
 
 
 def _main_namespace(columns: dict[str, list[Any]]) -> dict[str, list[Any]]:
     """Return the rows of the namespace with most of them: others have other metrics."""
-    from fisheye_svp_ros.io.recording import NAMESPACE
-
     names = columns[NAMESPACE]
     most = max(set(names), key=names.count, default=None)
     kept = [i for i, name in enumerate(names) if name == most]

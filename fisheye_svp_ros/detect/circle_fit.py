@@ -61,9 +61,7 @@ def _halved(pixels: Pixels, start: Array, points: Array) -> Corners:
     return found._replace(uv=2 * found.uv + 0.5, sigma=2 * found.sigma, blur=2 * found.blur)
 
 
-def _bends(
-    points: Array, uv: Array, shape: tuple[int, ...], step: float
-) -> tuple[Array, Array]:
+def _bends(points: Array, uv: Array, shape: tuple[int, ...], step: float) -> tuple[Array, Array]:
     """Return derivatives of the image by places on the board: (N, 2, 2), px/m, rows are the axes.
 
     And second ones (N, 3, 2), px/m^2, of x^2/2, x y and y^2/2: those of the lens that fits this
@@ -140,9 +138,7 @@ class _Problem(WindowProblem):
 
     slack = 5e-4
 
-    def __init__(
-        self, cut: Windows, start: Array, axes: Array, bend: Array, reach: float
-    ) -> None:
+    def __init__(self, cut: Windows, start: Array, axes: Array, bend: Array, reach: float) -> None:
         self._first, self._axes, self._bend = start - cut.place, axes, bend
         offset = cut.offset.T - self._first[:, None]
         far = np.linalg.norm(_on_board(offset, axes), axis=-1)

@@ -83,11 +83,10 @@ def detect(
     photographs: Iterable[Photograph],
     pattern: Pattern,
     detector: str = '',
-    seconds: float = SECONDS,
     progress: Callable[[], object] = lambda: None,
     source: str = 'photographs',
 ) -> Detection:
-    """Search photographs for a board, in processes of their own, `seconds` at most for each.
+    """Search photographs for a board, in processes of their own, SECONDS at most for each.
 
     progress is called after each.  Raises ObservationError where no photograph shows the board.
     """
@@ -100,10 +99,10 @@ def detect(
             taken.append(replace(photograph, data=b''))
             yield _Task(photograph, pattern, detector or default_detector(pattern))
 
-    for number, result in bounded_map(examine, tasks(), seconds):
+    for number, result in bounded_map(examine, tasks(), SECONDS):
         if isinstance(result, Late):
             one = taken[number]
-            why = f'no board within {seconds:g} s' if result.timed_out else 'the search crashed'
+            why = f'no board within {SECONDS:g} s' if result.timed_out else 'the search crashed'
             result = Searched(one.name, one.key, one.camera, one.t, reason=why)
         results[number] = result
         progress()

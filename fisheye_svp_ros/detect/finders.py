@@ -62,9 +62,7 @@ def _sharper(find: Finder) -> Finder:
 
 def classic(image: Grey, pattern: Pattern) -> Found | None:
     """cv2.findChessboardCorners."""
-    ok, corners = cv2.findChessboardCorners(
-        image, (pattern.columns, pattern.rows), flags=_CLASSIC
-    )
+    ok, corners = cv2.findChessboardCorners(image, (pattern.columns, pattern.rows), flags=_CLASSIC)
     return _all(ok, corners)
 
 

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, placed
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.camera import Incidence
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
@@ -83,10 +83,8 @@ class Scene:
     def times(self) -> Array:
         """Time of each view (S,), s; NaN where unknown."""
         t = np.where(self.views.used, self.views.t, np.nan)
-        known = np.isfinite(t).any(axis=1)
-        mean = np.full(len(t), np.nan)
-        mean[known] = np.nanmean(t[known], axis=1)
-        return mean
+        known = np.asarray(np.isfinite(t).any(axis=1))
+        return placed(known, np.nanmean(t[known], axis=1))
 
     @cached_property
     def twist(self) -> Array:

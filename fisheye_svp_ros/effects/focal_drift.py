@@ -28,6 +28,7 @@ class FocalDriftEffect(PlaneEffect):
     means: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'focal_drift'
+    of_recording = True
     signature = 'residuals in proportion to the image height that change smoothly with time'
     to_separate = 'a longer recording with the temperature noted; frames well spread in time'
 
@@ -37,10 +38,6 @@ class FocalDriftEffect(PlaneEffect):
         bare = cls(3, float(t.min()), float(np.ptp(t)))
         means = tuple(bare._polynomials(t).mean(axis=0).tolist())
         return [replace(bare, degree=degree, means=means[:degree]) for degree in (1, 2, 3)]
-
-    @property
-    def of_recording(self) -> bool:
-        return True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

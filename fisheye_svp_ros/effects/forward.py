@@ -151,9 +151,7 @@ class ForwardModel:
             views = self._target.labelled(views)
         points = self._seen_points(pose, views)
         ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
-        linear = LinearViews(
-            ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited
-        )
+        linear = LinearViews(ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited)
         if not self._acts('image', 'detector'):
             return linear
         uv = [ideal]

@@ -23,6 +23,7 @@ class RigFlexEffect(Effect):
 
     name = 'rig_flex'
     stage = 'pose'
+    of_recording = True
     signature = 'residuals of one camera against the other that differ from frame to frame'
     to_separate = 'a stiffer rig; frames with the rig unloaded and loaded'
 
@@ -40,10 +41,6 @@ class RigFlexEffect(Effect):
     @property
     def per_frame(self) -> bool:
         return not self.degree
-
-    @property
-    def of_recording(self) -> bool:
-        return True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -28,6 +28,7 @@ class SessionStepEffect(Effect):
     stage = 'image'
     # A step after the first few frames is hardly more than intrinsics that are wrong throughout.
     asked_after = ('focal_length', 'principal_point')
+    of_recording = True
     signature = 'residuals that change at one frame and keep their new pattern'
     to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 
@@ -47,10 +48,6 @@ class SessionStepEffect(Effect):
 
     def refocused(self, values: Array, ratio: float) -> Array:
         return np.asarray((values.reshape(-1, len(_STEP)) / [ratio, 1.0, 1.0]).ravel())
-
-    @property
-    def of_recording(self) -> bool:
-        return True
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -81,9 +81,7 @@ def parse_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> di
     return document
 
 
-def compose_yaml(
-    text: str, where: str | Path, error: type[FisheyeSvpError]
-) -> yaml.Node | None:
+def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> yaml.Node | None:
     """Return the nodes of a YAML text, None for an empty one; raise `error` as `parse_yaml`."""
     if len(text) > LARGEST_YAML:
         raise error(f'{where}: above {LARGEST_YAML >> 20} MB, which is more than is read as YAML')

@@ -5,30 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.clouds import Points
 from fisheye_svp_ros.io.columns import typed
-from fisheye_svp_ros.io.decoding import (
-    columns,
-    read_key_values,
-    read_residuals,
-    stamp_of,
-    statuses,
-)
+from fisheye_svp_ros.io.decoding import read_key_values, read_residuals, stamp_of, statuses
 
 STAMP = 'stamp_ns'
 NAMESPACE = 'namespace'
 
 Columns = dict[str, list[Any]]
-
-
-class ResidualField(NamedTuple):
-    """Residuals of one localization: uv and residual (N, 2), px."""
-
-    lens: str
-    radius: float
-    uv: Array
-    residual: Array
 
 
 class ResidualSet(NamedTuple):
@@ -111,12 +95,3 @@ def residual_sets(records: Iterable[Any]) -> list[ResidualSet]:
                     tags.get((topic.removesuffix('/localizer/residuals'), when), {}))
         for (topic, when), points in sorted(clouds.items(), key=lambda item: item[0])
     ]
-
-
-def residual_field(one: ResidualSet) -> ResidualField:
-    """Return the residuals of one set over the image; its scenario names lens and radius."""
-    points = one.points
-    return ResidualField(
-        one.tags['lens'], float(one.tags['radius']),
-        columns(points, ('u', 'v')), columns(points, ('du', 'dv')),
-    )

@@ -259,9 +259,7 @@ class SumOfShifts(ViewpointShift):
         return SumOfShifts((*self.parts, other))
 
 
-def shift_at(
-    curve: ViewpointShift, theta: Array, sin: Array, cos: Array
-) -> tuple[Array, Array]:
+def shift_at(curve: ViewpointShift, theta: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return s and sin ds/dtheta where sine and cosine are at hand; theta above 0."""
     formula: Formula | None = getattr(curve, 'formula', None)
     if formula is None:

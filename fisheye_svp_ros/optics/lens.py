@@ -68,9 +68,7 @@ class Lens:
         Raises LensError for a name this lens does not have.
         """
         changes: dict[str, Any] = {}
-        curves: dict[str, dict[str, float]] = {
-            'image_height': {}, 'viewpoint_shift': {}, PORT: {}
-        }
+        curves: dict[str, dict[str, float]] = {'image_height': {}, 'viewpoint_shift': {}, PORT: {}}
         for name, value in zip(names, map(float, values), strict=True):
             if name in INTRINSICS:
                 changes[name] = value

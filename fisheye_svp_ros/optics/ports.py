@@ -165,9 +165,7 @@ class DomeGlass(Port):
     z: float = 0.0
     thickness: float = 0.0
     glass_index: float = 1.5
-    coefficient_names = (
-        'radius', 'medium_index', 'x', 'y', 'z', 'thickness', 'glass_index'
-    )
+    coefficient_names = ('radius', 'medium_index', 'x', 'y', 'z', 'thickness', 'glass_index')
     placed = ('x', 'y', 'z')
 
     def starts(self) -> list[Self]:

@@ -9,13 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.recording import (
-    NAMESPACE,
-    Columns,
-    ResidualField,
-    residual_field,
-    residual_sets,
-)
+from fisheye_svp_ros.io.recording import NAMESPACE, Columns, ResidualSet, residual_sets
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
     ERROR2_RANGE,
@@ -103,12 +97,9 @@ def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -
     return rows
 
 
-def residual_fields(records: Iterable[Any]) -> list[ResidualField]:
+def residual_fields(records: Iterable[Any]) -> list[ResidualSet]:
     """Return the residuals of every localization with the whole environment (figure 6)."""
-    return [
-        residual_field(one) for one in residual_sets(records)
-        if one.tags.get('environment') == 'whole'
-    ]
+    return [one for one in residual_sets(records) if one.tags.get('environment') == 'whole']
 
 
 def _is_shown(task: Task, row: dict[str, Any]) -> bool:

@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import LogLocator
 
+from fisheye_svp_ros.io.decoding import columns
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.recording import ResidualField
+from fisheye_svp_ros.io.recording import ResidualSet
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.demonstration import DemoRow
@@ -66,31 +67,35 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
     axis.grid(visible=False, axis='y')
 
 
-def draw_residual_fields(fields: Sequence[ResidualField], path: Path) -> None:
-    """Draw the residuals of localization over the image, magnified (figure 6): a row a lens."""
-    names = list(dict.fromkeys(field.lens for field in fields))
-    columns = max(sum(field.lens == name for field in fields) for name in names)
-    with picture(path, 3.4 * columns, 0.3 + 3.7 * len(names)) as figure:
-        axes = figure.subplots(len(names), columns, squeeze=False)
+def draw_residual_fields(fields: Sequence[ResidualSet], path: Path) -> None:
+    """Draw the residuals of localization over the image, magnified (figure 6): a row a lens.
+
+    The scenarios of all of them name lens and radius.
+    """
+    names = list(dict.fromkeys(field.tags['lens'] for field in fields))
+    count = max(sum(field.tags['lens'] == name for field in fields) for name in names)
+    with picture(path, 3.4 * count, 0.3 + 3.7 * len(names)) as figure:
+        axes = figure.subplots(len(names), count, squeeze=False)
         for line, name in zip(axes, names, strict=True):
-            lens, mine = load_lens(lens_path(name)), [one for one in fields if one.lens == name]
+            lens, mine = load_lens(lens_path(name)), [f for f in fields if f.tags['lens'] == name]
             for axis, field in zip(line, mine, strict=False):
                 _draw_field(axis, field, lens)
 
 
-def _draw_field(axis: Any, field: ResidualField, lens: Lens) -> None:
+def _draw_field(axis: Any, field: ResidualSet, lens: Lens) -> None:
+    uv, residual = columns(field.points, ('u', 'v')), columns(field.points, ('du', 'dv'))
     edge, _ = lens.image_height.value_and_slope(np.array(lens.max_incidence))
     axis.add_patch(Circle((lens.cx, lens.cy), lens.fx * float(edge), fill=False, color=FAINT))
-    size = np.linalg.norm(field.residual, axis=-1)
+    size = np.linalg.norm(residual, axis=-1)
     # The longest residual takes an eighth of the image, whatever it is.
     factor = round_number(lens.width / 8 / size.max())
-    axis.quiver(*field.uv.T, *(factor * field.residual.T), angles='xy', scale_units='xy', scale=1,
+    axis.quiver(*uv.T, *(factor * residual.T), angles='xy', scale_units='xy', scale=1,
                 color=OURS, width=0.005)
-    axis.plot(*field.uv.T, 'o', markersize=3, color='#404850')
+    axis.plot(*uv.T, 'o', markersize=3, color='#404850')
     corner, margin = (-0.5, -0.5), 0.1 * lens.width
     axis.add_patch(Rectangle(corner, lens.width, lens.height, fill=False, color=FAINT))
     axis.set(xlim=(-margin, lens.width + margin), ylim=(lens.height + margin, -margin))
     axis.set_aspect('equal')
     axis.axis('off')
-    axis.set_title(f'{field.lens}, landmarks at {field.radius:g} m\n'
+    axis.set_title(f'{field.tags["lens"]}, landmarks at {float(field.tags["radius"]):g} m\n'
                    f'residual {size.mean():.2g} px on average, x {factor:g}', loc='left')

@@ -69,9 +69,7 @@ def draw_field(path: Path, shown: Shown) -> None:
             axis.set_xlabel('u / px')
 
 
-def draw_against(
-    path: Path, shown: Shown, x: Array, label: str, log: bool = False
-) -> None:
+def draw_against(path: Path, shown: Shown, x: Array, label: str, log: bool = False) -> None:
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}

@@ -19,9 +19,7 @@ _BLUE, _ORANGE = (168, 95, 31), (40, 123, 224)  # BGR
 _LARGEST = 1600  # px, of an overlay
 
 
-def write_overlays(
-    photographs: Iterable[Photograph], detection: Detection, folder: Path
-) -> None:
+def write_overlays(photographs: Iterable[Photograph], detection: Detection, folder: Path) -> None:
     """Draw each photograph with its corners in their order, the first of them ringed.
 
     Raises OutputError where a picture cannot be written.

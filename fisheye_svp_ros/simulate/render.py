@@ -184,9 +184,7 @@ def _of_board(
     return _light(board.printed, places) - np.float32(_ROOM)
 
 
-def _seen_places(
-    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array
-) -> Array:
+def _seen_places(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
     """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
     flat = uv.reshape(-1, 2)
     parts = [
@@ -196,9 +194,7 @@ def _seen_places(
     return np.concatenate(parts).reshape(uv.shape)
 
 
-def _seen_part(
-    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array
-) -> Array:
+def _seen_part(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
     printed = board.printed
     rays = back_project(lens, uv)
     origin, direction = rays.origin, rays.direction
@@ -296,9 +292,7 @@ def _inside(places: Array, low: Any, high: Any, width: Array) -> Array:
     return np.asarray(share[..., 0] * share[..., 1])
 
 
-def _blurred(
-    light: NDArray[np.float32], theta: Array, exposure: Exposure, edge: float
-) -> Array:
+def _blurred(light: NDArray[np.float32], theta: Array, exposure: Exposure, edge: float) -> Array:
     """Return what pixels (H, W) see of light between them: the lens blurs before they sample."""
     if not exposure.blur_edge:
         return _sampled(light, exposure.blur)

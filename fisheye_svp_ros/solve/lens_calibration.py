@@ -201,9 +201,7 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
     values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
-    adjusted = _settled(
-        _best_start(start.svp(), few, pose, values, svp_names), views, svp_names
-    )
+    adjusted = _settled(_best_start(start.svp(), few, pose, values, svp_names), views, svp_names)
     if start.port is not None:
         adjusted = _behind_port(start, adjusted, few, views, (*svp_names, *port_names))
     if shift is None:
@@ -212,9 +210,7 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
     return adjust(lens, views, adjusted.pose, names)
 
 
-def _best_start(
-    lens: Lens, few: Views, pose: Pose, values: Array, names: tuple[str, ...]
-) -> Lens:
+def _best_start(lens: Lens, few: Views, pose: Pose, values: Array, names: tuple[str, ...]) -> Lens:
     """Return the lens that fits best of those adjusted from starts (S, V) and (S, K)."""
     solved = adjust_batch(lens, few, pose, values, names, _START_ITERATIONS)
     return lens.with_parameters(names, solved.state[2][np.argmin(solved.cost)].tolist())

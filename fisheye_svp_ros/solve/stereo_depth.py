@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.arrays import Array, Index, Mask, placed
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -152,13 +152,10 @@ def triangulate_optimally(
     hessian = np.where(fixed[:, None, None], hessian, np.eye(3))
     fixed &= np.linalg.matrix_rank(hessian, hermitian=True) == 3
     hessian[~fixed] = np.eye(3)
-    found = np.flatnonzero(valid)[fixed]
     valid[valid] = fixed
 
     def filled(field: Array) -> Array:
-        whole = np.full((len(valid), *field.shape[1:]), np.nan)
-        whole[found] = field[fixed]
-        return whole.reshape(*pairs.shape, *field.shape[1:])
+        return placed(valid.reshape(pairs.shape), field[fixed])
 
     return OptimalPoints(
         filled(solved.state[0]), filled(np.asarray(np.linalg.inv(hessian), dtype=float)),
@@ -171,9 +168,7 @@ class _Pairs:
     """Matched image points and their rigs, flattened to M pairs from any leading shape."""
 
     def __init__(self, rig: Pose, uv_left: Array, uv_right: Array) -> None:
-        self.shape = np.broadcast_shapes(
-            uv_left.shape[:-1], uv_right.shape[:-1], rig.shape
-        )
+        self.shape = np.broadcast_shapes(uv_left.shape[:-1], uv_right.shape[:-1], rig.shape)
         self.left = np.broadcast_to(uv_left, (*self.shape, 2)).reshape(-1, 2)
         self.right = np.broadcast_to(uv_right, (*self.shape, 2)).reshape(-1, 2)
         self.rig = rig.broadcast_to(*self.shape).reshape(-1)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Mask, placed
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.optics.camera import back_project, unique_range
@@ -216,7 +216,7 @@ def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
         np.linalg.norm(solved - points[both], axis=-1),
         np.sqrt(np.trace(spread, axis1=-2, axis2=-1)),
     ]
-    epipolar, depth, depth_noise = (_mean_by_cap(both, values) for values in per_pair)
+    epipolar, depth, depth_noise = (known_mean(placed(both, values)) for values in per_pair)
     # Noise of the left point across the curve and of the right point that moves the curve.
     epipolar_noise = np.full(len(points), 2 / np.sqrt(np.pi) * setup.noise)
     return [(epipolar, epipolar_noise), (depth, depth_noise)]
@@ -242,7 +242,7 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
         far = np.sqrt(np.trace(getattr(depth, part), axis1=-2, axis2=-1))
         found[part] = {
             'position': np.sqrt(variance[:, :3].sum(axis=-1)),
-            'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)), 'depth': _mean_by_cap(both, far),
+            'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)), 'depth': known_mean(placed(both, far)),
         }
     return found
 
@@ -256,12 +256,6 @@ def _caps(angles: Array) -> Array:
     cosine = 1 - (1 - cosine) * (1 - np.cos(angles[:, None])) / (1 - cosine[:, -1:])
     sine = np.sqrt(1 - cosine**2)
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
-
-
-def _mean_by_cap(both: Mask, values: Array) -> Array:
-    whole = np.full(both.shape, np.nan)
-    whole[both] = values
-    return known_mean(whole)
 
 
 def _along(places: Array, table: Array, place: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Mask, placed
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.pose import Pose
@@ -120,14 +120,7 @@ def measured(
     pairs = *models, rig.take(np.nonzero(both)[0]), uv_left[both], uv_right[both]
     offset = epipolar_offset(*pairs)
     points = (triangulate_optimally if optimal else triangulate)(*pairs).points
-
-    def filled(values: Array) -> Array:
-        whole = np.full((*both.shape, *values.shape[1:]), np.nan)
-        whole[both] = values
-        return whole
-
-    found = Measurement(
-        filled(points), filled(offset.distance), filled(offset.vertical), filled(offset.foot)
-    )
+    found = Measurement(*(
+        placed(both, part) for part in (points, offset.distance, offset.vertical, offset.foot)))
     metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
     return Solved(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)

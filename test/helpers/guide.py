@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.guide import Seen, Session, Stand, start_session
@@ -16,7 +14,7 @@ from fisheye_svp_ros.simulate.render import Print
 
 LENS = Lens('hidden', 848, 800, 270.0, 270.0, 428.0, 396.0, KannalaBrandt(-0.01, 0.003),
             np.radians(92.0), Gennery(e0=-0.003))
-SHEET = replace(nominal_lens((848, 800), 3.15), max_incidence=3.15 / 2)
+SHEET = nominal_lens((848, 800), 3.15)
 POINTS = Print(6, 5, 0.030).corners
 
 

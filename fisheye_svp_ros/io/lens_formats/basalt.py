@@ -36,9 +36,7 @@ def read(text: str, where: str) -> Foreign:
     return Foreign('basalt', lenses, rigs, worst)
 
 
-def _lens(
-    name: str, camera: dict[str, Any], size: list[float], where: str
-) -> tuple[Lens, float]:
+def _lens(name: str, camera: dict[str, Any], size: list[float], where: str) -> tuple[Lens, float]:
     values, kind = camera['intrinsics'], camera['camera_type']
     pinhole = [float(values[key]) for key in ('fx', 'fy', 'cx', 'cy')]
     if kind == 'kb4':

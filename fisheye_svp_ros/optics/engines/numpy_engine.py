@@ -146,9 +146,7 @@ def _solved_incidence(lens: Lens, local: Array, limited: bool) -> RaySolution:
     return solve_incidence(lens, local, limited)
 
 
-def _seen(
-    rotation: Array, position: Array, points: Array, part: tuple[slice, slice]
-) -> Array:
+def _seen(rotation: Array, position: Array, points: Array, part: tuple[slice, slice]) -> Array:
     """Return a tile's points (3, S, N) in the frames of their cameras."""
     own, seen = part[0], points[part].transpose(2, 0, 1)
     arm = np.array(seen, order='C')  # faster copied than subtracted
