@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
+from fisheye_svp_ros.solve.measured import rms_px
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
 _SIDES = (('before', BEFORE), ('after', AFTER))
@@ -62,7 +63,7 @@ def draw_field(path: Path, shown: Shown) -> None:
                 _image_frame(axis, shown.lens)
                 _arrows(axis, *field[kind], typical, cell, colour)
         for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
-            axis.set_title(f'{side}: {_rms(getattr(points, side)):.3f} px rms', color=colour)
+            axis.set_title(f'{side}: {rms_px(getattr(points, side)):.3f} px rms', color=colour)
         axes[0, 0].set_ylabel('single points\nv / px')
         axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
         for axis in axes[1]:
@@ -225,10 +226,6 @@ def _polar(shown: Shown, residual: Array) -> Array:
     radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-9)
     across = np.stack([-radial[:, 1], radial[:, 0]], axis=-1)
     return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)
-
-
-def _rms(residual: Array) -> float:
-    return float(np.sqrt((residual**2).sum(axis=1).mean()))
 
 
 def residual_pictures(shown: Shown) -> Iterator[Picture]:

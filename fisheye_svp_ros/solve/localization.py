@@ -184,7 +184,7 @@ class _Localization:
 
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
-    if model.plain:
+    if model.plain and model.lens.port is None:
         cost, *normal = engines.pose_equations(model.lens, *pose, views.seen)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)

@@ -17,6 +17,7 @@ from types import ModuleType
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.engines import cache, numpy_engine, ported
+from fisheye_svp_ros.optics.engines.numpy_engine import pose_equations as pose_equations
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -74,19 +75,6 @@ def linearise_views(
     engine = _engine if lens.port is None else ported
     uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
     return uv, valid, d_pose
-
-
-def pose_equations(
-    lens: Lens, rotation: Array, position: Array, seen: Seen
-) -> tuple[Array, Array, Array]:
-    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses.
-
-    rotation (S, 3, 3), position (S, 3): cameras in the world.  A point without an image costs
-    infinity, unless its weight is 0.
-    """
-    if lens.port is not None:
-        return ported.pose_equations(lens, rotation, position, seen)
-    return numpy_engine.pose_equations(lens, rotation, position, seen)
 
 
 def localize(

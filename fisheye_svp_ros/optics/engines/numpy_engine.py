@@ -84,7 +84,11 @@ def linearise_views(
 def pose_equations(
     lens: Lens, rotation: Array, position: Array, seen: Seen
 ) -> tuple[Array, Array, Array]:
-    """See `engines.pose_equations`."""
+    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses; not for a port.
+
+    rotation (S, 3, 3), position (S, 3): cameras in the world.  A point without an image costs
+    infinity, unless its weight is 0.
+    """
     points, uv, weight = seen
     systems, count = weight.shape
     cost, gram = np.zeros(systems), np.zeros((systems, 6, 7))

@@ -12,7 +12,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.engines import numpy_engine
-from fisheye_svp_ros.optics.engines.results import Incidence, Seen
+from fisheye_svp_ros.optics.engines.results import Incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.varying import Varying
 from fisheye_svp_ros.pose import cross_matrix
@@ -105,25 +105,6 @@ def linearise_views(
     by_place = by_point @ np.swapaxes(rotation, -1, -2)[:, None]
     d_pose = np.concatenate([-by_place, by_place @ cross_matrix(arm)], axis=-1)
     return uv.reshape(*shape, 2), valid.reshape(shape), d_pose
-
-
-def pose_equations(
-    lens: Lens, rotation: Array, position: Array, seen: Seen
-) -> tuple[Array, Array, Array]:
-    """See `engines.pose_equations`."""
-    points, uv, weight = seen
-    predicted, _, d_pose = linearise_views(lens, rotation, position, points, False)
-    used = weight[..., None] > 0
-    off = np.where(used, (predicted - uv) * weight[..., None], 0.0)
-    rows = np.where(used[..., None], d_pose * weight[..., None, None], 0.0)
-    cost = (off**2).sum(axis=(1, 2))
-    flat, left = rows.reshape(len(rows), -1, 6), off.reshape(len(off), -1, 1)
-    outside = ~np.isfinite(cost)
-    flat[outside], left[outside], cost[outside] = 0.0, 0.0, np.inf
-    turned = np.swapaxes(flat, -1, -2)
-    hessian = turned @ flat
-    hessian[outside] = np.eye(6)
-    return cost, hessian, (turned @ left)[..., 0]
 
 
 def _image(lens: Lens, seen: Sight, limited: bool) -> tuple[Array, Mask, Array]:
