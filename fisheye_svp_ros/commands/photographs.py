@@ -123,11 +123,12 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     pattern = parse_pattern(args.board)
     if args.detector and pattern.kind not in DETECTORS[args.detector][0]:
         raise ParameterError(f'--detector {args.detector} does not find {args.board}')
-    with progress('searching', count_photographs(paths, args.every)) as done:
-        detection = detect(find_photographs(paths, args.every), pattern, args.detector,
-                           progress=done, source=', '.join(paths))
+    count = count_photographs(paths, args.every)
     for line in doubtful_folders(paths):
         say(line)
+    with progress('searching', count) as done:
+        detection = detect(find_photographs(paths, args.every), pattern, args.detector,
+                           progress=done, source=', '.join(paths))
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
            for one in detection.searched if one.reason or one.notes]
     for line in odd[:_SHOWN]:

@@ -108,12 +108,15 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     """
     given = [*map(Path, paths)]
     for folder in given:
-        if not folder.is_dir() or _is_recording(folder) or not (files := _images(folder)):
+        if not folder.is_dir() or _is_recording(folder):
             continue
-        for sub in sorted(folder.iterdir()):
-            if sub.is_dir() and sub not in given and (count := len(_images(sub))):
-                yield (f'{sub}: images in it are passed over ({count}), since the folder above '
-                       'has some, too; give it by itself, or move those into a subfolder')
+        files = _images(folder)
+        for above in [folder] if files else _folders(folder):
+            for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
+                if count := sum(len(_images(one)) for one in (sub, *_folders(sub))):
+                    yield (f'{sub}: images in it are passed over ({count}), since the folder '
+                           'above has some, too; give it by itself, or move those into a '
+                           'subfolder')
         named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
         other = next((p.name for p in files if p.name not in named), '')
         if other and len({*named.values()}) > 1:
@@ -236,9 +239,13 @@ def _images(path: Path) -> list[Path]:
     return sorted((p for p in path.iterdir() if p.suffix.lower() in IMAGES), key=_natural)
 
 
+def _folders(path: Path) -> list[Path]:
+    return [p for p in sorted(path.iterdir()) if p.is_dir() and _images(p)]
+
+
 def _folder(path: Path) -> Iterator[Photograph]:
     files = _images(path)
-    folders = [p for p in sorted(path.iterdir()) if not files and p.is_dir() and _images(p)]
+    folders = [] if files else _folders(path)
     for folder in folders:
         camera = folder.name if len(folders) > 1 or folder.name in STEREO else ''
         yield from (_file(p, camera) for p in _images(folder))

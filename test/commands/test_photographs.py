@@ -94,6 +94,17 @@ def test_images_in_a_subfolder_beside_photographs_are_told(
         assert all(text in line for text, line in zip(told, lines, strict=True))
 
 
+def test_what_is_passed_over_is_told_where_the_others_show_no_board(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(folder, tmp_path / 'photographs')
+    cv2.imwrite(str(tmp_path / 'cover.png'), np.zeros((400, 424), np.uint8))
+    assert cli.main(['detect', str(tmp_path), '--board', BOARD]) == 2
+    note, error = capsys.readouterr().err.splitlines()
+    assert 'photographs: images in it are passed over (11)' in note
+    assert 'no chessboard' in error
+
+
 def test_localize_photographs(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -527,12 +527,16 @@ class TestCameras:
         (['left01.png', 'other.png'], ''),
         (['1.png', 'results/1.png'], 'results: images in it are passed over (1)'),
         (['1.png', 'results/1.txt'], ''),
+        (['1.png', 'second/left/1.png', 'second/right/1.png'],
+         'second: images in it are passed over (2)'),
+        (['left/1.png', 'right/1.png', 'left/old/1.png'],
+         'left/old: images in it are passed over (1)'),
     ])
     def test_what_may_not_be_meant_is_told(
         self, tmp_path: Path, files: list[str], told: str
     ) -> None:
         for name in files:
-            (tmp_path / name).parent.mkdir(exist_ok=True)
+            (tmp_path / name).parent.mkdir(exist_ok=True, parents=True)
             (tmp_path / name).touch()
         lines = [*doubtful_folders([str(tmp_path)])]
         assert len(lines) == bool(told)
