@@ -21,6 +21,7 @@ from fisheye_svp_ros.commands import watch
 
 if not standalone.is_genuine():
     pytest.importorskip('cyclonedds')
+standalone.install()
 
 
 @pytest.mark.parametrize(('width', 'shown'), [
