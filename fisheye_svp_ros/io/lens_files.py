@@ -20,7 +20,7 @@ from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import INTRINSICS, PORT, Lens, check_lens, field_of_view
-from fisheye_svp_ros.optics.ports import PORTS, Port
+from fisheye_svp_ros.optics.ports import PORTS
 from fisheye_svp_ros.registry import Registry
 
 C = TypeVar('C', bound=Curve)
@@ -92,7 +92,8 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         **_projection(_section(document, 'projection', where), f'{where}: projection'),
         max_incidence=np.nan,
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
-        port=_port(own.get(PORT), where),
+        port=None if PORT not in own else _curve(
+            own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
         target=target,
         calibration=_mapping(document, 'calibration', where),
         uncertainty=_mapping(document, 'uncertainty', where),
@@ -161,10 +162,6 @@ def _viewpoint_shift(section: Any, where: str) -> ViewpointShift | None:
     place = f'{where}: viewpoint_shift'
     first, *others = (_curve(part, VIEWPOINT_SHIFTS, 'e', 0, place) for part in parts)
     return reduce(ViewpointShift.plus, others, first)
-
-
-def _port(section: Any, where: str) -> Port | None:
-    return None if section is None else _curve(section, PORTS, '', 0, f'{where}: corrections.port')
 
 
 def _curve(
