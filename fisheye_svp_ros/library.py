@@ -391,10 +391,8 @@ def _check_names(node: str, values: Mapping[str, Any]) -> None:
             raise ParameterError(f'{name!r} is no parameter of {node}: {", ".join(known)}')
 
 
-def _table(observations: AnyObservations) -> Observations:
-    if isinstance(observations, Observations):
-        return observations
-    return read_observations(observations)
+def _table(given: AnyObservations) -> Observations:
+    return given if isinstance(given, Observations) else read_observations(given)
 
 
 def _models(left: AnyLens, right: AnyLens) -> tuple[ForwardModel, ForwardModel]:
