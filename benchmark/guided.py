@@ -15,7 +15,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -129,7 +129,7 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
     rng = np.random.default_rng([17, number])
     lens, pattern = hidden(rng), parse_pattern(BOARD)
     field_of_view = 2 * lens.max_incidence * float(rng.normal(1, 0.02))
-    sheet = replace(nominal_lens(SIZE, field_of_view), max_incidence=field_of_view / 2)
+    sheet = nominal_lens(SIZE, field_of_view)
     guide = Guide(start_session(sheet, pattern.points, ROOM, 'e0', GOAL),
                   np.stack([turn.source for turn in pattern.symmetries]))
     hand = Hand(nominal_lens(SIZE, field_of_view), pattern.points, rng)

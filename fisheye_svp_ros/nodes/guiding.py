@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -139,8 +138,7 @@ class Guiding:
         if settings.lens == CAMERA_INFO:
             lens = self._infos.lens(CAMERA_INFO, stamp)
         if lens is None:
-            lens = replace(nominal_lens((width, height), settings.field_of_view),
-                           max_incidence=settings.field_of_view / 2)
+            lens = nominal_lens((width, height), settings.field_of_view)
         if (lens.width, lens.height) != (width, height):
             raise ObservationError(f'image: {width}x{height} px, but lens {lens.name!r} is for '
                                    f'{lens.width}x{lens.height}')
