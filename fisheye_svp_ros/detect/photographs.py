@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.scene.observations import STEREO
 
 Pixels = NDArray[Any]  # (H, W), uint8 or uint16, grey
 
 IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.webp', '.jp2')
 VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
-RECORDINGS = ('.mcap', '.db3')
 # Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
 _PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
 _COMPRESSED = '/compressed'
@@ -94,7 +94,7 @@ def count_photographs(paths: Sequence[str], every: int = 1) -> int | None:
     """Return how many photographs `find_photographs` yields; None for videos and recordings."""
     count = 0
     for path in map(Path, paths):
-        if path.suffix.lower() in (*VIDEOS, *RECORDINGS) or _is_recording(path):
+        if path.suffix.lower() in VIDEOS or is_recording(path):
             return None
         count += -(-sum(1 for _ in _source(path)) // every)
     return count
@@ -108,7 +108,7 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     """
     given = [*map(Path, paths)]
     for folder in given:
-        if not folder.is_dir() or _is_recording(folder):
+        if not folder.is_dir() or is_recording(folder):
             continue
         files = _images(folder)
         for above in [folder] if files else _folders(folder):
@@ -219,16 +219,11 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
 def _source(path: Path) -> Iterator[Photograph]:
     if not path.exists():
         raise ObservationError(f'{path}: there is no such file or folder; check the path')
-    if path.is_dir() and not _is_recording(path):
-        return _folder(path)
-    suffix = path.suffix.lower()
-    if path.is_dir() or suffix in RECORDINGS:
+    if is_recording(path):
         return _recording(path)
-    return _video(path) if suffix in VIDEOS else iter([_file(path)])
-
-
-def _is_recording(path: Path) -> bool:
-    return path.is_dir() and any(p.suffix in RECORDINGS for p in path.iterdir())
+    if path.is_dir():
+        return _folder(path)
+    return _video(path) if path.suffix.lower() in VIDEOS else iter([_file(path)])
 
 
 def _file(path: Path, camera: str = '') -> Photograph:

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import re
-import sqlite3
 import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
-from urllib.parse import quote
 
 from rosbags.interfaces import (
     Connection,
@@ -23,13 +19,14 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer, WriterError
+from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
-from fisheye_svp_ros.io.files import read_text
+from fisheye_svp_ros.io.databases import database_messages, database_topics
 from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
+from fisheye_svp_ros.io.recording_files import recording_files, unpacked, unpacked_message
 
 _SHOWN = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
@@ -171,7 +168,7 @@ class Bag:
             if typename not in store.fielddefs or not wanted(topic, typename):
                 continue
             try:
-                message = store.deserialize_cdr(data, typename)
+                message = store.deserialize_cdr(unpacked_message(data), typename)
             except Exception as cause:
                 notes.append(f'a message on {topic} cannot be read ({cause})')
                 continue
@@ -186,76 +183,43 @@ class Bag:
 
         Raises BagError where nothing can be read.
         """
-        listed = [listed_topics(file) for file in self._files()]
+        listed = []
+        for file in self._files():
+            with unpacked(file, _ignore) as plain:
+                list_topics = database_topics if plain.suffix == '.db3' else listed_topics
+                listed.append(list_topics(plain))
         if all(listed):
             return set().union(*listed)
-        every = self._raw(lambda _: None, lambda _: None)
-        return {(message.topic, message.typename) for message in every}
+        return {(message.topic, message.typename) for message in self._raw(_ignore, _ignore)}
 
     def _files(self) -> list[Path]:
-        """Return the files of the recording, by the numbers in their names."""
-        files = [self.path] if self.path.is_file() else [
-            *self.path.glob('*.mcap'), *self.path.glob('*.db3')]
-        return sorted(files, key=lambda file: [
-            (int(word), '') if word.isdecimal() else (0, word)
-            for word in re.split(r'(\d+)', file.name)])
+        return recording_files(self.path)
 
     def _raw(
         self, note: Callable[[str], None], passed: Callable[[int], None]
     ) -> Iterator[RawMessage]:
         """Yield all messages; raise BagError where nothing is whole."""
-        files, problems, count = self._files(), [], 0
+        problems, count = list[str](), 0
 
         def say(problem: str) -> None:
             problems.append(problem)
             note(problem)
 
-        plain = all(file.suffix != '.db3' for file in files) and not self._is_compressed()
-        sources = ([whole_messages(file, say, passed) for file in files] if plain else
-                   [self._read(say)])
-        for messages in sources:
-            for message in messages:
-                count += 1
-                if not plain:
-                    passed(len(message.data))
-                yield message
+        for file in self._files():
+            with unpacked(file, say) as plain:
+                read = database_messages if plain.suffix == '.db3' else whole_messages
+                for message in read(plain, say, passed if plain == file else _ignore):
+                    count += 1
+                    yield message
+            if plain != file:
+                passed(file.stat().st_size)
         if problems and not count:
             raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
                            f'({"; ".join(problems[:_SHOWN])})')
 
-    def _read(self, note: Callable[[str], None]) -> Iterator[RawMessage]:
-        """Yield the messages of a recording that has no checksums, or is compressed as files."""
-        try:
-            for file in self._files():
-                if file.suffix == '.db3':
-                    _refuse_made_up(file)
-            with Reader(self.path) as reader:
-                for connection, when, data in reader.messages():
-                    yield RawMessage(connection.topic, connection.msgtype, when, bytes(data))
-        except Exception as cause:
-            note(f'it cannot be read on ({cause or type(cause).__name__})')
 
-    def _is_compressed(self) -> bool:
-        """Whether the messages themselves are compressed, as rosbag2 can do it."""
-        about = self.path / 'metadata.yaml'
-        text = read_text(about, BagError) if about.is_file() else ''
-        found = re.search('compression_mode: *["\']?(message|file)', text, re.IGNORECASE)
-        return found is not None
-
-
-def _refuse_made_up(file: Path) -> None:
-    """Raise BagError for a database whose cells are computed, or stand for more than they hold.
-
-    A few bytes of SQL can stand for gigabytes, and so can a number where a message ought to be.
-    """
-    address = f'file:{quote(str(file.absolute()))}?mode=ro'
-    with closing(sqlite3.connect(address, uri=True)) as database:
-        made_up = database.execute(
-            'SELECT 1 FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE c.hidden '
-            "OR m.type = 'view' OR m.sql LIKE 'CREATE VIRTUAL %' LIMIT 1").fetchone()
-        if made_up or database.execute(
-                "SELECT 1 FROM messages WHERE typeof(data) <> 'blob' LIMIT 1").fetchone():
-            raise BagError('its tables hold what no recording does')
+def _ignore(_: object) -> None:
+    pass
 
 
 def _profile(offered: Offered) -> Qos:

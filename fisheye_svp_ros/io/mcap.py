@@ -20,9 +20,10 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
+from fisheye_svp_ros.io.recording_files import LARGEST
+
 _MAGIC = b'\x89MCAP0\r\n'
 _HEAD = struct.Struct('<BQ')  # of a record: opcode, length
-_LARGEST = 1 << 28  # bytes of a chunk, decompressed
 
 _Note = Callable[[str], None]
 _Passed = Callable[[int], None]
@@ -158,8 +159,8 @@ def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
 def _decompressed(chunk: Chunk) -> bytes:
     """Return the data of a chunk; raise ValueError for more than was announced."""
     size: int = chunk.uncompressed_size
-    if size > _LARGEST:
-        raise ValueError(f'it has {size} bytes; up to {_LARGEST} are read')
+    if size > LARGEST:
+        raise ValueError(f'it has {size} bytes; up to {LARGEST} are read')
     if not chunk.compression:
         return bytes(chunk.data)
     data: bytes

@@ -14,6 +14,7 @@ from typing import NamedTuple
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.poses_csv import FramePoses, read_poses, write_poses
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.registry import Registry
 from fisheye_svp_ros.scene.observations import Observations
 
@@ -42,9 +43,7 @@ READERS: Registry[Reader] = Registry('readers', {
                f'{_HERE}.observations_csv'),
         Reader('an .orpc file', lambda path: path.suffix == '.orpc', f'{_HERE}.orpc'),
         Reader('a folder of .orpc files', _holds('*.orpc'), f'{_HERE}.orpc'),
-        Reader('a rosbag2 recording', lambda path: path.suffix == '.mcap',
-               f'{_HERE}.observations_bag'),
-        Reader('a folder of one', _holds('*.mcap'), f'{_HERE}.observations_bag'),
+        Reader('a rosbag2 recording', is_recording, f'{_HERE}.observations_bag'),
     )
 }, Reader)
 
