@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -31,8 +32,9 @@ class Recorder(Node):  # type: ignore[misc]
         self._bag = bag
         self._wanted = wanted
         self._warned: set[str] = set()
-        self.create_timer(_LOOK_EVERY, self._look)
-        self.create_timer(_FLUSH_EVERY, bag.flush)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
+        self.create_timer(_LOOK_EVERY, self._look, clock=steady)
+        self.create_timer(_FLUSH_EVERY, bag.flush, clock=steady)
 
     def spin(self) -> None:
         """Record until SIGINT or SIGTERM, and then what is on its way; a second one ends that."""

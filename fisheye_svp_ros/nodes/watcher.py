@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
@@ -50,7 +51,8 @@ class Watcher(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__('watcher')
         self.results: dict[str, Results] = {}
-        self.create_timer(_LOOK_EVERY, self._look)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
+        self.create_timer(_LOOK_EVERY, self._look, clock=steady)
 
     def spin(self, show: Callable[[], None]) -> None:
         """Follow until SIGINT or SIGTERM; `show` is called after whatever came."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable
@@ -28,6 +29,8 @@ from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.recorder import Recorder
+from fisheye_svp_ros.nodes.watcher import Watcher
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 SETS = 3
@@ -55,6 +58,17 @@ def test_without_a_clock_simulated_time_silences_no_diagnostics(
     g.start(Localizer)
     g.until(lambda: diagnostics)
     assert 'use_sim_time is true, but /clock' in diagnostics[0].status[0].message
+
+
+def test_simulated_time_that_stands_still_stops_neither_recorder_nor_watcher(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    g = graph('use_sim_time:=true')
+    with BagWriter(tmp_path / 'bag') as bag:
+        recorder = g.start(lambda: Recorder(bag, re.compile('/localizer/.*')))
+        watcher = g.start(Watcher)
+        g.probe.create_publisher(DiagnosticArray, '/localizer/result', 10)
+        g.until(lambda: recorder.topics and watcher.results, 20)
 
 
 def write_sets(bag: BagWriter, pause: Callable[[], None]) -> None:
