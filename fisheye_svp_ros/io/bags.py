@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
-from rosbags.rosbag2.storage_mcap import McapWriter
+from rosbags.rosbag2.storage_mcap import McapWriter, write_channel, write_string
 from rosbags.typesys import Stores, get_typestore
 
 from fisheye_svp_ros.errors import BagError
@@ -41,7 +42,7 @@ class Offered(NamedTuple):
 
 
 class _Storage(McapWriter):
-    """The writer of rosbags, with the checksum that it leaves out.
+    """The writer of rosbags, with the checksums and hashes of types that it leaves out.
 
     The file has the name that rosbag2 gives it; `ros2 bag reindex` looks for no other.
     """
@@ -49,6 +50,17 @@ class _Storage(McapWriter):
     def __init__(self, path: Path, compression: Any) -> None:
         super().__init__(path, compression)
         self.path = self.path.rename(path / f'{path.name}_0.mcap')
+
+    def add_connection(self, connection: Connection, offered_qos_profiles: str) -> None:
+        place, more = self.chunk.bio.tell(), BytesIO()
+        super().add_connection(connection, offered_qos_profiles)
+        # `ros2 bag reindex` knows the hash from nowhere else.
+        write_string(more, 'topic_type_hash')
+        write_string(more, connection.digest)
+        channel = self.channels[-1]
+        self.channels[-1] = channel._replace(metadata=channel.metadata + more.getvalue())
+        self.chunk.bio.seek(place)
+        write_channel(self.chunk.bio, self.channels[-1], self.schemas)
 
     def close_chunk(self) -> None:
         if not self.chunk.msgs:  # rosbag2 plays nothing of a file that begins with such a chunk

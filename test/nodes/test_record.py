@@ -20,6 +20,8 @@ import pytest
 import yaml
 from helpers.nodes import ROOT, NodeProcess, until
 from mcap.reader import make_reader
+from mcap.records import Channel
+from mcap.stream_reader import StreamReader
 
 pytest.importorskip('rosbags')
 from helpers import graph  # noqa: F401 - supplies the message packages
@@ -265,15 +267,33 @@ def test_no_chunk_is_without_messages(tmp_path: Path) -> None:
     assert [len(chunk.message_index_offsets) for chunk in summary.chunk_indexes] == [1]
 
 
+def metadata(bag: Path) -> dict[str, Any]:
+    """Return what metadata.yaml says of each topic."""
+    text = yaml.safe_load((bag / 'metadata.yaml').read_text())
+    topics = text['rosbag2_bagfile_information']['topics_with_message_count']
+    return {one['topic_metadata']['name']: one['topic_metadata'] for one in topics}
+
+
+def test_a_recording_says_what_its_types_are_where_rosbag2_looks_for_it(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / 'bag') as bag:
+        bag.write('/landmarks', CLOUD, b'')
+        bag.flush()
+        (unfinished,) = (tmp_path / 'bag').glob('*.mcap')
+        with unfinished.open('rb') as stream:
+            early = next(one for one in StreamReader(stream).records if isinstance(one, Channel))
+    with unfinished.open('rb') as stream:
+        (late,) = make_reader(stream).get_summary().channels.values()
+    wanted = 'RIHS01_9198cabf7da3796ae6fe19c4cb3bdd3525492988c70522628af5daa124bae2b5'
+    assert metadata(tmp_path / 'bag')['/landmarks']['type_description_hash'] == wanted
+    assert early.metadata == late.metadata and late.metadata['topic_type_hash'] == wanted
+
+
 def test_a_recording_says_what_its_publishers_offered(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
         bag.add('/landmarks', CLOUD, [Offered(latched=True)])
         bag.add('/camera_info', 'sensor_msgs/msg/CameraInfo', [Offered(reliable=False)])
-    text = yaml.safe_load((tmp_path / 'bag' / 'metadata.yaml').read_text())
     topics = {
-        one['topic_metadata']['name']: one['topic_metadata']['offered_qos_profiles']
-        for one in text['rosbag2_bagfile_information']['topics_with_message_count']
-    }
+        topic: one['offered_qos_profiles'] for topic, one in metadata(tmp_path / 'bag').items()}
     (latched,), (plain,) = topics['/landmarks'], topics['/camera_info']
     assert latched['durability'] == 'transient_local' and latched['reliability'] == 'reliable'
     assert plain['durability'] == 'volatile' and plain['reliability'] == 'best_effort'
