@@ -40,7 +40,9 @@ class StereoCalibrator(SolverNode):
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Calibrate with one more set; raise GeometryError where the views fix no rig."""
         scenario = scenario_of(items)
-        known = self._window if scenario == self._scenario else []
+        # A recording that starts over tells nothing new.
+        known = ([seen for seen in self._window if seen.stamp != stamp]
+                 if scenario == self._scenario else [])
         one = collected_set(stamp, landmarks, items, self.CAMERAS)
         window = [*known, one][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)

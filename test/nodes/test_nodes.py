@@ -29,10 +29,12 @@ from fisheye_svp_ros.io.clouds import LANDMARKS, RESIDUALS, unpack
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import camera, messages
 from fisheye_svp_ros.nodes.base import Finished
 from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.recorder import Recorder
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
@@ -567,6 +569,22 @@ def test_the_calibrator_never_mixes_scenarios(graph: Callable[..., Graph]) -> No
     views = [float(values(m)['views']) for m in results]
     assert views == [1, 2, 3, 4, 4, 4, 4, 4, 4, 4] * 4
     assert max(float(values(m)['position_error_m']) for m in results) < 1e-8
+
+
+def test_the_calibrator_counts_a_set_that_is_played_again_once(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    scenario = Scenario(lens='fish180', style='parallel', poses_file='calibration')
+    table = simulate_scenario(scenario).observations
+    few = table.take(table.frame < 3)
+    write_observations(tmp_path / 'observations.csv', replace(few, t=few.frame + 1.0))
+    g = graph(f'observations:={tmp_path}/observations.csv', 'lens:=fish180', 'rate:=50.0',
+              'measured_camera:wait_for_subscribers:=1', 'lock_step:=stereo_calibrator/result')
+    results = g.hear(DiagnosticArray, 'stereo_calibrator/result')
+    g.start(StereoCalibrator)
+    g.start(MeasuredCamera)
+    g.until(lambda: len(results) == 8)
+    assert [float(values(m)['views']) for m in results] == [1, 2, 3, 3, 3, 3, 3, 3]
 
 
 def test_depth_with_a_rig_from_a_topic(graph: Callable[..., Graph]) -> None:
