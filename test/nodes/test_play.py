@@ -129,11 +129,15 @@ def test_who_comes_late_to_a_recording_that_is_played_hears_its_landmarks(
     assert player.finish(signal.SIGINT if more else None) == 0
 
 
+@pytest.mark.parametrize('form', [
+    ('-s', 'mcap'),
+    ('-s', 'sqlite3', '--compression-mode', 'file', '--compression-format', 'zstd'),
+])
 def test_a_table_of_what_rosbag2_recorded_is_that_of_our_own_recording(
-    process: Callable[..., NodeProcess], rosbag2: Any, tmp_path: Path
+    process: Callable[..., NodeProcess], rosbag2: Any, tmp_path: Path, form: tuple[str, ...]
 ) -> None:
     theirs, own = tmp_path / 'theirs', tmp_path / 'own'
-    recorders = [process('ros2', 'bag', 'record', '-s', 'mcap', '-a', '-o', str(theirs)),
+    recorders = [process('ros2', 'bag', 'record', *form, '-a', '-o', str(theirs)),
                  process(*OURS, 'record', '-o', str(own))]
     localizer = process(*OURS, 'run', 'localizer', '--ros-args', '-p', 'wait_for_subscribers:=3')
     camera = process(
