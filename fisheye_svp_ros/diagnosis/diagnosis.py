@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.inputs import (
     check_cameras,
     check_other,
+    dithered,
     free_names,
     of_rig,
     rig_lenses,
@@ -161,7 +162,7 @@ def diagnose(
     if wanted.quick:
         observations = thinned(observations)
     progress('fitting the simulation as it is', 0.0)
-    everything = prepare(observations, poses)
+    everything = prepare(dithered(observations), poses)
     simulated = start(everything, first, others)
     if unrelated(everything, simulated):
         everything = each_alone(everything)

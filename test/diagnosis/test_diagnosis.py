@@ -74,6 +74,16 @@ def test_clean_data_is_adequate():
     assert found.noise_px == pytest.approx(SIGMA, rel=0.1)
 
 
+@pytest.mark.parametrize('terms', [(), ((CATALOGUE['skew'](), np.array([0.002])),)])
+def test_rounding_is_no_cause(terms):
+    """Points simulated without noise are exact but for what their numbers round to."""
+    rng = np.random.default_rng(11)
+    pose, views = scene(rng)
+    found = diagnose(observe(lens(), terms, pose, views, 0.0, rng), lens())
+    assert [cause.effect for cause in found.causes] == ['skew'][: len(terms)]
+    assert not found.remaining and found.noise_px < 2e-6
+
+
 @pytest.mark.parametrize(
     ('name', 'values'),
     [
