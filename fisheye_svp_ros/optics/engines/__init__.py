@@ -17,7 +17,6 @@ from types import ModuleType
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.engines import cache, numpy_engine, ported
-from fisheye_svp_ros.optics.engines.numpy_engine import pose_equations as pose_equations
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -26,6 +25,8 @@ ENGINES = ('auto', 'numpy', 'numba')
 VARIABLE = 'FISHEYE_SVP_ENGINE'
 LOADING = 4_000_000  # points that the reference projects while Numba loads what it has compiled
 _COMPILING = 400_000_000  # while it compiles
+
+pose_equations = numpy_engine.pose_equations
 
 
 def use(name: str) -> None:
