@@ -15,6 +15,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.choice import TraceStep
 from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.inputs import (
+    ROUNDING,
     check_cameras,
     check_other,
     dithered,
@@ -162,7 +163,7 @@ def diagnose(
     if wanted.quick:
         observations = thinned(observations)
     progress('fitting the simulation as it is', 0.0)
-    everything = prepare(dithered(observations), poses)
+    everything = prepare(observations, poses)
     simulated = start(everything, first, others)
     if unrelated(everything, simulated):
         everything = each_alone(everything)
@@ -192,11 +193,15 @@ def diagnose(
     noise_causes = growth_cause(found.growth)
     noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
     progress('measuring the gain on held-out data', 0.8)
-    return _judged(
+    judged = _judged(
         observations, lenses, found,
         Measured(found, free, held_out, wanted.quick, _stated(simulated), medium),
         noise_causes, cameras, held_out,
     )
+    if judged.noise_px > ROUNDING:
+        return judged
+    return diagnose(dithered(observations), lens, free_intrinsics=free_intrinsics, poses=poses,
+                    held_out=held_out, wanted=wanted, progress=progress)
 
 
 def _judged(

@@ -20,7 +20,7 @@ from fisheye_svp_ros.solve.measured import posable_views
 _OUTSIDE = 0.02  # of the points of a camera: more than single gross errors
 _AGAIN = 0.5  # of the image points: no two photographs have so many alike to the last digit
 _ELSEWHERE = 1e-3  # of a target's extent: more than places that are written less exactly
-_DITHER = 1e-6  # px
+ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
 _MANY, _FEWEST = 1500, 24  # points of a thinned table, and of a view that stays whole
 
 
@@ -75,7 +75,7 @@ def dithered(table: Observations) -> Observations:
     Where nothing else is left over, as of simulated points without noise, rounding is: it depends
     on place and frame, and would be taken for a cause.
     """
-    noise = _DITHER * np.random.default_rng(0).standard_normal(table.uv.shape)
+    noise = 10 * ROUNDING * np.random.default_rng(0).standard_normal(table.uv.shape)
     return replace(table, uv=table.uv + noise)
 
 
