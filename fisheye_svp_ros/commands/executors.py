@@ -71,12 +71,10 @@ class _Processes(ProcessPoolExecutor):
         result: Future[Any] = Future()
 
         def done(written: Future[Path]) -> None:
-            if written.cancelled():
-                result.cancel()
-            elif error := written.exception():
-                result.set_exception(error)
-            else:
+            try:
                 result.set_result(_taken(written.result()))
+            except Exception as error:
+                result.set_exception(error)
 
         super().submit(_written, self._folder, fn, *args, **kwargs).add_done_callback(done)
         return result

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +19,7 @@ import pytest
 from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands.executors import local
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
@@ -332,6 +335,16 @@ def test_workers_that_die_while_they_send_results_are_named(
         process.send_signal(signal.SIGCONT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 2 and 'a worker process died' in err
+
+
+def test_a_result_that_cannot_be_read_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
+    with local(1) as workers:
+        folder, = tmp_path.iterdir()
+        gone = workers.executor.submit(shutil.rmtree, str(folder))
+        assert isinstance(gone.exception(timeout=60), FileNotFoundError)
 
 
 def test_workers_end_with_a_sweep_that_is_killed(
