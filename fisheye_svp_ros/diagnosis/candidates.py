@@ -50,7 +50,7 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
         if kind.stage == 'noise' or name in left_out:
             continue
         try:
-            by_lens = _forms(kind, linear.scene, linear.state.labels)
+            by_lens = _forms(kind, linear)
         except Untestable as why:
             untestable[name] = str(why)
             continue
@@ -79,36 +79,40 @@ def forms_of(linear: Linearised, left_out: Sequence[str] = ()) -> Forms:
     return Forms(tuple(effects), tuple(at), columns, where, count, untestable)
 
 
-def simplest_form(kind: type[Effect], scene: Scene, labels: Sequence[str]) -> Effect:
+def simplest_form(kind: type[Effect], linear: Linearised) -> Effect:
     """Return the simplest form of an effect, of every camera of a rig where lenses have it.
 
     Raises Untestable where there is none.
     """
-    first = [forms[0] for forms in _forms(kind, scene, labels)]
+    first = [forms[0] for forms in _forms(kind, linear)]
     own = [effect for effect in first if isinstance(effect, OfCameras)]
     return together(own) if own else first[0]
 
 
-def _forms(
-    kind: type[Effect], scene: Scene, labels: Sequence[str]
-) -> list[Sequence[Effect]]:
+def _forms(kind: type[Effect], linear: Linearised) -> list[Sequence[Effect]]:
     """Return the forms of an effect; what a lens has, each lens of a rig has for itself.
 
     Raises Untestable where there is none.
     """
+    scene, labels = linear.scene, linear.state.labels
     of_lens = kind.stage in ('ray', 'image', 'detector') and not kind.of_target
     if not isinstance(scene, RigScene) or not of_lens:
-        return [kind.candidates(scene)]
+        return [_asked(kind, scene, linear.free)]
     found: list[Sequence[Effect]] = []
     reason = Untestable('no camera sees anything')
     for _, camera, own in scene.parts:
         try:
-            found.append(by_camera(camera, labels[camera], kind.candidates(own)))
+            found.append(by_camera(camera, labels[camera], _asked(kind, own, linear.free)))
         except Untestable as why:
             reason = why
     if not found:
         raise reason
     return found
+
+
+def _asked(kind: type[Effect], scene: Scene, free: Sequence[str]) -> Sequence[Effect]:
+    forms = kind.candidates(scene)
+    return [form.beside_intrinsics(scene) for form in forms] if free else forms
 
 
 def _of_all_cameras(

@@ -198,10 +198,10 @@ def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) 
     """
     if not wanted.included:
         return state
-    scene = Linearised(data, state, free).scene
+    linear = Linearised(data, state, free)
     for name in wanted.included:
         try:
-            state = with_effect(state, simplest_form(CATALOGUE[name], scene, state.labels))
+            state = with_effect(state, simplest_form(CATALOGUE[name], linear))
         except Untestable as why:
             raise ObservationError(f'{data.observations.source}: {name}: {why}') from why
     return refit_by_least_squares(data, state, free)

@@ -175,6 +175,10 @@ class Effect(ABC):
         """Return the form that holds this one and another of the same effect."""
         return other
 
+    def beside_intrinsics(self, scene: Scene) -> Effect:
+        """Return the form to ask for where the lens's own intrinsics are fitted, too."""
+        return self
+
     @property
     def of_recording(self) -> bool:
         """Whether it happened to one recording, so that neither lens nor target has it."""

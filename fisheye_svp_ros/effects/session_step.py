@@ -19,10 +19,13 @@ class SessionStepEffect(Effect):
     """From each of the given instants (or frames, where no time is known) on, other intrinsics.
 
     Every step adds to the ones before it.
+    means: the shares of frames after each start, where intrinsics are fitted, too: the lens's own
+    are then those of the mean frame, and not those of the first session.
     """
 
     starts: tuple[float, ...] = ()
     timed: bool = field(default=True, metadata={'key': False})
+    means: tuple[float, ...] = field(default=(), metadata={'key': False})
 
     name = 'session_step'
     stage = 'image'
@@ -40,11 +43,18 @@ class SessionStepEffect(Effect):
             raise Untestable('fewer than six frames')
         return [cls((float(start),), timed) for start in instants[2:-1]]
 
+    def beside_intrinsics(self, scene: Scene) -> Effect:
+        return replace(self, means=tuple(self._after(scene).mean(axis=0).tolist()))
+
     def holds_for(self, t: Array, known: Array) -> bool:
         return self.timed and super().holds_for(t, known)
 
     def joined(self, other: Self) -> Effect:
-        return replace(self, starts=tuple(dict.fromkeys((*self.starts, *other.starts))))
+        means: dict[float, float] = {}
+        for step in (self, other):
+            none = (0.0,) * len(step.starts)
+            means |= zip(step.starts, step.means or none, strict=True)
+        return replace(self, starts=tuple(means), means=tuple(means.values()))
 
     def refocused(self, values: Array, ratio: float) -> Array:
         return np.asarray((values.reshape(-1, len(_STEP)) / [ratio, 1.0, 1.0]).ravel())
@@ -62,7 +72,11 @@ class SessionStepEffect(Effect):
         growth = (scene.normalised() * focal)[..., None]
         shift = np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))
         step = np.concatenate([growth, shift], axis=-1)
-        instant = scene.times if self.timed else scene.views.frame
-        after = (instant[:, None] >= np.array(self.starts)).astype(float)
+        after = self._after(scene) - (self.means or 0.0)
         columns = step[..., None, :] * after[:, None, None, :, None]
         return np.asarray(columns.reshape(*scene.uv.shape, len(self.parameters)))
+
+    def _after(self, scene: Scene) -> Array:
+        """Return 1.0 where views (S,) come after the starts (K,), 0.0 where before: (S, K)."""
+        instant = scene.times if self.timed else scene.views.frame
+        return np.asarray(instant[:, None] >= np.array(self.starts), dtype=float)

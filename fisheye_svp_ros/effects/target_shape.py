@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
@@ -70,8 +71,8 @@ class TargetShapeEffect(Effect):
         for number, ox, oy, oz, ax, ay, az, bx, by, bz, size in self.boards:
             arm = (views.points - np.array([ox, oy, oz])) / size
             first, second = np.array([ax, ay, az]), np.array([bx, by, bz])
-            a, b = arm @ first, arm @ second
-            shape = np.stack([a**i * b**j for i, j in _powers(self.degree)], axis=-1)
+            a, b = (polynomial.polyvander(arm @ axis, self.degree) for axis in (first, second))
+            shape = np.stack([a[..., i] * b[..., j] for i, j in _powers(self.degree)], axis=-1)
             shape = shape * (views.board == number)[..., None]
             blocks.append(shape[..., None, :] * np.cross(first, second)[:, None])
         return np.concatenate(blocks, axis=-1)

@@ -319,6 +319,17 @@ def test_what_happened_to_a_recording_is_no_part_of_the_lens():
     assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
+def test_a_lens_that_is_fitted_is_that_of_the_mean_session():
+    step, first = CATALOGUE['session_step']((12.0,), False), lens()
+    table = table_of(22, 24, terms=[(step, np.array([0.004, 1.0, -2.0]))])
+    found = diagnose(table, first, free_intrinsics=True)
+    assert [cause.effect for cause in found.causes] == ['session_step']
+    cx, cy, fx = (found.intrinsics[name] for name in ('cx', 'cy', 'fx'))
+    assert abs(cx.after - first.cx - 0.5) < 3 * cx.after_stderr
+    assert abs(cy.after - first.cy + 1.0) < 3 * cy.after_stderr
+    assert abs(fx.after / first.fx - 1.002) < 3 * fx.after_stderr / first.fx
+
+
 @pytest.mark.parametrize('kept', [
     lambda t: t.frame < 1,
     lambda t: t.frame < 2,
