@@ -10,6 +10,7 @@ Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), ch
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -261,15 +262,24 @@ def factored(eq: Equations, lam: Array, weight: Array) -> Factored:
     diagonal = np.arange(b.ee.shape[1])
     ee = b.ee.copy()
     ee[:, diagonal, diagonal] += e
-    inverse = np.linalg.inv(np.linalg.cholesky(ee))
-    coupled, block_border = inverse @ b.er, inverse @ b.ex
-    count = b.e_label.size
-    flat, bent = coupled.reshape(count, len(b.rr)), block_border.reshape(count, len(b.xx))
-    rr = b.rr - flat.T @ flat
+    count, cut = e.size, len(e) // 2
+    inverse, coupled, block_border = np.empty_like(ee), np.empty_like(b.er), np.empty_like(b.ex)
+
+    def eliminated(part: slice) -> tuple[Array, Array]:
+        inverse[part] = np.linalg.inv(np.linalg.cholesky(ee[part]))
+        np.matmul(inverse[part], b.er[part], out=coupled[part])
+        np.matmul(inverse[part], b.ex[part], out=block_border[part])
+        flat = coupled[part].reshape(e[part].size, len(b.rr))
+        return flat.T @ flat, flat.T @ block_border[part].reshape(len(flat), len(b.xx))
+
+    # Two threads: most of the time goes here, and NumPy lets go of the interpreter.
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(eliminated, (slice(cut), slice(cut, None)))
+    rr, bent = b.rr - first[0] - second[0], block_border.reshape(count, len(b.xx))
     rr[np.diag_indices_from(rr)] += r
     if len(rr):
         factor = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
-        border = solve_lower(factor, b.rx - flat.T @ bent)
+        border = solve_lower(factor, b.rx - first[1] - second[1])
     else:
         factor, border = rr, b.rx
     information = b.xx - bent.T @ bent - border.T @ border
