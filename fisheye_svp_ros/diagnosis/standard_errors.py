@@ -10,10 +10,11 @@ from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.choice import candidates
-from fisheye_svp_ros.diagnosis.evidence import Evidence
+from fisheye_svp_ros.diagnosis.evidence import Evidence, Score
 from fisheye_svp_ros.effects.base import Effect
 
 _MOST = 40  # models
+_FEWEST = 3  # frames
 _WINDOW = 6.0  # of merit: odds of 20, beyond which a model counts for nothing (Occam's window)
 
 
@@ -72,8 +73,8 @@ def model_uncertainty(evidence: Evidence) -> Array:
     """Return what other models, likely too, add to standard errors (K,) of what is shared.
 
     Each model with more effects, or with another effect in the place of one, is as probable as its
-    evidence says (BIC; Raftery 1995, eq. 35), and adds so much of the variance that it brings and
-    of the square of the change.  Beside a further form of an effect, or without it, its parameters
+    evidence says (`_evidence_for`), and adds so much of the variance that it brings and of the
+    square of the change.  Beside a further form of an effect, or without it, its parameters
     mean something else: for them that model does not count.
     """
     own, information, reported = evidence.own, evidence.information, _reported(evidence)
@@ -93,6 +94,17 @@ def model_uncertainty(evidence: Evidence) -> Array:
                 more[columns] = 0.0
         added += weight * more
     return np.asarray(np.sqrt(added) / evidence.scale[:own])
+
+
+def _evidence_for(evidence: Evidence, score: Score) -> float:
+    """Return twice the logarithm of the odds that an effect of such a score is there (BIC).
+
+    What counts as so many observations are the frames: points of one have errors in common.
+    Source: Raftery 1995, eq. 35; Pauler, The Schwarz criterion and related methods for normal
+    linear models (1998), for the number.
+    """
+    frames = max(evidence.linear.data.frames, _FEWEST)
+    return float(score.statistic - score.rank * np.log(frames))
 
 
 class _Model(NamedTuple):
@@ -115,12 +127,12 @@ def _likely_models(evidence: Evidence) -> list[_Model]:
         forms, model = max(waiting.items(), key=lambda item: item[1].merit)
         found[forms] = waiting.pop(forms)
         for one in candidates(evidence, model.included, per_frame=False):
-            kinds = set(one.effect.kinds)
-            if one.merit <= 0 or model.kinds & kinds:
+            kinds, gain = set(one.effect.kinds), _evidence_for(evidence, one.score)
+            if gain <= 0 or model.kinds & kinds:
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, evidence.columns_of(one.form)])
-                waiting[larger] = _Model(model.merit + one.merit, columns, model.kinds | kinds)
+                waiting[larger] = _Model(model.merit + gain, columns, model.kinds | kinds)
     return [*found.values()]
 
 
@@ -134,13 +146,14 @@ def _exchanged(evidence: Evidence) -> Iterator[tuple[frozenset[int], _Model]]:
             continue
         rest = np.setdiff1d(np.arange(evidence.own), columns)
         score = evidence.score(evidence.remaining(evidence.information, rest), columns)
-        lost = score.statistic - score.rank * np.log(evidence.full.rows)
+        lost = _evidence_for(evidence, score)
         for one in candidates(evidence, rest, per_frame=False):
             kinds = frozenset(one.effect.kinds)
-            if one.merit > lost - _WINDOW and _lasts(one.effect) and not evidence.kinds & kinds:
+            gain = _evidence_for(evidence, one.score) - lost
+            if gain > -_WINDOW and _lasts(one.effect) and not evidence.kinds & kinds:
                 included = np.concatenate([rest, evidence.columns_of(one.form)])
                 yield frozenset({~i, one.form}), _Model(
-                    one.merit - lost, included, kinds | set(effect.kinds))
+                    gain, included, kinds | set(effect.kinds))
 
 
 def _lasts(effect: Effect) -> bool:

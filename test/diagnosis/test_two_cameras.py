@@ -87,7 +87,7 @@ def test_what_the_user_knows_of_lenses_each_camera_of_a_rig_has_for_itself():
     data = prepare(seen.table)
     first, *others = seen.lenses.values()
     state = start(data, first, others)
-    effect = simplest_form(ViewpointShiftEffect, Linearised(data, state, ()).scene, state.labels)
+    effect = simplest_form(ViewpointShiftEffect, Linearised(data, state, ()))
     assert [parameter.name for parameter in effect.parameters] == ['left.e0', 'right.e0']
     assert effect.kinds == ('left.viewpoint_shift', 'right.viewpoint_shift')
 
