@@ -19,9 +19,7 @@ from fisheye_svp_ros.io.recording import (
     residual_sets,
     tabulate,
 )
-from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
 from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 
 _FIELDS = 4  # residual fields a lens
 _TABLES = ('.csv', '.parquet')
@@ -56,11 +54,15 @@ def _table_in(source: Path) -> Path | None:
 
 
 def _of_table(path: Path, folder: Path) -> list[Path]:
+    from fisheye_svp_ros.reporting.sweep_plots import draw_table
+
     with progress('drawing'):
         return draw_table(read_columns(path), folder)
 
 
 def _of_bag(args: argparse.Namespace) -> list[Path]:
+    from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
+
     bag = Bag(args.source)
     with progress('reading', 2 * bag.size) as passed:
         columns = tabulate(bag.records(is_tabulated, passed))
@@ -87,6 +89,8 @@ def _fields(found: list[ResidualSet], path: Path) -> list[Path]:
             named.setdefault(key, one)
     if not named:
         return []
+    from fisheye_svp_ros.paper.demonstration_plots import draw_residual_fields
+
     draw_residual_fields(list(named.values()), path)
     return [path]
 

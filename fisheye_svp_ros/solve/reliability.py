@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtri
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -142,6 +141,8 @@ def doubt_of_pairs(
 
 def misfit_fails(cost: Array, freedom: Array) -> Mask:
     """Say whether whitened sums of squares are more than degrees of freedom allow."""
+    from scipy.special import chdtri  # takes a third of the time that `--help` may take
+
     return np.asarray(cost > chdtri(np.maximum(freedom, 1), _ALARM))
 
 

@@ -319,6 +319,18 @@ class TestCommandLine:
         for name in cli.COMMANDS:
             assert name in run.stdout
 
+    def test_no_help_of_a_command_waits_for_what_draws_or_solves(self):
+        code = (
+            'import sys\nfrom fisheye_svp_ros.cli import COMMANDS, main\n'
+            'for name in COMMANDS:\n'
+            '    try:\n        main([name, "--help"])\n    except SystemExit:\n        pass\n'
+            'print(sorted({"matplotlib", "scipy", "numba"} & set(sys.modules)))'
+        )
+        run = subprocess.run(
+            [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        assert run.stdout.splitlines()[-1] == '[]'
+
     def test_interrupt_is_silent(self, tmp_path):
         (tmp_path / 'a.yaml').write_text(
             f'synthetic_camera: {{ros__parameters: {{sweep.seed: {list(range(9000))}}}}}')
