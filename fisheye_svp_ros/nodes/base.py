@@ -15,7 +15,6 @@ from typing import Any, ClassVar, TypeVar
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException
@@ -29,6 +28,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.declaration import declare
 from fisheye_svp_ros.nodes.inputs import Count, Unread, twins
+from fisheye_svp_ros.nodes.timers import every
 from fisheye_svp_ros.study.settings import Settings
 
 # All topics are reliable; inputs are deep enough for what comes while a solver is busy.
@@ -146,8 +146,7 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def every(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
         """Have a function called every `period` seconds, of real time where no clock is given."""
-        clock = clock or Clock(clock_type=ClockType.STEADY_TIME)
-        return self.create_timer(period, self.guarded(callback), clock=clock)
+        return every(self, period, self.guarded(callback), clock)
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fisheye_svp_ros.io.bags import BagWriter, Offered
+from fisheye_svp_ros.nodes.timers import every
 
 _COUNTED = ('/image_points', '/result')
 _LOOK_EVERY = 0.2  # s, for topics that are new
@@ -32,9 +32,8 @@ class Recorder(Node):  # type: ignore[misc]
         self._bag = bag
         self._wanted = wanted
         self._warned: set[str] = set()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
-        self.create_timer(_LOOK_EVERY, self._look, clock=steady)
-        self.create_timer(_FLUSH_EVERY, bag.flush, clock=steady)
+        every(self, _LOOK_EVERY, self._look)
+        every(self, _FLUSH_EVERY, bag.flush)
 
     def spin(self) -> None:
         """Record until SIGINT or SIGTERM, and then what is on its way; a second one ends that."""

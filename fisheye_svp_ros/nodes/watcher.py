@@ -8,13 +8,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.nodes.base import RELIABLE
+from fisheye_svp_ros.nodes.timers import every
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 _LOOK_EVERY = 0.5  # s, for nodes that are new
@@ -51,8 +51,7 @@ class Watcher(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__('watcher')
         self.results: dict[str, Results] = {}
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # simulated time may stand still
-        self.create_timer(_LOOK_EVERY, self._look, clock=steady)
+        every(self, _LOOK_EVERY, self._look)
 
     def spin(self, show: Callable[[], None]) -> None:
         """Follow until SIGINT or SIGTERM; `show` is called after whatever came."""
