@@ -37,21 +37,20 @@ def local(count: int) -> Iterator[Workers]:
     if not count:
         yield Workers(InProcess(), 1)
         return
-    folder = tempfile.TemporaryDirectory(prefix='fisheye_svp_')
-    executor = _Processes(count, folder.name)
-    try:
-        yield Workers(executor, _AHEAD * count)
-    except BrokenExecutor as cause:
-        raise SweepError('a worker process died (out of memory?); what is done is kept, '
-                         '--resume goes on with fewer --workers') from cause
-    except (KeyboardInterrupt, SystemExit):
-        # Nobody waits any longer for what they are at.
-        for process in multiprocessing.active_children():
-            process.terminate()
-        raise
-    finally:
-        executor.shutdown(cancel_futures=True)
-        folder.cleanup()
+    with tempfile.TemporaryDirectory(prefix='fisheye_svp_') as folder:
+        executor = _Processes(count, folder)
+        try:
+            yield Workers(executor, _AHEAD * count)
+        except BrokenExecutor as cause:
+            raise SweepError('a worker process died (out of memory?); what is done is kept, '
+                             '--resume goes on with fewer --workers') from cause
+        except (KeyboardInterrupt, SystemExit):
+            # Nobody waits any longer for what they are at.
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+        finally:
+            executor.shutdown(cancel_futures=True)
 
 
 class _Processes(ProcessPoolExecutor):
