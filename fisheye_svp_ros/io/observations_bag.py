@@ -45,10 +45,11 @@ def read(path: str | Path) -> Observations:
         else:
             sets.append(_Set(stamp, namespace, read_image_points(record.message, where)))
     if len(worlds) != 1 or not sets:
-        found = ', '.join(sorted(worlds)) or 'none'
+        found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
+        wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
         raise ObservationError(
             f'{path}: observations need image_points and landmarks of one namespace; landmarks '
-            f'are in: {found}'
+            f"are in: {found}; record with --topics '{wanted}'"
         )
     return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
 

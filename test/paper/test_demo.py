@@ -14,8 +14,9 @@ from helpers import graph  # noqa: F401 - skips where there is neither ROS 2 nor
 from helpers.nodes import ROOT
 
 from fisheye_svp_ros.commands.processes import Processes
-from fisheye_svp_ros.errors import BagError, StandaloneError
+from fisheye_svp_ros.errors import BagError, ObservationError, StandaloneError
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.paper.demonstration import demo_rows
 
@@ -75,6 +76,11 @@ def test_everything_is_recorded(demo: Any) -> None:
     pose = types['/localization/localizer/pose']
     assert pose == 'geometry_msgs/msg/PoseWithCovarianceStamped'
     assert types['/depth/stereo_depth/metrics/error3_m'] == 'std_msgs/msg/Float64'
+
+
+def test_as_observations_it_says_how_to_record_one_of_its_namespaces(demo: Any) -> None:
+    with pytest.raises(ObservationError, match=r"calibration, /depth, .*--topics '/localization/"):
+        read_observations(demo[0] / 'recording')
 
 
 def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
