@@ -27,7 +27,12 @@ from rosbags.typesys import Stores, get_typestore
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.databases import database_messages, database_topics
 from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
-from fisheye_svp_ros.io.recording_files import recording_files, unpacked, unpacked_message
+from fisheye_svp_ros.io.recording_files import (
+    metadata_topics,
+    recording_files,
+    unpacked,
+    unpacked_message,
+)
 
 _SHOWN = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
@@ -195,11 +200,7 @@ class Bag:
 
         Raises BagError where nothing can be read.
         """
-        listed = []
-        for file in self._files():
-            with unpacked(file, _ignore) as plain:
-                list_topics = database_topics if plain.suffix == '.db3' else listed_topics
-                listed.append(list_topics(plain))
+        listed = [_listed(file) for file in self._files()]
         if all(listed):
             return set().union(*listed)
         return {(message.topic, message.typename) for message in self._raw(_ignore, _ignore)}
@@ -228,6 +229,13 @@ class Bag:
         if problems and not count:
             raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
                            f'({"; ".join(problems[:_SHOWN])})')
+
+
+def _listed(file: Path) -> set[tuple[str, str]]:
+    """Return the topics and types that a file, or the metadata beside it, lists; empty if not."""
+    if file.suffix == '.zstd':
+        return metadata_topics(file.parent)  # it is not unpacked for this alone
+    return database_topics(file) if file.suffix == '.db3' else listed_topics(file)
 
 
 def _ignore(_: object) -> None:

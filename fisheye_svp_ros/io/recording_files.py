@@ -5,12 +5,13 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zstandard
 
 from fisheye_svp_ros.errors import BagError
+from fisheye_svp_ros.io.documents import read_yaml
 
 LARGEST = 1 << 28  # bytes of a chunk or a message, decompressed
 
@@ -30,6 +31,15 @@ def recording_files(path: Path) -> list[Path]:
     return sorted(_files_in(path) if path.is_dir() else [path], key=lambda file: [
         (int(word), '') if word.isdecimal() else (0, word)
         for word in re.split(r'(\d+)', file.name)])
+
+
+def metadata_topics(folder: Path) -> set[tuple[str, str]]:
+    """Return the topics and types that the metadata of a recording lists; empty without."""
+    with suppress(BagError, KeyError, TypeError):
+        known = read_yaml(folder / 'metadata.yaml', BagError)['rosbag2_bagfile_information']
+        topics = [topic['topic_metadata'] for topic in known['topics_with_message_count']]
+        return {(str(topic['name']), str(topic['type'])) for topic in topics}
+    return set()
 
 
 @contextmanager
