@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -17,10 +18,12 @@ from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.next_photographs import Room
+    from fisheye_svp_ros.diagnosis.next_question import Next
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,6 +73,7 @@ def run(args: argparse.Namespace) -> None:
     print('  standard errors to expect: '
           + ', '.join(f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
                       for name, error in planned.stderr.items()))
+    _note_guessed(lens, wanted)
     if args.output:
         print(f'{args.output}: plan.pdf, plan.json, poses.csv')
 
@@ -83,6 +87,19 @@ def room_of(given: Sequence[float]) -> Room:
         raise ParameterError(f'--room {near:g} {far:g}: two distances above 0 are needed, m, the '
                              'nearer first')
     return Room(near, far)
+
+
+def _note_guessed(lens: Lens, wanted: Next) -> None:
+    """Name the views that need more of a lens than it was calibrated for."""
+    match (lens.calibration or {}).get('reached_deg'):
+        case float(reached) | int(reached) if lens.port is None:
+            seen = wanted.shots.camera.into_body(wanted.board.points)
+            angle = np.degrees(incidence(lens, seen).theta.max(axis=-1))
+            further = [str(i + 1) for i in np.flatnonzero(angle > reached)]
+            if further:
+                say(f'lens {lens.name!r} was calibrated up to {reached:.0f} degrees off the axis; '
+                    f'views {", ".join(further)} reach further, up to {angle.max():.0f}, where '
+                    'the board may be seen elsewhere than drawn, or not at all')
 
 
 def _lens(args: argparse.Namespace) -> Lens:

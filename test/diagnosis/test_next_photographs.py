@@ -207,6 +207,18 @@ def test_a_board_that_never_fits_is_refused_by_its_corners(monkeypatch, capsys):
     assert sum(looked_at) < 100_000
 
 
+def test_views_past_what_a_lens_was_calibrated_for_are_named(tmp_path, capsys):
+    lens = {'name': 'narrow', 'image': {'width': 640, 'height': 480},
+            'projection': {'model': 'equidistant', 'f': 200.0, 'cx': 320.0, 'cy': 240.0}}
+    for reached in (50, 115):
+        (tmp_path / 'lens.yaml').write_text(json.dumps(
+            {**lens, 'calibration': {'reached_deg': reached}}))
+        assert main(['plan', '--lens', str(tmp_path / 'lens.yaml'), '--board',
+                     'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '3']) == 0
+        noted = 'calibrated up to 50 degrees off the axis; views ' in capsys.readouterr().err
+        assert noted == (reached == 50)
+
+
 def test_a_plan_before_the_first_photograph(tmp_path, capsys):
     command = ['plan', '--fov', '170', '--image-size', '640x480', '--board',
                'chessboard:9x6:25mm', '--room', '0.15', '0.8', '--count', '4']
