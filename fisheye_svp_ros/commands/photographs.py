@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _SHOWN = 12
+_UNCERTAIN = 0.9
 
 
 def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
@@ -130,11 +131,16 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         detection = detect(find_photographs(paths, args.every), pattern, args.detector,
                            progress=done, source=', '.join(paths))
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
-           for one in detection.searched if one.reason or one.notes]
+           for one in sorted(detection.searched, key=lambda one: not one.reason)
+           if one.reason or one.notes]
     for line in odd[:_SHOWN]:
         say(line)
     if len(odd) > _SHOWN:
         say(f'and {len(odd) - _SHOWN} more such photographs')
+    unsure = int((detection.certainty < _UNCERTAIN).sum())
+    if unsure:
+        say(f'{unsure} photographs: which corner is the first is less than '
+            f'{100 * _UNCERTAIN:.0f} % sure, since {args.board} looks the same when turned')
     found = sum(one.points is not None for one in detection.searched)
     if 2 * found < len(detection.searched):
         say(f'most photographs show no {args.board}: check kind and size of the board'

@@ -14,13 +14,14 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
-from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals
-from fisheye_svp_ros.detect.patterns import Pattern
+from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turned
+from fisheye_svp_ros.detect.patterns import Pattern, Turn
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
@@ -28,7 +29,7 @@ SECONDS = 30.0  # a photograph
 _BLURRED = 1.5  # times the median blur, and px
 _BURNT = 0.02  # of the board's pixels as bright as pixels can be
 _SAME_PLACE = 0.3  # px
-_UNCERTAIN = 0.9
+_FEWEST = 3  # frames of two cameras that say how they stand
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
 _UNTURNED = 'asks to be shown turned; taken as the sensor lay'
 _DAMAGED = 'damaged: the JPEG decodes in part; fetch it again'
@@ -223,6 +224,7 @@ def _agreed(
     """Return the photographs with their corners in one order, and how sure that is."""
     table = _observations(found, pattern, cameras, number, source)
     field = np.full((len(found), len(pattern.points), 2), np.nan)
+    poses = Pose(np.full((len(found), 3, 3), np.nan), np.full((len(found), 3), np.nan))
     for camera, name in enumerate(cameras):
         mine = {number[one.key]: i for i, one in enumerate(found) if one.camera == name}
         size = next(one.size for one in found if one.camera == name)
@@ -237,26 +239,55 @@ def _agreed(
             field[mine[frame], views.landmark[view, used]] = board_residuals(
                 views.points[view, used, :2], views.uv[view, used],
                 fitted.adjusted.residual[view, used])
+            for whole, part in zip(poses, fitted.adjusted.pose, strict=True):
+                whole[mine[frame]] = part[view]
     seen = np.isfinite(field).any(axis=(1, 2))
     sure = np.full(len(found), np.nan)
     if seen.sum() < 3:
         return found, sure
-    agreement: Agreement = agree(field[seen], pattern.symmetries)
-    sure[seen] = agreement.certainty
+    leader, own = _led(found, cameras, poses, pattern)
+    together = np.zeros_like(field)
+    for i in np.flatnonzero(seen):
+        together[leader[i]] += np.nan_to_num(turned(field[i], pattern.symmetries[own[i]]))
+    leaders = np.unique(leader[seen])
+    agreement: Agreement = agree(together[leaders], pattern.symmetries)
     done = list(found)
-    for i, turn in zip(np.flatnonzero(seen), agreement.turn, strict=True):
-        points = found[i].points
+    for i in np.flatnonzero(seen):
+        at = np.searchsorted(leaders, leader[i])
+        points, sure[i] = found[i].points, agreement.certainty[at]
         assert points is not None
-        source_of = pattern.symmetries[turn].source
-        where = np.argsort(source_of)
-        order = np.argsort(where[points.ids], kind='stable')
-        turned = points._replace(ids=where[points.ids][order], uv=points.uv[order],
-                                 sigma=points.sigma[order], reach=points.reach[order])
-        notes = found[i].notes
-        if sure[i] < _UNCERTAIN:
-            notes = (*notes, f'order of corners {100 * sure[i]:.0f} % sure')
-        done[i] = replace(found[i], points=turned, notes=notes)
+        for turn in (own[i], agreement.turn[at]):
+            points = _turned_points(points, pattern.symmetries[turn])
+        done[i] = replace(found[i], points=points)
     return done, sure
+
+
+def _led(
+    found: list[Searched], cameras: tuple[str, ...], poses: Pose, pattern: Pattern
+) -> tuple[Index, Index]:
+    """Return with which photograph (S,) each one is turned, and how it is turned to fit that.
+
+    Those of a rig go with the first camera's of the same moment, all others by themselves.
+    """
+    leader, own = np.arange(len(found)), np.zeros(len(found), dtype=int)
+    posed = set(np.flatnonzero(np.isfinite(poses.position).all(axis=1)).tolist())
+    first = {found[i].key: i for i in posed if found[i].camera == cameras[0]}
+    for name in cameras[1:]:
+        mine = np.array(sorted(
+            i for i in posed if found[i].camera == name and found[i].key in first), dtype=int)
+        theirs = np.array([first[found[i].key] for i in mine], dtype=int)
+        turns = of_rig(poses.take(theirs), poses.take(mine), pattern.points[:, :2],
+                       pattern.symmetries) if len(mine) >= _FEWEST else None
+        if turns is not None:
+            leader[mine], own[mine] = theirs, turns
+    return leader, own
+
+
+def _turned_points(points: Points, turn: Turn) -> Points:
+    where = np.argsort(turn.source)
+    order = np.argsort(where[points.ids], kind='stable')
+    return points._replace(ids=where[points.ids][order], uv=points.uv[order],
+                           sigma=points.sigma[order], reach=points.reach[order])
 
 
 def _observations(

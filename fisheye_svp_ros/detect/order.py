@@ -2,7 +2,8 @@
 
 Single corners are never quite where they should be, and what is wrong with them turns with the
 board.  After a calibration that believes them, each view's residuals are a picture of those
-errors; views are turned until their pictures agree.
+errors; views are turned until their pictures agree.  Cameras of a rig see one board at one moment:
+their views are turned so that the cameras stand alike in all frames, and then as one.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.patterns import Turn, local_axes
+from fisheye_svp_ros.pose import Pose
 
 _ROUNDS = 30
 _SHUFFLES = 8
+_TRIED = 50  # frames, each of which may say how two cameras stand
+_ALIKE = 0.1  # rad, and of the distance of the board, by which half of the frames may differ
 
 
 class Agreement(NamedTuple):
@@ -29,6 +33,33 @@ def board_residuals(points: Array, uv: Array, residual: Array) -> Array:
     """Return residuals (M, 2), px, of points (M, 2), m, seen at uv (M, 2), as m on the board."""
     axes = local_axes(points, uv)
     return np.asarray(np.linalg.solve(np.swapaxes(axes, -1, -2), residual[..., None])[..., 0])
+
+
+def turned(field: Array, turn: Turn) -> Array:
+    """Return residuals (..., N, 2) on the board as they are once the board is turned."""
+    return np.asarray(field[..., turn.source, :] @ turn.matrix.T)
+
+
+def of_rig(one: Pose, other: Pose, points: Array, turns: tuple[Turn, ...]) -> Index | None:
+    """Return which turns of `other` let two cameras stand alike in all frames (F,).
+
+    one, other: of the cameras before the board with points (N, 2), m.  None where there is no
+    such turn for most frames: the cameras are no rig.
+    """
+    rotation = np.tile(np.eye(3), (len(turns), 1, 1, 1))
+    place = np.zeros((len(turns), 1, 3))
+    for i, turn in enumerate(turns):
+        rotation[i, 0, :2, :2] = turn.matrix
+        place[i, 0, :2] = (points - points[turn.source] @ turn.matrix.T).mean(axis=0)
+    between = one.inverse().compose(Pose(rotation, place).compose(other))
+    tried = Pose(*(part[:, :_TRIED].reshape(-1, *part.shape[2:]) for part in between))
+    cosine = np.einsum('hij,gfij->hgf', tried.rotation, between.rotation) / 2 - 0.5
+    away = np.linalg.norm(one.position - [*points.mean(axis=0), 0.0], axis=-1)
+    off = np.arccos(np.clip(cosine, -1, 1)) + np.linalg.norm(
+        tried.position[:, None, None] - between.position, axis=-1) / away
+    typical = np.median(off.min(axis=1), axis=-1)
+    best = int(typical.argmin())
+    return off[best].argmin(axis=0) if typical[best] < _ALIKE else None
 
 
 def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
@@ -47,34 +78,34 @@ def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
 
 def _agreed(field: Array, turns: tuple[Turn, ...]) -> tuple[Index, Array]:
     """Return the best turns (V,) and how much better each is than the next, (V,)."""
-    turned = np.stack([field[:, turn.source] @ turn.matrix.T for turn in turns])
-    turned = turned.reshape(len(turns), len(field), -1)
-    turned -= turned.mean(axis=0)  # what looks the same in all turns tells nothing
-    turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
+    ways = np.stack([turned(field, turn) for turn in turns])
+    ways = ways.reshape(len(turns), len(field), -1)
+    ways -= ways.mean(axis=0)  # what looks the same in all turns tells nothing
+    ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-30)
     # Views alike in all turns say nothing: start from each view in turn, keep the best agreement.
-    found = [_settled(turned, turned[0, seed]) for seed in range(len(field))]
-    choice = max(found, key=lambda one: _likeness(turned, one)[one, np.arange(len(one))].sum())
-    likeness = _likeness(turned, choice)
+    found = [_settled(ways, ways[0, seed]) for seed in range(len(field))]
+    choice = max(found, key=lambda one: _likeness(ways, one)[one, np.arange(len(one))].sum())
+    likeness = _likeness(ways, choice)
     ranked = np.sort(likeness, axis=0)
     return choice, np.asarray(ranked[-1] - ranked[-2]) / 2
 
 
-def _settled(turned: Array, first: Array) -> Index:
-    choice: Index = (turned @ first).argmax(axis=0)
+def _settled(ways: Array, first: Array) -> Index:
+    choice: Index = (ways @ first).argmax(axis=0)
     for _ in range(_ROUNDS):
-        better = _likeness(turned, choice).argmax(axis=0)
+        better = _likeness(ways, choice).argmax(axis=0)
         if np.array_equal(better, choice):
             break
         choice = better
     return choice
 
 
-def _likeness(turned: Array, choice: Index) -> Array:
+def _likeness(ways: Array, choice: Index) -> Array:
     """Likeness (G, V) of each view, in each turn, to the mean of all others."""
-    chosen = turned[choice, np.arange(len(choice))]
+    chosen = ways[choice, np.arange(len(choice))]
     others = chosen.sum(axis=0) - chosen
     others /= np.maximum(np.linalg.norm(others, axis=-1, keepdims=True), 1e-30)
-    return np.asarray((turned * others).sum(axis=-1))
+    return np.asarray((ways * others).sum(axis=-1))
 
 
 def _certainty(margin: Array, chance: float) -> Array:

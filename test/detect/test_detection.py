@@ -43,6 +43,7 @@ from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 
@@ -624,7 +625,31 @@ class TestOrder:
         board = Print(6, 4, 0.030)
         where = poses(8, 6, board)
         write(tmp_path, [photograph(where.take(i), board, seed=i) for i in range(8)])
-        assert found(tmp_path, 'chessboard:6x4:30mm').certainty.mean() < 0.95
+        detection = found(tmp_path, 'chessboard:6x4:30mm')
+        assert detection.certainty.mean() < 0.95
+        # That is said once, not of each photograph, where it would hide what is said of some.
+        assert not any(one.notes for one in detection.searched)
+
+    def test_cameras_of_a_rig_have_the_board_in_one_order(self, tmp_path: Path) -> None:
+        board = Print(6, 4, 0.030)
+        left = poses(12, 6, board)
+        # Mounted upside down: the upper left of its image is another corner's.
+        rig = Pose(np.diag([-1.0, -1.0, 1.0]), np.array([0.02, 0.0, 0.0]))
+        truth = {'left': left, 'right': left.compose(rig)}
+        for name, where in truth.items():
+            write(tmp_path / name,
+                  [photograph(where.take(i), board, seed=i) for i in range(12)])
+        table = found(tmp_path, 'chessboard:6x4:30mm').observations
+        turned: dict[int, set[bool]] = {}
+        for i in range(12):
+            for camera, name in enumerate(table.cameras):
+                mine = (table.frame == i) & (table.camera == camera)
+                if mine.any():
+                    true = true_corners(truth[name].take(i), board)[table.landmark[mine]]
+                    turned.setdefault(i, set()).add(np.abs(table.uv[mine] - true).max() > 1)
+        both = [i for i in turned if len({*table.camera[table.frame == i]}) == 2]
+        assert len(both) > 6
+        assert all(len(turned[i]) == 1 for i in both)
 
 
 def test_a_script_without_a_main_guard_searches_as_well(tmp_path: Path) -> None:

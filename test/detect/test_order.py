@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.detect.order import agree
+from fisheye_svp_ros.detect.order import agree, of_rig
 from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 
 PATTERN = parse_pattern('chessboard:4x6:30mm')
 TURN = PATTERN.symmetries[1]
@@ -19,6 +20,15 @@ def views(board, rng, count=20):
     way = rng.integers(2, size=count)
     seen = np.stack([turned(board) if one else board for one in way])
     return seen + rng.normal(size=seen.shape), way
+
+
+def test_cameras_that_are_no_rig_are_turned_by_themselves():
+    rng = np.random.default_rng(5)
+    one, other = (Pose(rotation_from_vector(rng.normal(size=(9, 3))), rng.normal(size=(9, 3)))
+                  for _ in range(2))
+    assert of_rig(one, other, PATTERN.points[:, :2], PATTERN.symmetries) is None
+    still = one.compose(other.take(0))
+    assert not of_rig(one, still, PATTERN.points[:, :2], PATTERN.symmetries).any()
 
 
 @pytest.mark.parametrize('alike', [0.0, 5.0])
