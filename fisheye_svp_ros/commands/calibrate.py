@@ -254,10 +254,10 @@ def _print(result: Calibration, trust: Trust) -> None:
     print_table(
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
-        ('parameter', 'value', 'std. error', 'with any target', 'unit'),
+        ('parameter', 'value', 'std. error', *(['with any target'] if open_ones else []), 'unit'),
         [
             (name, *with_error(value, errors.get(name, 0.0)),
-             open_ones.get(name, ''), UNITS.get(name, '1'))
+             *([open_ones.get(name, '')] if open_ones else []), UNITS.get(name, '1'))
             for name, value in lens.parameters.items()
         ],
     )

@@ -286,10 +286,10 @@ def _next(d: Diagnosis) -> str:
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
-    steps += [
-        f'solve with {EXTENDED}, which holds {c.effect}' for c in d.causes
-        if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections
-    ]
+    held = [c.effect for c in d.causes
+            if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections]
+    if held and f'solve with {EXTENDED}' not in steps:
+        steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if stage_of(c.effect) == 'frame' and not c.indistinguishable_from]
     steps += [

@@ -199,6 +199,7 @@ class TestCalibrate:
         shown, err = capsys.readouterr()
         assert f'{len(table)} points in 6 frames' in shown
         assert err == ''
+        assert 'std. error   unit' in shown  # no column of ranges where all are settled
         lens = load_lens(out)
         assert lens.name == 'mine'
         stderr = lens.calibration.pop('stderr')

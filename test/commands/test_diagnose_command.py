@@ -342,6 +342,9 @@ class TestWords:
                 for lens in (found.lens, shutter)]
         assert told[0] == 'To confirm rolling_shutter: use a tripod.'
         assert told[1].startswith('Solve with extended_lens.yaml, which holds rolling_shutter; to')
+        following = verdict_sentences(replace(
+            found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
+        assert following.count('olve with extended_lens.yaml') == 1
 
     def test_errors_against_the_truth_go_or_stay(self, found):
         _, gained, _ = verdict_sentences(found, {
