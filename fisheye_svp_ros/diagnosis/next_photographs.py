@@ -27,7 +27,7 @@ from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
-from fisheye_svp_ros.optics.lens import INTRINSICS
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
@@ -43,6 +43,7 @@ _FLAT = 0.02  # thickness of a board over its length
 _STEP, _QUARTER, _TILTS = np.radians(5.0), np.radians(45.0), np.radians([0, 15, 30, 45, 60])
 _DISTANCES = 9
 _NEAR = 0.25  # of the distance
+_BEYOND = np.radians(10.0)  # what has been seen, where the image of a lens may have ended
 # Prior standard deviations of intrinsics that nothing is known of, over the focal length
 _WIDE = {'fx': 0.1, 'fy': 0.1, 'cx': 0.1, 'cy': 0.1}
 
@@ -271,6 +272,17 @@ def look_alikes(linear: Linearised, names: Sequence[str]) -> list[Effect]:
             continue
         found.append(max(forms, key=lambda form: len(form.parameters)))
     return found
+
+
+def furthest(lens: Lens, reached: float) -> float:
+    """Return out to which angle a lens may well see that did so up to `reached`, rad.
+
+    The image of most fills it to the nearest edge, and of many ends there.
+    """
+    u = min(lens.cx, lens.width - lens.cx) / lens.fx
+    v = min(lens.cy, lens.height - lens.cy) / lens.fy
+    edge = lens.image_height.angle(np.asarray(max(min(u, v), 0.0)))
+    return max(reached + float(_BEYOND), min(float(edge), lens.max_incidence))
 
 
 def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Generator) -> Shots:

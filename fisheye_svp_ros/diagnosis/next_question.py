@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.next_photographs import (
     Room,
     Shots,
     candidate_shots,
+    furthest,
     look_alikes,
 )
 from fisheye_svp_ros.effects.base import Effect, Untestable
@@ -81,6 +82,10 @@ def next_photographs(
     if room is None:
         away = np.linalg.norm(board.points.mean(axis=0) - pose.position, axis=-1)
         room = Room(_NEARER * float(away.min()), _FURTHER * float(away.max()))
+    views = after.data.views
+    seen = pose.into_body(views.points)[views.used]
+    reached = float(np.arccos((seen[:, 2] / np.linalg.norm(seen, axis=-1)).min()))
+    room = room._replace(field=min(room.field, furthest(after.state.lens, reached)))
     asked, others, effects = _asked(after, causes, number)
     shots = candidate_shots(after.state, board, room, np.random.default_rng(0))
     design = Design(after, effects, board, shots, noise)

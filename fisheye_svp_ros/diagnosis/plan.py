@@ -14,6 +14,7 @@ from fisheye_svp_ros.diagnosis.next_photographs import (
     Design,
     Room,
     candidate_shots,
+    furthest,
 )
 from fisheye_svp_ros.diagnosis.next_question import Next, answered, whole_lens
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
@@ -42,6 +43,9 @@ def plan(
     """
     board = Board(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     state = State(identity(1), identity(1), lens, ())
+    match (lens.calibration or {}).get('reached_deg'):
+        case float(reached) | int(reached) if lens.port is None:
+            room = room._replace(field=furthest(lens, float(np.radians(reached))))
     shots = candidate_shots(state, board, room, np.random.default_rng(0))
     blank = make_observations(np.zeros(len(points), int), board.landmark, 0.0 * points[:, :2],
                               points)

@@ -17,9 +17,11 @@ from fisheye_svp_ros.diagnosis.next_photographs import (
     Design,
     Room,
     candidate_shots,
+    furthest,
     look_alikes,
 )
 from fisheye_svp_ros.diagnosis.next_question import next_photographs
+from fisheye_svp_ros.diagnosis.plan import plan
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
@@ -205,6 +207,20 @@ def test_a_board_that_never_fits_is_refused_by_its_corners(monkeypatch, capsys):
                  '0.5']) == 2
     assert 'does not see the whole board from 0.1 to 0.5 m' in capsys.readouterr().err
     assert sum(looked_at) < 100_000
+
+
+def test_no_view_lies_far_beyond_what_was_seen_or_the_nearest_edge_of_the_image(board):
+    """The corners of an image may be dark; nobody has said that they are."""
+    wide = replace(AIR, fx=AIR.fx / 2, fy=AIR.fy / 2, max_incidence=3.0)
+    data = prepare(photographs(wide, None, 6))
+    linear = Linearised(data, fit(data, start(data, wide), FREE), FREE)
+    wanted = next_photographs(linear, [], NOISE, 6, room=ROOM)
+    limit = furthest(wide, 0.0)
+    assert limit == pytest.approx(wide.image_height.angle(AIR.height / AIR.fy), 0.02)
+    for shots in (wanted.shots, plan(replace(wide, calibration={'reached_deg': 30.0}),
+                                     board.points, ROOM, 6, None, NOISE).wanted.shots):
+        seen = shots.camera.into_body(board.points)
+        assert np.arccos(seen[..., 2] / np.linalg.norm(seen, axis=-1)).max() < limit
 
 
 def test_views_past_what_a_lens_was_calibrated_for_are_named(tmp_path, capsys):
