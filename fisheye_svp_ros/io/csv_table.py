@@ -1,6 +1,7 @@
 """CSV tables with a header: columns as numbers, with errors that name file, line and column.
 
-Cells are separated by commas, or by semicolons or tabs, as spreadsheets write them.
+Cells are separated by commas, or by semicolons or tabs, as spreadsheets write them.  Comments may
+stand above the header, and the header in the last of them, as numpy.savetxt writes it.
 """
 
 from __future__ import annotations
@@ -32,9 +33,10 @@ class CsvTable:
         self._lines: list[int] = []
         rows = []
         try:
-            text = read_text(path, ObservationError)
-            reader = csv.reader(io.StringIO(text, newline=''), delimiter=_separator(text))
-            self._header = [name.strip() for name in next(reader, [])]
+            lines = io.StringIO(read_text(path, ObservationError), newline='').readlines()
+            place = _uncomment(lines, required)
+            reader = csv.reader(lines, delimiter=_separator(lines[place:]))
+            self._header = [name.strip() for name in next(filter(None, reader), [])]
             self._check_header(required)
             for row in reader:
                 if not row:
@@ -128,9 +130,21 @@ class CsvTable:
         return values
 
 
-def _separator(text: str) -> str:
+def _uncomment(lines: list[str], required: Sequence[str]) -> int:
+    """Empty the comments above the header, but for the header; return the place of that."""
+    for place, line in enumerate(lines):
+        bare = line.lstrip('#')
+        header = {name.strip() for name in bare.split(_separator([bare]))}
+        if bare.strip() and (bare == line or header.issuperset(required)):
+            lines[place] = bare
+            return place
+        lines[place] = '\n'
+    return len(lines)
+
+
+def _separator(lines: Sequence[str]) -> str:
     """Return what separates the cells: a semicolon or tab where the header has no comma."""
-    header = text.partition('\n')[0]
+    header = lines[0] if lines else ''
     return next((one for one in ';\t' if one in header and ',' not in header), ',')
 
 

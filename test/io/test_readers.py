@@ -85,6 +85,15 @@ class TestObservationsCsv:
         path = csv(f'\ufeff{text}', 'OBSERVATIONS.CSV')
         assert same(read_observations(path), read_observations(csv(f'{HEADER}\n{ROWS}')))
 
+    @pytest.mark.parametrize('above', ['# of a tool\n# 2 of "them\n', '# ', '# a tool\n#'])
+    def test_comments_above_the_header(self, csv, above):
+        table = read_observations(csv(f'{above}{HEADER}\n{ROWS}'))
+        assert len(table) == len(read_observations(csv(f'{HEADER}\n{ROWS}')))
+
+    def test_lines_are_counted_with_comments(self, csv):
+        with pytest.raises(ObservationError, match='line 4: u is'):
+            read_observations(csv(f'# a\n\n{HEADER}\n0,0,?,0,0,0,0\n'))
+
     def test_written_tables_read_back_to_the_same_bits(self, tmp_path):
         rng = np.random.default_rng(1)
         table = make_observations(
