@@ -80,6 +80,7 @@ _UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data kno
 _NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
 _MOST = 6  # names in one sentence
 _ELSEWHERE = 6.0  # standard errors by which the intrinsics given are not those of the data
+_ABOVE = 1.5  # times the noise, from which an error is more than that
 _FEW = 4  # parameters that are read one by one
 
 
@@ -223,7 +224,11 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
         local = (f'; the local offsets of single landmarks and of the image do not hold there: '
                  f'with them {best:.3g} px')
     if not moving:
-        why = 'that is the noise' if d.verdict == 'adequate' else 'no extension improved on it'
+        why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
+        if d.verdict == 'adequate':
+            why = 'that is the noise' if times < _ABOVE else (
+                f'that is {times:.1f} times the noise: these frames hold the lens too loosely to '
+                'predict others; --next N says which are wanted')
         if d.causes:
             why = 'the cause is in the table of image points, not in the lens'
         which = 'The lens, fitted to these data,' if _elsewhere(d) else 'The lens as it is'

@@ -317,6 +317,13 @@ class TestWords:
             found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}))
         assert 'give the time of each frame (a column t, s)' in following
 
+    def test_frames_that_do_not_predict_each_other_leave_more_than_noise(self, found):
+        for times, said in ((1.1, 'that is the noise'), (3.0, 'that is 3.0 times the noise')):
+            error = replace(found.base, heldout_rms_px=times * 2**0.5 * found.noise_px)
+            _, gained, _ = verdict_sentences(replace(
+                found, verdict='adequate', causes=[], base=error, named=error, extended=error))
+            assert said in gained
+
     def test_what_was_almost_named_is_told(self, found):
         step = replace(found.trace[0], accepted=False, corrected=3e-6,
                        why='does not predict better')
