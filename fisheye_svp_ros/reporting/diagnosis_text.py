@@ -293,7 +293,8 @@ def _next(d: Diagnosis) -> str:
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     held = [c.effect for c in d.causes
             if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections]
-    if held and f'solve with {EXTENDED}' not in steps:
+    refuted = d.named.heldout_rms_px >= d.base.heldout_rms_px
+    if held and not refuted and f'solve with {EXTENDED}' not in steps:
         steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if stage_of(c.effect) == 'frame' and not c.indistinguishable_from]
@@ -316,8 +317,8 @@ def advice_text(advice: Advice) -> str:
     about = [
         f'{name}s {listed([str(n) for n in numbers[:_MOST]])}' if len(numbers) > 1
         else f'{name} {numbers[0]}'
-        for name, numbers in (('frame', advice.frames), ('board', advice.boards),
-                              ('landmark', advice.landmarks)) if numbers
+        for name, numbers in (('frame', [*dict.fromkeys(advice.frames)]),
+                              ('board', advice.boards), ('landmark', advice.landmarks)) if numbers
     ]
     what = advice.what.replace('the extended lens file', EXTENDED)
     return f'{what} ({", ".join(about)})' if about else what

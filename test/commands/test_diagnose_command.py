@@ -11,6 +11,7 @@ import pytest
 from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.diagnosis.advice import Advice
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised
@@ -31,7 +32,12 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
-from fisheye_svp_ros.reporting.diagnosis_text import cause_rows, intrinsic_rows, verdict_sentences
+from fisheye_svp_ros.reporting.diagnosis_text import (
+    advice_text,
+    cause_rows,
+    intrinsic_rows,
+    verdict_sentences,
+)
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
@@ -352,6 +358,13 @@ class TestWords:
         following = verdict_sentences(replace(
             found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
         assert following.count('olve with extended_lens.yaml') == 1
+        worse = replace(found.named, heldout_rms_px=2 * found.base.heldout_rms_px)
+        refuted = verdict_sentences(replace(
+            found, causes=[cause], advice=[], lenses={'': shutter}, named=worse))
+        assert 'no correction' in refuted[1] and 'olve with' not in refuted[2]
+
+    def test_a_frame_that_several_cameras_saw_is_named_once(self):
+        assert advice_text(Advice('look', frames=[4, 1, 4])) == 'look (frames 4 and 1)'
 
     def test_errors_against_the_truth_go_or_stay(self, found):
         _, gained, _ = verdict_sentences(found, {
