@@ -238,6 +238,43 @@ def test_cameras_of_a_chain_are_in_the_order_of_their_numbers(
         f'{path}#cam1 is another\n')
 
 
+ECHO = """\
+header:
+  stamp: {sec: 1, nanosec: 2}
+  frame_id: fisheye
+height: 480
+width: 640
+distortion_model: equidistant
+d:
+- -0.012
+- 0.002
+- 0.0
+- 0.0
+k: [193.0, 0.0, 322.3, 0.0, 194.0, 237.1, 0.0, 0.0, 1.0]
+binning_x: 0
+binning_y: 0
+roi: {x_offset: 0, y_offset: 0, height: 0, width: 0, do_rectify: false}
+---
+"""
+
+
+def test_a_camera_info_as_it_is_echoed(tmp_path: Path) -> None:
+    path = tmp_path / 'info.yaml'
+    for text in (ECHO, 2 * ECHO, ECHO.replace('\nk:', '\nK:').replace('\nd:', '\nD:')):
+        path.write_text(text)
+        lens = load_lens(path)
+        assert (lens.name, lens.width, lens.fx, lens.fy, lens.cy) == (
+            'fisheye', 640, 193.0, 194.0, 237.1)
+        assert lens.parameters['k1'] == -0.012
+    for given, wrong, said in (('k: [193.0', 'k: [0.0', 'not calibrated'),
+                               ('binning_x: 0', 'binning_x: 2', 'whole images are needed'),
+                               ('width: 640', 'size: 640', 'not a whole camera_info'),
+                               ('k: [193.0, ', 'k: [', 'k must be a list of 9')):
+        path.write_text(ECHO.replace(given, wrong))
+        with pytest.raises(LensError, match=f'info.yaml: .*{said}'):
+            load_lens(path)
+
+
 def test_curves_that_a_form_cannot_say() -> None:
     bare = replace(LENS, image_height=Equidistant())
     assert yaml.safe_load(write_foreign(bare, 'kalibr'))['cam0']['distortion_coeffs'] == (

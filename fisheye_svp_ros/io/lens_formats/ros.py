@@ -1,10 +1,16 @@
-"""ROS camera_info, as YAML of camera_calibration and as message: equidistant, or near to it."""
+"""ROS camera_info, as YAML of camera_calibration and as message: equidistant, or near to it.
+
+A file may hold either, the message as `ros2 topic echo` prints it (or `rostopic echo`, which has
+capitals).
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +19,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import project
-from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.errors import LensError, ObservationError
+from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.optics.lens import Lens
@@ -25,15 +32,19 @@ _PERSPECTIVE = {'plumb_bob': (0, 4, 5), 'rational_polynomial': (8,)}
 _EQUIDISTANT = ('equidistant', 'fisheye')
 _TOLERANCE = 0.2  # px, of a perspective lens as one of ours
 _STEPS = 40
+_MESSAGE = re.compile('^[kK]:', re.MULTILINE)
 
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return 'distortion_model:' in text and 'camera_matrix:' in text and '%YAML' not in text
+    return 'distortion_model:' in text and '%YAML' not in text and (
+        'camera_matrix:' in text or bool(_MESSAGE.search(text)))
 
 
 def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the field."""
+    if 'camera_matrix:' not in text:
+        return _read_message(text, where)
     document = parse_yaml(text, where, LensError)
     try:
         k = fields.numbers(document['camera_matrix'], 'data', 9, where)
@@ -45,6 +56,22 @@ def read(text: str, where: str) -> Foreign:
     except (KeyError, TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     lens, worst = lens_of(model, size, (k[0], k[4], k[2], k[5]), tuple(d), name, where)
+    return Foreign('ros', {name: lens}, (), {name: worst} if worst else {})
+
+
+def _read_message(text: str, where: str) -> Foreign:
+    document = parse_yaml(text.partition('\n---')[0], where, LensError)
+    try:
+        told = {name.lower(): value for name, value in document.items()}
+        fields.numbers(told, 'k', 9, where)
+        message = SimpleNamespace(**{**told, 'roi': SimpleNamespace(**told['roi'])})
+        model = read_camera_info(message, where)
+        name = str(told['header']['frame_id']) or 'camera'
+    except ObservationError as cause:
+        raise LensError(str(cause)) from cause
+    except (LookupError, TypeError, ValueError, AttributeError) as cause:
+        raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
+    lens, worst = lens_of(*model, name, where)
     return Foreign('ros', {name: lens}, (), {name: worst} if worst else {})
 
 
