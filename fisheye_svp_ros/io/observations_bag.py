@@ -15,6 +15,7 @@ from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 _CLOUD = 'sensor_msgs/msg/PointCloud2'
+_IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 _NAMES = ('landmarks', 'image_points')
 
 
@@ -45,13 +46,19 @@ def read(path: str | Path) -> Observations:
         else:
             sets.append(_Set(stamp, namespace, read_image_points(record.message, where)))
     if len(worlds) != 1 or not sets:
-        found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
-        wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
-        raise ObservationError(
-            f'{path}: observations need image_points and landmarks of one namespace; landmarks '
-            f"are in: {found}; record with --topics '{wanted}'"
-        )
+        raise ObservationError(f'{path}: observations need image_points and landmarks of one '
+                               f'namespace; {_instead(bag, worlds)}')
     return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
+
+
+def _instead(bag: Bag, worlds: set[str]) -> str:
+    """Return what a recording has in place of one world's observations, and what to do."""
+    images = {topic for topic, kind in bag.topics() if kind in _IMAGES}
+    if images and not worlds:
+        return f'it has images, on {min(images)}: say what they show, --board chessboard:9x6:24mm'
+    found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
+    wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
+    return f"landmarks are in: {found}; record with --topics '{wanted}'"
 
 
 def _table(

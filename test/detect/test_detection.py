@@ -42,6 +42,7 @@ from fisheye_svp_ros.detect.points import _least_square, find_points
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
+from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.simulate.render import Exposure, Print, render
@@ -566,6 +567,8 @@ class TestCameras:
                     message = make[kind](header, 'png', data)
                 bag.write(topic, kind, bytes(store.serialize_cdr(message, kind)))
         assert sorted(camera for camera, _ in self.cameras(tmp_path / 'bag')) == cameras
+        with pytest.raises(ObservationError, match=f'has images, on {min(topics)}.*--board'):
+            read_observations(tmp_path / 'bag')
 
 
 @pytest.mark.parametrize('shape', [(1, 3072), (48, 8), (40_000, 30), (1, 1)])
