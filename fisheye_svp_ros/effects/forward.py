@@ -20,6 +20,8 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 
+_STEP = 1e-4  # px
+
 
 @dataclass(frozen=True)
 class LinearViews:
@@ -104,10 +106,22 @@ class ForwardModel:
     def linearise(self, pose: Pose, views: Views) -> LinearViews:
         """Predict and differentiate; angles past the field of view are allowed (a solver).
 
-        The derivatives leave out that image and detector effects vary over the image: a part in
-        a hundred of a pixel step, which a solver does not notice.
+        The derivatives leave out that image and detector effects vary over the image: `d_pose` has
+        them for a solver whose points are good to a hundredth of a pixel.
         """
         return self._through(pose, views, limited=False)
+
+    def d_pose(self, linear: LinearViews, views: Views) -> Array:
+        """Return the derivatives (S, N, 2, 6) by the pose, with how detector effects vary."""
+        if not self._acts('detector'):
+            return linear.d_pose
+        low, high = (
+            self._moved(Scene(views, self.lens, linear.pose, linear.optical + step,
+                              linear.image.incidence), 'detector')
+            for step in (-_STEP, _STEP))
+        # What moves u depends on u, and v on v.
+        slope = (np.asarray(high) - low) / (2 * _STEP)
+        return np.asarray(linear.d_pose * (1 + slope)[..., None])
 
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""

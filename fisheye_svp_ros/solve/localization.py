@@ -188,7 +188,7 @@ def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array
         cost, *normal = engines.pose_equations(model.lens, *pose, views.seen)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)
-    return normal_equations(linear.uv, linear.d_pose, views)
+    return normal_equations(linear.uv, model.d_pose(linear, views), views)
 
 
 def normal_equations(uv: Array, jacobian: Array, views: Views) -> tuple[Array, Arrays]:

@@ -1,5 +1,7 @@
 """Self-localization: exact with the true lens, the paper's errors with SVP, honest covariances."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.differences import derivative, jacobian
@@ -10,7 +12,7 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.pose import Pose, axis_angle_between
+from fisheye_svp_ros.pose import Pose, axis_angle_between, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import paper_pose
@@ -133,6 +135,22 @@ def test_equals_scipy(shift):
         expected = start.retract(found.x[None])
         assert np.abs(solved.pose.position[i] - expected.position[0]).max() < 1e-10
         assert np.abs(solved.pose.rotation[i] - expected.rotation[0]).max() < 1e-10
+
+
+@pytest.mark.parametrize('order', [1, 2])
+def test_what_a_detector_adds_keeps_no_pose_from_being_found(order):
+    """It changes within a pixel, by a thirtieth of a step, which sharp corners notice."""
+    lens, rng = LENSES['fish180'], np.random.default_rng(0)
+    names = ('sine',) if order == 1 else ('u_sine', 'u_cosine', 'v_sine', 'v_cosine')
+    bias = {'order': order, 'parameters': dict.fromkeys(names, -0.006)}
+    lens = replace(lens, corrections={'detector_bias': bias})
+    true = Pose(rotation_from_vector(rng.normal(scale=0.1, size=(20, 3))),
+                rng.normal(scale=0.02, size=(20, 3)))
+    points = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)),
+                       np.full((5, 7), 0.6)], axis=-1).reshape(1, -1, 3).repeat(20, 0)
+    views = seen(lens, points, true, 0.02, rng)._replace(weight=np.full((20, 35), 100.0))
+    found = localize(ForwardModel(lens), views)
+    assert found.converged.all()
 
 
 def test_no_start_value_is_needed_from_any_pose():
