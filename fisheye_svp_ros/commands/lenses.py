@@ -16,7 +16,7 @@ def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> Non
     parser.add_argument('--lens', required=True, action='append', metavar='[CAMERA=]LENS',
                         help=f'{purpose}a lens file, also of other tools, or the name of one that '
                         'comes with the package; left=LENS and right=LENS for a rig, or a file '
-                        'that holds both')
+                        'or folder that holds both')
 
 
 class Lenses(dict[str, 'Lens']):

@@ -35,6 +35,8 @@ _OLD = 'effects'  # what older files call corrections, of the lens and of the ta
 def load_lens(path: str | Path) -> Lens:
     """Read a lens YAML, or what another tool wrote; FILE#cam1: another camera than its first.
 
+    A folder is that of a rig, as `calibrate` and `diagnose` write it: a file a camera.
+
     Raises LensError, naming file and field, for anything impossible.
     """
     text, camera = _read(path)
@@ -60,10 +62,13 @@ def read_lens_file(path: str | Path) -> Foreign | None:
 
 
 def cameras_in(path: str | Path) -> tuple[str, ...]:
-    """Return the cameras of a file that holds several, in its order, none where it holds one.
+    """Return the cameras of a file or folder that holds several, none where it holds one.
 
     FILE#cam1 is one.  Raises LensError for a file that cannot be read.
     """
+    if Path(path).is_dir():
+        names = tuple(_in_folder(Path(path)))
+        return names if len(names) > 1 else ()
     text, camera = _read(path)
     foreign = None if camera else read_foreign(path, text)
     return tuple(foreign.lenses) if foreign and len(foreign.lenses) > 1 else ()
@@ -137,7 +142,25 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
 def _read(path: str | Path) -> tuple[str, str]:
     """Return the text of a file and the camera after its name, as in FILE#cam1."""
     file, _, camera = str(path).rpartition('#') if '#' in str(path) else (str(path), '', '')
+    if Path(file).is_dir():
+        lenses = _in_folder(Path(file))
+        camera = camera or next(iter(lenses))
+        if camera not in lenses:
+            raise LensError(f'{file}: no lens of camera {camera!r} in it; there are '
+                            + ', '.join(lenses))
+        file, camera = str(lenses[camera]), ''
     return read_text(file, LensError, LARGEST), camera
+
+
+def _in_folder(folder: Path) -> dict[str, Path]:
+    """Return the lens files of a rig by camera; raise LensError where there is none."""
+    found = {file.stem: file for file in sorted(folder.glob('*.yaml')) if file.stem != 'rig'}
+    found = found or {file.parent.name: file
+                      for file in sorted(folder.glob('*/extended_lens.yaml'))}
+    if not found:
+        raise LensError(f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '
+                        'CAMERA/extended_lens.yaml')
+    return found
 
 
 def _projection(section: Mapping[str, Any], where: str) -> dict[str, Any]:

@@ -41,10 +41,16 @@ def sweep_path(name: str) -> Path:
 
 def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
     given, named = Path(name), config_path(f'{folder}/{name}.yaml')
-    # FILE#cam1 names one of the lenses of a file.
+    # FILE#cam1 names one of the lenses of a file, or of a folder.
     if given.suffix in ('.yaml', '.yml') or _is_file(Path(name.partition('#')[0])):
         return given
+    # What has no slash may come over the network, and is a name in config/ then.
+    if '/' in name and Path(name.partition('#')[0]).is_dir():
+        return given
     if not _is_file(named):
+        if given.is_dir():
+            raise error(f'{name!r} is a folder and not among the {folder} of this package; with a '
+                        f'slash, {name}/, it is one of files')
         known = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
         raise error(f'{name!r} is neither a file nor among the {folder} of this package: {known}')
     return named

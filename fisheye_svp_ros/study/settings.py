@@ -54,9 +54,9 @@ class SolverSettings(Settings):
     """Parameters of every node that solves."""
 
     lens: str = parameter(
-        '', 'Lens to solve with: a file, or a name in config/lenses; of a file with several '
-        'cameras a rig takes the first two; `camera_info`: what that topic says; empty: the one '
-        'that `scenario` names', file=True
+        '', 'Lens to solve with: a file, or a name in config/lenses; of a file or folder with '
+        'several cameras a rig takes the first two; `camera_info`: what that topic says; empty: '
+        'the one that `scenario` names', file=True
     )
     svp: str = parameter(
         'auto', 'Solve with the single-viewpoint approximation of the lens; auto: of one that '

@@ -14,14 +14,18 @@ import yaml
 from helpers.nodes import SHARED
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.lenses import load_lenses
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
 from fisheye_svp_ros.io.rig_files import load_rig, save_rig
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.nodes.lenses import lenses_of as of_rig
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery, KannalaBrandt, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_vector
+from fisheye_svp_ros.study.settings import SolverSettings
 
 LENS = Lens('front', 848, 800, 285.2, 284.9, 424.3, 398.7,
             KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0))
@@ -238,6 +242,36 @@ def test_cameras_of_a_chain_are_in_the_order_of_their_numbers(
         f'{path}#cam1 is another\n')
 
 
+def test_the_folder_of_a_rig_is_its_lenses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `calibrate` writes it, and as `diagnose` does."""
+    for name in ('{}.yaml', '{}/extended_lens.yaml'):
+        folder = tmp_path / name[-9:]
+        for camera in ('left', 'right'):
+            path = folder / name.format(camera)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_lens(replace(LENS, name=camera), path)
+            assert cameras_in(folder) == (() if camera == 'left' else ('left', 'right'))
+        save_rig(Pose(np.eye(3), np.ones(3)), folder / 'rig.yaml', ('left', 'right'))
+        assert cameras_in(folder) == ('left', 'right')
+        assert load_lens(lens_path(f'{folder}#right')).name == 'right'
+        assert [*load_lenses([str(folder)]).names] == ['left', 'right']
+        of_node = SolverSettings(lens=str(folder))
+        assert [lens.name for lens in of_rig(of_node, ('left/', 'right/')).values()] == [
+            'left', 'right']
+        with pytest.raises(LensError, match="no lens of camera 'top' in it; there are left, rig"):
+            load_lens(f'{folder}#top')
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'empty').mkdir()
+    (tmp_path / 'fish180').mkdir()  # hides no lens of the package
+    assert load_lens(lens_path('fish180')).name == 'fish180'
+    with pytest.raises(LensError, match=r"'empty' is a folder .* with a slash, empty/, it is"):
+        lens_path('empty')
+    with pytest.raises(LensError, match='empty: a folder without lenses'):
+        load_lens(lens_path(str(tmp_path / 'empty')))
+
+
 ECHO = """\
 header:
   stamp: {sec: 1, nanosec: 2}
@@ -286,8 +320,6 @@ def test_curves_that_a_form_cannot_say() -> None:
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from fisheye_svp_ros.io.lens_files import save_lens
-
     save_lens(SHORT, tmp_path / 'lens.yaml')
     assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'ros.yaml'),
                      '--format', 'ros']) == 0

@@ -317,6 +317,8 @@ def test_files_are_named_below_the_folder_alone(
     for path in (inside, outside):
         save_lens(load_lens(lens_path('fish180')), path)
     Path('plain').write_bytes(outside.read_bytes())
+    Path('rig').mkdir()
+    save_lens(load_lens(outside), Path('rig') / 'left.yaml')
     (inside.parent / 'link.yaml').symlink_to(outside)
     os.mkfifo(inside.parent / 'fifo.yaml')
     with (inside.parent / 'huge.yaml').open('wb') as file:
@@ -325,7 +327,8 @@ def test_files_are_named_below_the_folder_alone(
     assert set_parameter(node, 'lens', str(inside)).successful
     for name, reason in ((outside, 'is not below'), (inside.parent / 'link.yaml', 'is not below'),
                          (inside.parent / 'fifo.yaml', 'is no file'), ('/dev/zero', 'not below'),
-                         (inside.parent / 'huge.yaml', 'above 64 MB'), ('plain', 'not below')):
+                         (inside.parent / 'huge.yaml', 'above 64 MB'), ('plain', 'not below'),
+                         ('rig', 'is a folder and not among')):
         result = set_parameter(node, 'lens', str(name))
         assert not result.successful and reason in result.reason, name
     assert node.settings.lens == str(inside)
