@@ -99,7 +99,13 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
     size = (pattern.columns, pattern.rows)
     if hasattr(_ARUCO, 'CharucoDetector'):
         board = _ARUCO.CharucoBoard(size, pattern.size, pattern.marker, dictionary)
-        corners, ids, _, _ = _ARUCO.CharucoDetector(board).detectBoard(image)
+        corners, ids, tags, tag_ids = _ARUCO.CharucoDetector(board).detectBoard(image)
+        turned = pattern.rows % 2 == 0 and hasattr(board, 'setLegacyPattern')
+        if ids is None and tag_ids is not None and turned:
+            # Before OpenCV 4.6 boards of an even number of rows had their colours the other way.
+            board.setLegacyPattern(True)
+            corners, ids, _, _ = _ARUCO.CharucoDetector(board).detectBoard(
+                image, markerCorners=tags, markerIds=tag_ids)
     else:
         board = _ARUCO.CharucoBoard_create(*size, pattern.size, pattern.marker, dictionary)
         tags, tag_ids, _ = _ARUCO.detectMarkers(image, dictionary)

@@ -278,6 +278,23 @@ class TestTags:
         image = cv2.GaussianBlur(image, (0, 0), 0.7)
         return image, turn
 
+    def test_a_charuco_board_of_an_older_opencv(self) -> None:
+        made = getattr(getattr(cv2, 'aruco', None), 'CharucoBoard', None)
+        if not hasattr(made, 'setLegacyPattern'):
+            pytest.skip('this OpenCV knows no older boards')
+        pattern, side = parse_pattern('charuco:6x4:40mm:28mm:DICT_5X5_100'), 60
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+        board = cv2.aruco.CharucoBoard((6, 4), 0.04, 0.028, dictionary)
+        for legacy in (False, True):
+            board.setLegacyPattern(legacy)
+            image = board.generateImage((6 * side, 4 * side), marginSize=0)
+            image = cv2.copyMakeBorder(image, 50, 50, 50, 50, cv2.BORDER_CONSTANT, value=255)
+            points = find_points(cv2.GaussianBlur(image, (0, 0), 0.8), pattern, 'charuco')
+            assert not isinstance(points, str)
+            column, row = points.ids % 5, points.ids // 5
+            true = 49.5 + side * np.stack([column + 1, row + 1], axis=-1)
+            assert len(points.ids) == 15 and np.abs(points.uv - true).max() < 0.1
+
     def test_charuco(self) -> None:
         if not hasattr(cv2, 'aruco'):
             pytest.skip('this OpenCV has no markers')
