@@ -111,8 +111,11 @@ def detect(
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
+        counted = {'chessboard': ' (inner corners: one less than squares)',
+                   'charuco': ' (squares, columns first) and its dictionary'}
         raise ObservationError(f'{source}: no {pattern.spec} in {len(searched)} photographs: '
-                               f'{said}; check kind and size of the board')
+                               f'{said}; check kind and size of the board'
+                               + counted.get(pattern.kind, ''))
     return _table(searched, pattern, source)
 
 
