@@ -223,7 +223,7 @@ def test_broken_file_is_refused_with_its_reason(content, reason, tmp_path):
 def test_missing_file_and_unwritable_place(tmp_path):
     with pytest.raises(LensError, match=r'absent\.yaml: cannot be read .*; check the path'):
         load_lens(tmp_path / 'absent.yaml')
-    with pytest.raises(LensError, match='cannot be read'):
+    with pytest.raises(LensError, match='a folder without lenses; those of a rig are'):
         load_lens(tmp_path)
     (tmp_path / 'file').write_text('')
     with pytest.raises(OutputError, match='cannot be written'):
