@@ -228,9 +228,11 @@ def kill(
         outcome.fault('temporary file', f'{how.name} after {after:.2f} s: {rest}')
     for name in rest:
         del found[name]
+    # SIGKILL may come between two renames, which nothing makes one: each file is whole then.
+    wanted = whole if how == signal.SIGTERM else {n: whole[n] for n in found if n in whole}
     if not found:
         outcome.nothing += 1
-    elif _same(found, whole):
+    elif _same(found, wanted):
         outcome.whole += 1
     else:
         outcome.fault('part', f'{how.name} after {after:.2f} s: {[*found]}')
