@@ -68,6 +68,12 @@ def refused(capsys, *arguments):
     return err
 
 
+def printed(code):
+    """Run code in an interpreter of its own and return what it prints."""
+    return subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True,
+                          check=True).stdout
+
+
 class TestLocalize:
     @pytest.fixture(scope='class')
     @classmethod
@@ -313,12 +319,10 @@ class TestCommandLine:
             'print(sorted({"numpy", "rich", "cv2", "scipy", "yaml", "matplotlib"}'
             ' & set(sys.modules)))'
         )
-        run = subprocess.run(
-            [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
-        )
-        assert run.stdout.splitlines()[-1] == '[]'
+        said = printed(code)
+        assert said.splitlines()[-1] == '[]'
         for name in cli.COMMANDS:
-            assert name in run.stdout
+            assert name in said
 
     def test_no_help_of_a_command_waits_for_what_draws_or_solves(self):
         code = (
@@ -327,10 +331,7 @@ class TestCommandLine:
             '    try:\n        main([name, "--help"])\n    except SystemExit:\n        pass\n'
             'print(sorted({"matplotlib", "scipy", "numba"} & set(sys.modules)))'
         )
-        run = subprocess.run(
-            [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
-        )
-        assert run.stdout.splitlines()[-1] == '[]'
+        assert printed(code).splitlines()[-1] == '[]'
 
     def test_interrupt_is_silent(self, tmp_path):
         (tmp_path / 'a.yaml').write_text(
