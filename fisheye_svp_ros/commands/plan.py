@@ -91,15 +91,16 @@ def room_of(given: Sequence[float]) -> Room:
 
 def _note_guessed(lens: Lens, wanted: Next) -> None:
     """Name the views that need more of a lens than it was calibrated for."""
-    match (lens.calibration or {}).get('reached_deg'):
-        case float(reached) | int(reached) if lens.port is None:
-            seen = wanted.shots.camera.into_body(wanted.board.points)
-            angle = np.degrees(incidence(lens, seen).theta.max(axis=-1))
-            further = [str(i + 1) for i in np.flatnonzero(angle > reached)]
-            if further:
-                say(f'lens {lens.name!r} was calibrated up to {reached:.0f} degrees off the axis; '
-                    f'views {", ".join(further)} reach further, up to {angle.max():.0f}, where '
-                    'the board may be seen elsewhere than drawn, or not at all')
+    if lens.reached is None:
+        return
+    seen = wanted.shots.camera.into_body(wanted.board.points)
+    angle = incidence(lens, seen).theta.max(axis=-1)
+    further = [str(i + 1) for i in np.flatnonzero(angle > lens.reached)]
+    if further:
+        say(f'lens {lens.name!r} was calibrated up to {np.degrees(lens.reached):.0f} degrees off '
+            f'the axis; views {", ".join(further)} reach further, up to '
+            f'{np.degrees(angle.max()):.0f}, where the board may be seen elsewhere than drawn, or '
+            'not at all')
 
 
 def _lens(args: argparse.Namespace) -> Lens:

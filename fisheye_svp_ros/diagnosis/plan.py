@@ -43,9 +43,8 @@ def plan(
     """
     board = Board(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     state = State(identity(1), identity(1), lens, ())
-    match (lens.calibration or {}).get('reached_deg'):
-        case float(reached) | int(reached) if lens.port is None:
-            room = room._replace(field=furthest(lens, float(np.radians(reached))))
+    if lens.reached is not None:
+        room = room._replace(field=furthest(lens, lens.reached))
     shots = candidate_shots(state, board, room, np.random.default_rng(0))
     blank = make_observations(np.zeros(len(points), int), board.landmark, 0.0 * points[:, :2],
                               points)

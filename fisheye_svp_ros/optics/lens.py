@@ -102,6 +102,17 @@ class Lens:
         """Mean of fx and fy, px."""
         return (self.fx + self.fy) / 2
 
+    @property
+    def reached(self) -> float | None:
+        """The incidence angle up to which it was calibrated, rad; None if unknown, or by a port.
+
+        Past it the curve is a guess, and where the image of the lens ends is not known.
+        """
+        match (self.calibration or {}).get('reached_deg'):
+            case float(degrees) | int(degrees) if self.port is None:
+                return float(np.radians(degrees))
+        return None
+
     def check(self) -> str:
         """Say what is wrong with the numbers of the lens, its field apart; empty if nothing is."""
         for name, value in self.parameters.items():

@@ -100,14 +100,12 @@ def widest_spread(lens: Lens) -> float:
 def usual_spread(lens: Lens) -> float:
     """Return the spread to be asked about where none is named, rad.
 
-    It is the widest, but for a lens that was calibrated up to a smaller angle (`reached_deg`):
-    past that its curve is a guess, and where the image of the lens ends is not known.
+    It is the widest, but for a lens that was calibrated up to a smaller angle (`Lens.reached`).
     """
     widest = widest_spread(lens)
-    match (lens.calibration or {}).get('reached_deg'):
-        case float(reached) | int(reached) if lens.port is None:
-            return float(np.clip(np.radians(reached), _SMALLEST_SPREAD, widest))
-    return widest
+    if lens.reached is None:
+        return widest
+    return float(np.clip(lens.reached, _SMALLEST_SPREAD, widest))
 
 
 def nearest_range(lens: Lens) -> float:
