@@ -1,4 +1,4 @@
-"""Standard errors: of the null model, between frames, and of the choice of causes."""
+"""Standard errors: of the null model, between frames, of a broad field and of the choice."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _WINDOW = 6.0  # of merit: odds of 20, beyond which a model counts for nothing (
 
 def honest_errors(evidence: Evidence) -> Array:
     """Return the standard errors (K,) of all that is shared, other likely models allowed for."""
-    return np.hypot(standard_errors(evidence), model_uncertainty(evidence))
+    parts = standard_errors(evidence), field_uncertainty(evidence), model_uncertainty(evidence)
+    return np.asarray(np.sqrt(np.square(parts).sum(axis=0)))
 
 
 def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
@@ -67,6 +68,28 @@ def _estimates(
     estimate = seen[:, kept] @ (vectors[:, kept].T @ information[included, -1] / values[kept])
     variance = (seen[:, kept]**2 / values[kept]).sum(axis=1)
     return estimate, variance, np.asarray((seen[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+
+
+def field_uncertainty(evidence: Evidence) -> Array:
+    """Return what the unknown size of a broad image field adds to standard errors (K,).
+
+    What intrinsics and effects take up of such a field is lost for its variance, which is found
+    too small then, or nothing.  Each size, none among them, is as probable as its restricted
+    likelihood says, and adds what it brings and the square of the change.
+    """
+    own, reported = np.arange(evidence.own), _reported(evidence)
+    freedom = evidence.full.rows - evidence.full.poses - evidence.own
+    estimate, variance, _ = _estimates(evidence.information, own, reported)
+    likelihoods, more = [], []
+    for logs, information in evidence.with_field:
+        noise = evidence.remaining(information, own)[-1, -1] / freedom
+        values = np.linalg.eigvalsh(information[np.ix_(own, own)])
+        determinant = np.log(np.maximum(values, 1e-12)).sum()
+        likelihoods.append(-(logs + determinant + freedom * np.log(noise)) / 2)
+        other, wider, _ = _estimates(information / noise, own, reported)
+        more.append(wider - variance + (other - estimate) ** 2)
+    added = np.maximum(special.softmax(likelihoods) @ np.array(more), 0.0)
+    return np.asarray(np.sqrt(added) / evidence.scale[: evidence.own])
 
 
 def model_uncertainty(evidence: Evidence) -> Array:

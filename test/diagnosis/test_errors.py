@@ -12,7 +12,11 @@ from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_error
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence
 from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.refit import refit
-from fisheye_svp_ros.diagnosis.standard_errors import model_uncertainty, standard_errors
+from fisheye_svp_ros.diagnosis.standard_errors import (
+    honest_errors,
+    model_uncertainty,
+    standard_errors,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
@@ -41,6 +45,27 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
     assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
+
+
+def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resembles():
+    """Six bumps as wide as a quarter of the image: focal length and centre take up most of it."""
+    off, free = [], ('fx', 'fy', 'cx', 'cy')
+    true = np.array([getattr(lens(), name) for name in free])
+    size = np.array([lens().width, lens().height])
+    for seed in range(8):
+        rng = np.random.default_rng(500 + seed)
+        pose, views = scene(rng, frames=16)
+        table = observe(lens(), (), pose, views, SIGMA, rng)
+        apart = table.uv[:, None] - rng.uniform(size=(6, 2)) * size
+        bumps = np.exp(-(apart**2).sum(axis=-1) / 2 / (0.25 * size.max()) ** 2)
+        table = replace(table, uv=table.uv + bumps @ rng.normal(size=(6, 2)) * 3 * SIGMA)
+        data = prepare(table)
+        evidence = gather_evidence(data, fit(data, start(data, lens()), free), free)
+        fitted = refit(data, evidence.linear.state, free, evidence.variances)
+        found = np.array([getattr(fitted.lens, name) for name in free])
+        off.append((found - true) / honest_errors(evidence))
+    spread = np.sqrt(np.mean(np.square(off), axis=0))
+    assert (spread > 0.45).all() and (spread < 1.75).all(), spread
 
 
 @pytest.mark.parametrize('size', [0.0, 4e-4])
