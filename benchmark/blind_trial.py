@@ -16,6 +16,7 @@ from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import Needs, Scene, World, draw_scene
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
+from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, swept
 from fisheye_svp_ros.diagnosis.model import intrinsic_names
 
@@ -289,7 +290,7 @@ def _null_p_values(found: Diagnosis, free: bool) -> dict[str, float]:
         if effect.name in values:
             continue  # the simplest form stands first
         columns = evidence.columns_of(form)
-        result = evidence.confident(evidence.score(left, columns), own, columns)
+        result = confident(evidence, evidence.score(left, columns), own, columns)
         wrong = [
             value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
             if parameter.positive

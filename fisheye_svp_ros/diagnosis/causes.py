@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.choice import (
 )
 from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed
 from fisheye_svp_ros.diagnosis.search import drop_test
+from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
@@ -56,20 +57,20 @@ def mean_causes(
         }
         included = np.arange(evidence.own)
         causes.append(Cause(
-            name, effect.key, parameters, drop_test(evidence, included, columns).p_value,
-            shares[name], _survives(evidence, columns), rms, gain,
+            name, effect.key, parameters, drop_test(evidence, included, columns, effect).p_value,
+            shares[name], _survives(evidence, effect, columns), rms, gain,
             _look_alikes(evidence, name, columns), effect.to_separate,
         ))
     return causes
 
 
-def _survives(evidence: Evidence, columns: Index) -> bool:
+def _survives(evidence: Evidence, effect: Effect, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
     factor = evidence.forms.names()
     for _, other, _ in evidence.terms:
         included = np.setdiff1d(np.arange(evidence.own), other)
         if not np.array_equal(other, columns) and (
-            drop_test(evidence, included, columns).p_value * factor > SIGNIFICANCE
+            drop_test(evidence, included, columns, effect).p_value * factor > SIGNIFICANCE
         ):
             return False
     return True

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.doubt import confident, random_gain
 from fisheye_svp_ros.diagnosis.evidence import Evidence, Score, pseudo_inverse, swept
 from fisheye_svp_ros.effects.base import Effect
 
@@ -82,7 +83,7 @@ def candidates(
             continue
         gain, count = score.statistic, score.rank
         if effect.per_frame:  # what it is in single frames is one variance, as in its twins
-            gain, count = evidence.random_gain(included, columns), 1
+            gain, count = random_gain(evidence, included, columns), 1
             score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
         merit = float(gain - count * np.log(evidence.full.rows))
         found.append(Candidate(form, effect, score, _corrected(evidence, effect, score), merit))
@@ -112,8 +113,8 @@ def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:
             continue
         if not candidate.effect.per_frame:  # that one holds at any size of the variances
             columns = evidence.columns_of(candidate.form)
-            score = evidence.confident(
-                candidate.score, included, columns, candidate.effect.of_recording)
+            score = confident(
+                evidence, candidate.score, included, columns, candidate.effect)
             corrected = _corrected(evidence, candidate.effect, score)
             candidate = replace(candidate, score=score, corrected=corrected)
         if candidate.corrected < SIGNIFICANCE:

@@ -17,7 +17,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
 from fisheye_svp_ros.diagnosis.components import called, find_variances
-from fisheye_svp_ros.diagnosis.fields import mean_fields
+from fisheye_svp_ros.diagnosis.fields import centre_paths, mean_fields
 from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
@@ -32,10 +32,8 @@ from fisheye_svp_ros.diagnosis.reml import (
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
-_DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them fields are tried
 _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
 _FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
-_TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # the same, of one coefficient of an effect
 _ANEW = 6  # steps: the likelihood is flat around the best variances
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
@@ -57,8 +55,8 @@ class Evidence:
     """A linearised state with its null model and everything that could be added to it.
 
     scale (X,): norms that the border's columns were divided by: what is in the model (the first
-    `own` of them), then the forms, then probes (`fields`); full: equations of all of them and
-    all components.
+    `own` of them), then the forms, then probes and paths (`fields`); full: equations of all of
+    them and all components.
     """
 
     linear: Linearised
@@ -70,6 +68,7 @@ class Evidence:
     scale: Array
     border: Array
     probes: dict[str, Index]
+    paths: Index
 
     def around(
         self, data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
@@ -133,15 +132,21 @@ class Evidence:
 
     def restored(self, information: Array, kept: Index) -> Array:
         """Return information (..., X + 1, X + 1) as if only these of the effects were fitted."""
-        way = np.zeros(information.shape[-1])
+        way = self.residual_with(kept)
+        found = information.copy()
+        found[..., -1] = information @ way
+        found[..., -1, :] = found[..., -1]
+        found[..., -1, -1] = found[..., -1] @ way
+        return found
+
+    def residual_with(self, kept: Index) -> Array:
+        """Return the combination (X + 1,) of the border that is the residual with only these."""
+        way = np.zeros(self.border.shape[-1])
+        way[-1] = 1.0
         for _, columns, values in self.terms:
             gone = ~np.isin(columns, kept)
             way[columns[gone]] = (values * self.scale[columns])[gone]
-        found = information.copy()
-        found[..., -1] += information @ way
-        found[..., -1, :] = found[..., -1]
-        found[..., -1, -1] += found[..., -1] @ way
-        return found
+        return way
 
     def remaining(self, information: Array, included: Index) -> Array:
         """Return what is left of information once what is included, and no more, is swept out."""
@@ -163,47 +168,6 @@ class Evidence:
         p = float(special.chdtrc(rank, max(statistic, 0.0))) if rank else 1.0
         return Score(statistic, rank, p, estimate / self.scale[columns], np.inf)
 
-    def confident(
-        self, score: Score, included: Index, columns: Index, varying: bool = False
-    ) -> Score:
-        """Return the score with what the uncertainty of the variances does to its p-value.
-
-        F test with Satterthwaite's degrees of freedom, of the direction that was estimated; where
-        it is not beyond doubt, the likelihood ratio beside a smooth image field, too: the variance
-        of one that was too small to be called for says nothing of its uncertainty.
-        varying: whether what columns do changes from frame to frame.
-        """
-        covariance = self.variances.covariance
-        if covariance is None or not score.rank:
-            return score
-        freedom = self._freedom(score.estimate * self.scale[columns], included, columns)
-        p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
-        if p < _DOUBTFUL and score.statistic < _BEYOND_DOUBT:
-            gain = self._beside_fields(included, columns, varying)
-            p = max(p, float(special.chdtrc(score.rank, gain)))
-        return score._replace(p_value=p, freedom=freedom)
-
-    def _beside_fields(self, included: Index, columns: Index, varying: bool) -> float:
-        """Return the likelihood ratio of columns, whatever the size of a smooth image field.
-
-        Its variance is found with the columns and without them.  For what varies in a rig so is
-        what frames have of their own: no pose of a single view takes up most of that there.
-        """
-        count = self.full.rows - self.full.poses
-        without, beside = np.inf, np.inf
-        fields = self.with_field
-        if varying and self.linear.data.cameras > 1:
-            fields = [*fields, *((f.log_determinant, f.information) for f in (
-                self.without_frames, self._frames_anew))]
-        for logs, information in fields:
-            rest = self.remaining(information, included)
-            remaining = rest[-1, -1]
-            without = min(without, logs + count * np.log(remaining))
-            inverse, _ = pseudo_inverse(rest[np.ix_(columns, columns)], least=IDENTIFIABLE)
-            remaining -= rest[columns, -1] @ inverse @ rest[columns, -1]
-            beside = min(beside, logs + count * np.log(remaining))
-        return max(float(without - beside), 0.0)
-
     @cached_property
     def with_field(self) -> list[tuple[float, Array]]:
         """Log determinant and information of the border, for image fields of several sizes."""
@@ -218,25 +182,9 @@ class Evidence:
         count = len(f.information) - len(self.border[0, 0])
         for more in _FIELDS:
             prior = own * self.full.rows / count / more
-            logs, information = _integrated(f, np.arange(count), prior)
+            logs, information = integrated(f, np.arange(count), prior)
             found.append((logs, information[count:, count:]))
         return found
-
-    def random_gain(self, included: Index, columns: Index) -> float:
-        """Return twice the gain in log likelihood if the coefficients of columns are random.
-
-        Of whatever size, beside what frames have of their own or in place of it, against what
-        frames may have of their own without the columns.
-        """
-        count = self.full.rows - self.full.poses
-
-        def cost(logs: float, information: Array) -> float:
-            rest = self.remaining(information, included)
-            return logs + count * float(np.log(rest[-1, -1]))
-
-        parts = [self.factored, self.without_frames, self._frames_anew]
-        return min(cost(f.log_determinant, f.information) for f in parts) - min(
-            cost(*_integrated(f, columns, 1 / size)) for f in parts for size in _TURNS)
 
     @cached_property
     def without_frames(self) -> Factored:
@@ -245,7 +193,7 @@ class Evidence:
             replace(self.variances, lam=np.where(_OF_FRAMES, GONE, self.variances.lam)))
 
     @cached_property
-    def _frames_anew(self) -> Factored:
+    def frames_anew(self) -> Factored:
         """The equations with all that single frames have of their own found anew, factored.
 
         Beside the whole catalogue its effects that change with time take a part of that.
@@ -262,20 +210,6 @@ class Evidence:
         """Return the equations of all components with chosen columns as their whole border."""
         columns = self.border[..., :-1]
         return self.full.bordered(identifiable(self.linear.frame_columns, columns, chosen))
-
-    def _freedom(self, estimate: Array, included: Index, columns: Index) -> float:
-        info, f = self.factored.information, self.factored
-        inside, _ = pseudo_inverse(info[np.ix_(included, included)])
-        way = np.zeros(len(info))
-        way[columns] = estimate
-        way[included] -= inside @ (info[np.ix_(included, columns)] @ estimate)
-        size = float(way @ info @ way)
-        e, r = f.coefficients(way)
-        shares = f.shares(e, r) / max(size, 1e-300)
-        slope = -np.append(shares, 1 - shares.sum())
-        assert self.variances.covariance is not None
-        spread = float(slope @ self.variances.covariance @ slope)
-        return float(np.clip(2 / max(spread, 1e-9), 2.0, 1e6))
 
 
 def gather_evidence(
@@ -329,8 +263,9 @@ def _multiplied(
     """
     linear = Linearised(data, state, free)
     forms = forms_of(linear, left_out)
-    fields = mean_fields(linear)
-    columns = np.concatenate([linear.shared_columns, forms.columns, *fields.values()], axis=-1)
+    fields, paths = mean_fields(linear), centre_paths(linear)
+    columns = np.concatenate(
+        [linear.shared_columns, forms.columns, *fields.values(), paths], axis=-1)
     scale = np.sqrt((columns**2).sum(axis=(0, 1)))
     scale = np.where(scale > 0, scale, 1.0)
     border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
@@ -343,11 +278,12 @@ def _multiplied(
     for name, field in fields.items():
         probes[name] = np.arange(at, at + field.shape[-1])
         at += field.shape[-1]
-    nothing = start_variances(full)
-    return Evidence(linear, forms, random, full, nothing, own, scale, border, probes)
+    nothing, paths_at = start_variances(full), np.arange(at, at + paths.shape[-1])
+    return Evidence(
+        linear, forms, random, full, nothing, own, scale, border, probes, paths_at)
 
 
-def _integrated(f: Factored, columns: Index, prior: float) -> tuple[float, Array]:
+def integrated(f: Factored, columns: Index, prior: float) -> tuple[float, Array]:
     """Return log determinant and information with columns of the border random; prior: lambda."""
     inner = f.information[np.ix_(columns, columns)] + prior * np.eye(len(columns))
     across = f.information[columns]

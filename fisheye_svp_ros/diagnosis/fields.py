@@ -8,6 +8,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.model import Linearised
 
 _CURVE = 5  # degree of smooth curves over an angle
+_WAVES = 12
 
 
 def mean_fields(linear: Linearised) -> dict[str, Array]:
@@ -39,6 +40,24 @@ def mean_fields(linear: Linearised) -> dict[str, Array]:
     return {
         name: linear.whitened(np.stack(columns, axis=-1)) for name, columns in fields.items()
     }
+
+
+def centre_paths(linear: Linearised) -> Array:
+    """Smooth paths (F, M, P) of each camera's image over the frames, in the order of time.
+
+    Cosines that at least three frames share the half period of, along u and along v.
+    """
+    data, scene = linear.data, linear.scene
+    instant = scene.times if np.isfinite(scene.times).all() else scene.views.frame
+    _, place = np.unique(instant, return_inverse=True)
+    count = int(place.max()) + 1
+    waves = np.arange(1, min(_WAVES, count // 3) + 1)
+    path = np.cos(np.pi * waves * (place[:, None] + 0.5) / count)
+    mine = data.camera_of[:, None] == np.arange(data.cameras)
+    moves = (path[..., None] * mine[:, None]).reshape(len(path), -1)
+    both = moves[:, None, None, :, None] * np.eye(2)[:, None, :]
+    shape = (*linear.weight.shape, 2, both.shape[-1] * both.shape[-2])
+    return linear.whitened(np.broadcast_to(both.reshape(len(path), 1, 2, -1), shape))
 
 
 def _along(direction: Array, scalars: list[Array]) -> list[Array]:

@@ -254,7 +254,7 @@ class Measured:
         evidence = self.evidence
         own = np.arange(evidence.own)
         p_values = significance(evidence.beside(own), evidence.variances)
-        found = {effect.name: drop_test(evidence, own, columns).p_value
+        found = {effect.name: drop_test(evidence, own, columns, effect).p_value
                  for effect, columns, _ in self.found.causes}
         parts = budget(
             evidence, self._squares, p_values, found | dict(noise_causes), self.local.views)

@@ -82,6 +82,20 @@ def multiplied_by(design: Design, pose: Array, residual: Array) -> tuple[Array, 
             design.shared.T @ flat)
 
 
+def moves_of(
+    design: Design, pose: Array, frame: Array, landmark: Array, shared: Array, landmarks: Index
+) -> Array:
+    """Return what coefficients do to the rows (F, M, C).
+
+    Those of frames (F, B, C), of some landmarks (m, 3, C) and shared (Q, C); landmarks (m,).
+    """
+    own = np.concatenate([pose, design.frame], axis=-1)
+    offset = np.zeros((len(design.landmark), *landmark.shape[1:]))
+    offset[landmarks] = landmark
+    flat = design.offsets @ offset.reshape(-1, offset.shape[-1]) + design.shared @ shared
+    return np.asarray(flat.reshape(*own.shape[:2], -1) + own @ frame)
+
+
 def arranged(
     p: Products, f_label: Index, l_label: Index, s_label: Index, by_frame: bool
 ) -> Blocks:

@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows
+from fisheye_svp_ros.diagnosis.products import moves_of
 from fisheye_svp_ros.diagnosis.refit import Fitted
 
 _PROBES = 24
@@ -82,12 +83,9 @@ def _own(fitted: Fitted) -> Array:
 
 def _rows(fitted: Fitted, e: Array, r: Array, values: Array) -> Array:
     """Return what coefficients (E, k, C), (R, C) and fixed values (K, C) do to the rows."""
-    eq, random = fitted.factored.equations, fitted.design
-    frame, landmark, shared = eq.sorted(e, r)
-    offset = np.zeros((len(random.landmark), 3, values.shape[-1]))
-    offset[eq.landmarks] = landmark
-    flat = random.offsets @ offset.reshape(-1, offset.shape[-1]) + random.shared @ shared
-    rows = flat.reshape(*fitted.linear.residual.shape, -1) + _own(fitted) @ frame
+    eq = fitted.factored.equations
+    pose = fitted.linear.frame_columns / eq.pose_scale[:, None]
+    rows = moves_of(fitted.design, pose, *eq.sorted(e, r), eq.landmarks)
     return np.asarray(rows + fitted.linear.shared_columns @ (values / fitted.scale[:, None]))
 
 

@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.choice import (
     choose,
     held_out_gain,
 )
+from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import (
     Evidence,
     Placed,
@@ -235,7 +236,7 @@ def _doubt(
     evidence: Evidence, included: Index, effect: Effect, columns: Index, quick: bool
 ) -> TraceStep | None:
     """Return why an effect is not needed beside everything else that is included, if so."""
-    score = drop_test(evidence, included, columns)
+    score = drop_test(evidence, included, columns, effect)
     corrected = min(1.0, score.p_value * evidence.forms.names())
     gain, why = HeldOutGain(np.nan, np.nan), 'removed: the other causes explain it'
     if corrected < SIGNIFICANCE:
@@ -249,11 +250,11 @@ def _doubt(
                 gain.value, gain.stderr, False, why)
 
 
-def drop_test(evidence: Evidence, included: Index, columns: Index) -> Score:
+def drop_test(evidence: Evidence, included: Index, columns: Index, effect: Effect) -> Score:
     """Test an effect in the model given everything else that is included."""
     rest = np.setdiff1d(included, columns)
     remaining = evidence.remaining(evidence.information, rest)
-    return evidence.confident(evidence.score(remaining, columns), rest, columns)
+    return confident(evidence, evidence.score(remaining, columns), rest, columns, effect)
 
 
 def _estimated(

@@ -11,6 +11,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import Evidence, swept
 from fisheye_svp_ros.diagnosis.refit import Fitted
 from fisheye_svp_ros.diagnosis.residuals import ripples, standardised_squares
@@ -62,7 +63,7 @@ def _field_tests(evidence: Evidence) -> Iterator[tuple[str, float, float]]:
     remaining = swept(evidence.information, own)
     total = float((evidence.linear.residual**2).sum())
     for name, columns in evidence.probes.items():
-        score = evidence.confident(evidence.score(remaining, columns), own, columns)
+        score = confident(evidence, evidence.score(remaining, columns), own, columns)
         explained = (score.statistic - score.rank) * evidence.variances.sigma**2
         yield name, score.p_value, max(explained, 0.0) / total
 

@@ -32,6 +32,7 @@ class SessionStepEffect(Effect):
     # A step after the first few frames is hardly more than intrinsics that are wrong throughout.
     asked_after = ('focal_length', 'principal_point')
     of_recording = True
+    abrupt = True
     signature = 'residuals that change at one frame and keep their new pattern'
     to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 

@@ -52,6 +52,18 @@ def test_a_smooth_image_field_is_not_named_after_the_effect_that_it_resembles(se
     assert [cause.effect for cause in found.causes] == []
 
 
+@pytest.mark.parametrize('seed', [1, 2, 7])
+def test_an_image_that_swings_is_no_step(seed):
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng, cameras=2)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    swing = np.sin(rng.uniform(3, 8) * table.t + rng.uniform(0, 6))[:, None] * rng.normal(size=2)
+    found = diagnose(replace(table, uv=table.uv + 10 * SIGMA * swing), lens(),
+                     free_intrinsics=False)
+    assert [cause.effect for cause in found.causes] == []
+    assert 'frame' in [s.variable for s in found.remaining]
+
+
 def test_gross_errors_that_hit_another_landmark_by_chance_are_no_wrong_ids():
     """Far points on a target whose landmarks are a few standard deviations apart."""
     rng = np.random.default_rng(17)

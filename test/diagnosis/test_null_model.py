@@ -9,6 +9,7 @@ from scipy import stats
 
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.components import score_components, significance
+from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
 from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import equations, factored, solve
@@ -268,7 +269,7 @@ def test_doubt_about_variances_has_its_degrees_of_freedom():
     form = next(i for i, e in enumerate(evidence.forms.effects) if e.name == 'target_shape')
     columns = evidence.columns_of(form)
     score = evidence.score(swept(evidence.information, own), columns)
-    sure = evidence.confident(score, own, columns)
+    sure = confident(evidence, score, own, columns)
     assert sure.p_value == pytest.approx(
         stats.f.sf(score.statistic / score.rank, score.rank, sure.freedom))
     assert sure.p_value > 1.5 * score.p_value
@@ -300,7 +301,7 @@ def test_p_values_are_uniform_without_an_effect():
             if simplest and effect.name in TESTED:
                 columns = evidence.columns_of(form)
                 score = evidence.score(left, columns)
-                sure = evidence.confident(score, np.arange(evidence.own), columns)
+                sure = confident(evidence, score, np.arange(evidence.own), columns)
                 p_values.append(sure.p_value)
     # 40 values; a sound build fails this less than once in ten thousand runs.
     assert stats.kstest(p_values, 'uniform').pvalue > 1e-4
