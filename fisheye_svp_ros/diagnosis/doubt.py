@@ -20,7 +20,7 @@ from fisheye_svp_ros.effects.base import Effect
 
 _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them more is asked
 _TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # variance over noise of an effect's coefficient
-_PATHS = tuple(0.5 * 4.0**i for i in range(10))  # the same, of a path over the frames
+_PATHS = tuple(8.0 * 4.0**i for i in range(12))  # the same, of a path's slowest wave
 
 
 def confident(
@@ -88,7 +88,7 @@ def _fields(evidence: Evidence, effect: Effect | None) -> Iterator[tuple[float, 
     """Yield log determinant and information beside fields that an effect may be mistaken for.
 
     A smooth field of the image; for what varies in a rig what frames have of their own: no pose
-    of a single view takes up most of that there; for what is abrupt a smooth path of the image.
+    of a single view takes up most of that there; for what is abrupt smooth paths of intrinsics.
     """
     yield from evidence.with_field
     if effect is not None and effect.of_recording and evidence.linear.data.cameras > 1:
@@ -96,7 +96,7 @@ def _fields(evidence: Evidence, effect: Effect | None) -> Iterator[tuple[float, 
             yield f.log_determinant, f.information
     if effect is not None and effect.abrupt:
         for size in _PATHS:
-            yield integrated(evidence.factored, evidence.paths, 1 / size)
+            yield integrated(evidence.factored, evidence.paths, evidence.roughness / size)
 
 
 def _direction(evidence: Evidence, estimate: Array, included: Index, columns: Index) -> Array:

@@ -17,7 +17,7 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.candidates import Forms, forms_of
 from fisheye_svp_ros.diagnosis.components import called, find_variances
-from fisheye_svp_ros.diagnosis.fields import centre_paths, mean_fields
+from fisheye_svp_ros.diagnosis.fields import intrinsic_paths, mean_fields
 from fisheye_svp_ros.diagnosis.left_out import LeftOut, left_out_in_turn
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, flat_rows
@@ -69,6 +69,7 @@ class Evidence:
     border: Array
     probes: dict[str, Index]
     paths: Index
+    roughness: Array
 
     def around(
         self, data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
@@ -263,7 +264,7 @@ def _multiplied(
     """
     linear = Linearised(data, state, free)
     forms = forms_of(linear, left_out)
-    fields, paths = mean_fields(linear), centre_paths(linear)
+    fields, (paths, roughness) = mean_fields(linear), intrinsic_paths(linear)
     columns = np.concatenate(
         [linear.shared_columns, forms.columns, *fields.values(), paths], axis=-1)
     scale = np.sqrt((columns**2).sum(axis=(0, 1)))
@@ -280,14 +281,15 @@ def _multiplied(
         at += field.shape[-1]
     nothing, paths_at = start_variances(full), np.arange(at, at + paths.shape[-1])
     return Evidence(
-        linear, forms, random, full, nothing, own, scale, border, probes, paths_at)
+        linear, forms, random, full, nothing, own, scale, border, probes, paths_at, roughness)
 
 
-def integrated(f: Factored, columns: Index, prior: float) -> tuple[float, Array]:
+def integrated(f: Factored, columns: Index, prior: float | Array) -> tuple[float, Array]:
     """Return log determinant and information with columns of the border random; prior: lambda."""
-    inner = f.information[np.ix_(columns, columns)] + prior * np.eye(len(columns))
+    priors = np.broadcast_to(prior, columns.shape)
+    inner = f.information[np.ix_(columns, columns)] + np.diag(priors)
     across = f.information[columns]
-    logs = f.log_determinant + np.linalg.slogdet(inner)[1] - len(columns) * np.log(prior)
+    logs = f.log_determinant + np.linalg.slogdet(inner)[1] - np.log(priors).sum()
     return float(logs), f.information - across.T @ np.linalg.solve(inner, across)
 
 

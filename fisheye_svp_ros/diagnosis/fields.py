@@ -42,10 +42,11 @@ def mean_fields(linear: Linearised) -> dict[str, Array]:
     }
 
 
-def centre_paths(linear: Linearised) -> Array:
-    """Smooth paths (F, M, P) of each camera's image over the frames, in the order of time.
+def intrinsic_paths(linear: Linearised) -> tuple[Array, Array]:
+    """Smooth paths (F, M, P) of each camera's focal length and centre, in the order of time.
 
-    Cosines that at least three frames share the half period of, along u and along v.
+    Cosines over the frames, each half period of three frames at least; and the precision (P,) of
+    the coefficient of each beside that of the slowest, as the square of the second derivative.
     """
     data, scene = linear.data, linear.scene
     instant = scene.times if np.isfinite(scene.times).all() else scene.views.frame
@@ -55,9 +56,11 @@ def centre_paths(linear: Linearised) -> Array:
     path = np.cos(np.pi * waves * (place[:, None] + 0.5) / count)
     mine = data.camera_of[:, None] == np.arange(data.cameras)
     moves = (path[..., None] * mine[:, None]).reshape(len(path), -1)
-    both = moves[:, None, None, :, None] * np.eye(2)[:, None, :]
-    shape = (*linear.weight.shape, 2, both.shape[-1] * both.shape[-2])
-    return linear.whitened(np.broadcast_to(both.reshape(len(path), 1, 2, -1), shape))
+    growth = np.nan_to_num(scene.normalised())[..., None]
+    step = np.concatenate([growth, np.broadcast_to(np.eye(2), (*growth.shape[:-1], 2))], axis=-1)
+    columns = step[..., None] * moves[:, None, None, None]
+    roughness = np.tile(np.repeat(waves**4.0, data.cameras), step.shape[-1])
+    return linear.whitened(columns.reshape(*growth.shape[:-1], -1)), roughness
 
 
 def _along(direction: Array, scalars: list[Array]) -> list[Array]:

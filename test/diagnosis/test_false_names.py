@@ -64,6 +64,19 @@ def test_an_image_that_swings_is_no_step(seed):
     assert 'frame' in [s.variable for s in found.remaining]
 
 
+@pytest.mark.parametrize('seed', [0, 3])
+def test_a_focal_length_that_drifts_is_no_step_where_no_time_is_known(seed):
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng)
+    table = observe(lens(), (), pose, views, SIGMA, rng)
+    growth = 5e-3 * (2 * table.t[:, None] / table.t.max() - 1)
+    table = replace(table, uv=table.uv + growth * (table.uv - [lens().cx, lens().cy]),
+                    t=np.full(len(table), np.nan))
+    found = diagnose(table, lens(), free_intrinsics=False)
+    assert 'session_step' not in {cause.effect for cause in found.causes}
+    assert found.remaining
+
+
 def test_gross_errors_that_hit_another_landmark_by_chance_are_no_wrong_ids():
     """Far points on a target whose landmarks are a few standard deviations apart."""
     rng = np.random.default_rng(17)
