@@ -107,21 +107,27 @@ class ForwardModel:
         """Predict and differentiate; angles past the field of view are allowed (a solver).
 
         The derivatives leave out that image and detector effects vary over the image: `d_pose` has
-        them for a solver whose points are good to a hundredth of a pixel.
+        them for a solver, which else would not come to rest where points have errors.
         """
         return self._through(pose, views, limited=False)
 
     def d_pose(self, linear: LinearViews, views: Views) -> Array:
-        """Return the derivatives (S, N, 2, 6) by the pose, with how detector effects vary."""
-        if not self._acts('detector'):
-            return linear.d_pose
-        low, high = (
-            self._moved(Scene(views, self.lens, linear.pose, linear.optical + step,
-                              linear.image.incidence), 'detector')
-            for step in (-_STEP, _STEP))
-        # What moves u depends on u, and v on v.
-        slope = (np.asarray(high) - low) / (2 * _STEP)
-        return np.asarray(linear.d_pose * (1 + slope)[..., None])
+        """Return derivatives (S, N, 2, 6) by the pose, with how effects vary over the image."""
+        found = linear.d_pose
+        for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
+            if self._acts(stage):
+                found = found + self._slope(linear, views, stage, uv) @ found
+        return found
+
+    def _slope(self, linear: LinearViews, views: Views, stage: str, uv: Array) -> Array:
+        """Return the derivatives (S, N, 2, 2) of the displacements of a stage by image points."""
+        scene = Scene(views, self.lens, linear.pose, uv, linear.image.incidence)
+
+        def moved(step: Array) -> Array:
+            return np.asarray(self._moved(replace(scene, uv=uv + step), stage))
+
+        steps = _STEP * np.eye(2)
+        return np.stack([moved(step) - moved(-step) for step in steps], axis=-1) / (2 * _STEP)
 
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""

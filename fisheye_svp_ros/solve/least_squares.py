@@ -22,6 +22,7 @@ Arrays = tuple[Array, ...]
 
 _RIDGE = 2e-14  # beyond rounding, and less than what counts as determined
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
+_REST = 1e-6  # of the cost: what a step promises where derivatives that are not exact end
 
 
 class Problem(Protocol):
@@ -100,6 +101,11 @@ def levenberg_marquardt(
             damping[active], growth[active], better, before - cost, moved
         )
         active = active[damping[active] < STUCK]
+    rest = np.flatnonzero(~found.converged & np.isfinite(total))
+    if rest.size:
+        # Some effects have derivatives that are not exact: no step keeps what it promises.
+        _, moved = problem.step(_at(found.normal, rest), np.zeros(len(rest)))
+        found.converged[rest] = moved <= _REST * total[rest]
     return found
 
 

@@ -1,12 +1,11 @@
 """Self-localization: exact with the true lens, the paper's errors with SVP, honest covariances."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from helpers.differences import derivative, jacobian
 from scipy.optimize import least_squares
 
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.landmark_files import environment
@@ -137,20 +136,52 @@ def test_equals_scipy(shift):
         assert np.abs(solved.pose.rotation[i] - expected.rotation[0]).max() < 1e-10
 
 
-@pytest.mark.parametrize('order', [1, 2])
-def test_what_a_detector_adds_keeps_no_pose_from_being_found(order):
-    """It changes within a pixel, by a thirtieth of a step, which sharp corners notice."""
-    lens, rng = LENSES['fish180'], np.random.default_rng(0)
-    names = ('sine',) if order == 1 else ('u_sine', 'u_cosine', 'v_sine', 'v_cosine')
-    bias = {'order': order, 'parameters': dict.fromkeys(names, -0.006)}
-    lens = replace(lens, corrections={'detector_bias': bias})
-    true = Pose(rotation_from_vector(rng.normal(scale=0.1, size=(20, 3))),
+CORRECTIONS = [
+    ('sensor_tilt', {}, 0.003), ('decentering', {}, 0.003), ('aspect', {}, 0.003),
+    ('skew', {}, 0.003), ('dot_centroid', {}, 1e-3),
+    ('detector_bias', {'order': 1}, -0.006), ('detector_bias', {'order': 2}, -0.006),
+]
+
+
+@pytest.mark.parametrize(('name', 'form', 'size'), CORRECTIONS)
+def test_no_correction_keeps_a_pose_from_being_found(name, form, size):
+    """What it does to an image point changes over the image, and within a pixel."""
+    lens, rng = LENSES['fish180'].svp(), np.random.default_rng(0)
+    effect = CATALOGUE[name](**form)
+    values = np.full(len(effect.parameters), size)
+    model = ForwardModel(lens, [(effect, values)])
+    true = Pose(rotation_from_vector(rng.normal(scale=0.3, size=(20, 3))),
                 rng.normal(scale=0.02, size=(20, 3)))
     points = np.stack([*np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.4, 0.4, 5)),
                        np.full((5, 7), 0.6)], axis=-1).reshape(1, -1, 3).repeat(20, 0)
-    views = seen(lens, points, true, 0.02, rng)._replace(weight=np.full((20, 35), 100.0))
-    found = localize(ForwardModel(lens), views)
+    views = views_of(points)
+    uv = model.predict(true, views).uv
+    views = views._replace(uv=uv + rng.normal(scale=0.2, size=uv.shape),
+                           weight=np.full((20, 35), 5.0))
+    found = localize(model, views)
     assert found.converged.all()
+    error = found.pose.difference(true)
+    nees = np.einsum('si,sij,sj->s', error, np.linalg.inv(found.covariance), error)
+    assert nees.mean() == pytest.approx(6.0, abs=2.0)
+
+
+@pytest.mark.parametrize('name', ['sensor_tilt', 'decentering', 'skew', 'detector_bias'])
+def test_a_solvers_derivatives_have_how_corrections_vary_over_the_image(name):
+    rng = np.random.default_rng(36)
+    effect = CATALOGUE[name]()
+    model = ForwardModel(LENSES['fish180'], [(effect, np.full(len(effect.parameters), 0.003))])
+    pose = scattered_poses(rng, 10, 0.5)
+    views = seen(LENSES['fish180'], environment('inner', 0.5).points, pose)
+    found = model.d_pose(model.linearise(pose, views), views)
+    for axis in np.eye(6):
+        def moved(size, axis=axis):
+            camera = pose.retract(np.tile(size * axis, (10, 1)))
+            return model.predict(camera, views, limited=False).uv
+
+        column, expected = found @ axis, derivative(moved, 1e-5)
+        ok = (views.weight > 0)[..., None]
+        scale = np.abs(column).max(axis=-1, keepdims=True)
+        assert np.where(ok, np.abs(column - expected) / scale, 0.0).max() < 1e-6
 
 
 def test_no_start_value_is_needed_from_any_pose():
