@@ -85,9 +85,10 @@ def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust
     """
     data = prepare(observations)
     evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
-    errors = honest_errors(evidence)
+    # What else the lens has, its corrections, is fitted along and follows them.
+    errors = honest_errors(evidence)[: len(names)]
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    moved, covariance = _any_target(evidence)
+    moved, covariance = _any_target(evidence, len(names))
     values = parameter_values(lens, names)
     admissible = {
         name: _admissible(name, (value, error), (value + step, spread)) for name, value, error,
@@ -112,8 +113,11 @@ def with_stderr(lens: Lens, trusted: Trust) -> Lens:
         'covariance': trusted.covariance.tolist()})
 
 
-def _any_target(evidence: Evidence) -> tuple[Array, Array]:
-    """Return how far parameters (K,) move once the target is free, and their covariance (K, K)."""
+def _any_target(evidence: Evidence, count: int) -> tuple[Array, Array]:
+    """Return how far parameters (K,) move once the target is free, and their covariance (K, K).
+
+    count: of these, the first of what is in the model.
+    """
     own = np.arange(evidence.own)
     columns, prior = [own], [np.zeros(evidence.own)]
     for form, effect in enumerate(evidence.forms.effects):
@@ -126,7 +130,7 @@ def _any_target(evidence: Evidence) -> tuple[Array, Array]:
     inverse, _ = pseudo_inverse(
         information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
     )
-    scale = evidence.scale[own]
+    own, scale = own[:count], evidence.scale[:count]
     return (inverse @ information[every, -1])[own] / scale, (
         inverse[np.ix_(own, own)] / np.outer(scale, scale))
 

@@ -106,18 +106,21 @@ class ForwardModel:
     def linearise(self, pose: Pose, views: Views) -> LinearViews:
         """Predict and differentiate; angles past the field of view are allowed (a solver).
 
-        The derivatives leave out that image and detector effects vary over the image: `d_pose` has
-        them for a solver, which else would not come to rest where points have errors.
+        The derivatives leave out that image and detector effects vary over the image: `d_pose` and
+        `through` have it for a solver, which else does not come to rest where points have errors.
         """
         return self._through(pose, views, limited=False)
 
     def d_pose(self, linear: LinearViews, views: Views) -> Array:
         """Return derivatives (S, N, 2, 6) by the pose, with how effects vary over the image."""
-        found = linear.d_pose
+        return self.through(linear, views, linear.d_pose)
+
+    def through(self, linear: LinearViews, views: Views, columns: Array) -> Array:
+        """Return columns (S, N, 2, P) that move ideal image points as they move measured ones."""
         for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
             if self._acts(stage):
-                found = found + self._slope(linear, views, stage, uv) @ found
-        return found
+                columns = columns + self._slope(linear, views, stage, uv) @ columns
+        return columns
 
     def _slope(self, linear: LinearViews, views: Views, stage: str, uv: Array) -> Array:
         """Return the derivatives (S, N, 2, 2) of the displacements of a stage by image points."""

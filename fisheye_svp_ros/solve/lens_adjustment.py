@@ -11,7 +11,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.camera import lens_columns
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import (
@@ -123,8 +123,13 @@ def _linearised(
     lens: Lens, views: Views, pose: Pose, names: Sequence[str]
 ) -> tuple[Array, Array, Arrays]:
     """Return predictions (V, N, 2), costs (V,) and normal equations of poses and lens by view."""
-    linear = ForwardModel(lens).linearise(pose, views)
-    jacobian = np.concatenate([linear.d_pose, lens_columns(lens, linear.image, names)], axis=-1)
+    model = ForwardModel(lens)
+    linear = model.linearise(pose, views)
+    columns = lens_columns(lens, linear.image, names)
+    # Corrections of the image plane go with its centre and focal lengths.
+    inner = [name not in ('f', *INTRINSICS) for name in names]
+    columns[..., inner] = model.through(linear, views, columns[..., inner])
+    jacobian = np.concatenate([model.d_pose(linear, views), columns], axis=-1)
     return linear.uv, *normal_equations(linear.uv, jacobian, views)
 
 

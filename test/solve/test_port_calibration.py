@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
+from fisheye_svp_ros.diagnosis.calibration import trust
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
@@ -33,6 +34,20 @@ def test_a_port_is_found_for_a_lens_calibrated_in_air(port):
     assert np.abs(pulls(result, port)).max() < 4
     assert result.adjusted.lens.svp() == replace(
         AIR, calibration=result.adjusted.lens.calibration, max_incidence=AIR.max_incidence)
+
+
+def test_a_port_is_found_in_front_of_a_lens_with_corrections():
+    """As `diagnose` extends a lens in air; what is said of the port's errors is said then, too."""
+    tilt = {'parameters': {'about_x': 0.02, 'about_y': -0.01}}
+    air = replace(AIR, corrections={'sensor_tilt': tilt})
+    seen = photographs(air, FLAT)
+    result = calibrate_port(seen, air, FlatGlass(0.0, 1.333))
+    assert result.adjusted.converged
+    assert np.abs(pulls(result, FLAT)).max() < 4
+    found = trust(seen, result.adjusted.lens, result.adjusted.names)
+    assert list(found.stderr) == list(result.adjusted.names)
+    assert found.covariance.shape == (3, 3)
+    assert min(found.stderr.values()) > 0
 
 
 def test_the_index_is_fitted_on_demand():
