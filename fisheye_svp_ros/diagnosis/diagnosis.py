@@ -188,6 +188,10 @@ def diagnose(
             wanted = replace(wanted, left_out=(*wanted.left_out, 'session_step'))
         data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
     found = search(data, base, free, wanted, gross, progress)
+    if medium is not None and (thinner := medium.glassless(found.evidence)) is not None:
+        # What stood in for a cause was no glass.
+        medium, base, free = thinner, thinner.state, thinner.names
+        found = search(data, base, free, wanted, gross, progress)
     found, cameras = agreed(found, free, wanted, lambda less: search(
         data, base, free, less, gross, lambda stage, _: progress(stage, 0.79)), progress)
     noise_causes = growth_cause(found.growth)

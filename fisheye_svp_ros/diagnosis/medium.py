@@ -17,12 +17,13 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.budget import Component
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.evidence import block_basis, pseudo_inverse
+from fisheye_svp_ros.diagnosis.evidence import Evidence, block_basis, pseudo_inverse
 from fisheye_svp_ros.diagnosis.in_air import InAir
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, flat_rows
 from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
 from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
 from fisheye_svp_ros.diagnosis.residuals import rms_px
+from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
 from fisheye_svp_ros.errors import GeometryError
@@ -44,6 +45,7 @@ _WORSE = 1.5  # times as much misfit as a free lens curve leaves; lenses are not
 _LIQUIDS = (1.30, 1.56)  # refractive indices of what one photographs through (water to oils)
 _KEPT = 0.8  # of the points, at least, are no gross errors behind a port that is there
 _THICKEST = 0.05  # m, of glass
+_SURE = 3.0  # standard errors of its thickness
 _TOLD = 0.02  # standard error above which the index is not told by the data
 
 
@@ -70,6 +72,22 @@ class Medium:
     merit: float
     moved: bool
     magnified: float = 0.0
+
+    def glassless(self, evidence: Evidence) -> Medium | None:
+        """Return the medium with its glass counted as part of the distance.
+
+        evidence: once all causes are found; None where it still tells of the glass.
+        """
+        if THICKNESS not in self.names:
+            return None
+        thickness = evidence.linear.state.lens.parameters[THICKNESS]
+        error = standard_errors(evidence)[evidence.linear.free.index(THICKNESS)]
+        if _is_glass(thickness) and thickness > _SURE * error:
+            return None
+        names = tuple(name for name in self.names if name != THICKNESS)
+        lens = self.state.lens.with_parameters([THICKNESS], [0.0])
+        state = fit(self.air.data, replace(self.state, lens=lens), names)
+        return replace(self, state=state, names=names)
 
     def held_out(self) -> HeldOut:
         """Predict parts of the frames in turn, in air."""
@@ -244,12 +262,16 @@ def _behind_port(
         state, names = freed, (*PLACE, INDEX)
     freed, errors, gain = _freed(data, state, (*names, THICKNESS))
     # Glass of no thickness is part of the distance.
-    thickness = freed.lens.parameters[THICKNESS]
-    if 0 < thickness < _THICKEST and gain > np.log(2 * len(data.observations)):
+    there = _is_glass(freed.lens.parameters[THICKNESS])
+    if there and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
     if rms_px(Linearised(data, state, ())) > _LOST:
         return None
     return data, gross, state, names
+
+
+def _is_glass(thickness: float) -> bool:
+    return 0 < thickness < _THICKEST
 
 
 def _freed(data: Data, state: State, names: tuple[str, ...]) -> tuple[State, Array, float]:

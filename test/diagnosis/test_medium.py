@@ -49,6 +49,18 @@ def test_water_is_named_and_measured(lens, others):
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
 
 
+def test_glass_that_stood_in_for_a_cause_is_gone_with_it():
+    """The lens was off in air: so many millimetres of glass, even below none, would undo that."""
+    rng = np.random.default_rng(0)
+    true = replace(AIR, cx=AIR.cx + rng.normal(0, 6), cy=AIR.cy + rng.normal(0, 6),
+                   fy=AIR.fy * (1 + rng.normal(0, 0.003)))
+    found = diagnose(photographs(true, PORT, 12, 0.05), AIR, wanted=Wanted(quick=True))
+    assert {c.effect for c in found.causes} >= {'flat_port', 'principal_point', 'aspect'}
+    assert 'thickness' not in medium_of(found).parameters
+    assert found.lens.port.thickness == 0.0
+    assert found.lens.port.medium_index == pytest.approx(1.34, rel=0.001)
+
+
 def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     """The curve turns back at 62 degrees where no point in air was."""
     table = photographs(AIR, None, 6, noise=0.3, seed=2, reach=0.15)
