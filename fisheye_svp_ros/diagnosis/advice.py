@@ -11,12 +11,15 @@ from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.measured import Measured
+from fisheye_svp_ros.diagnosis.medium import Medium
 from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW, Gross
 from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.scene.observations import Observations
 
+DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
+                'that: the lens was off in air')
 _STANDS_OUT = 2.0  # times the typical one
 _MOST = 8
 
@@ -82,12 +85,24 @@ def advise(
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
         if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
     ]
-    if measured.medium is not None and measured.medium.moved:
+    if measured.medium is not None:
+        advice += _in_air(measured.medium, causes)
+    # Advice without a figure keeps its order, after all that has one.
+    return sorted(advice, key=lambda one: -one.gain)
+
+
+def _in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
+    """Return what would make a lens surer that was calibrated in air."""
+    advice = []
+    others = {cause.effect for cause in causes if stage_of(cause.effect) == 'lens'}
+    told = medium.state.lens.uncertainty is not None  # by `diagnose`
+    if not told and (medium.moved or len(others) > 1):
+        advice.append(Advice(DIAGNOSE_AIR))
+    if medium.moved:
         advice.append(Advice(
             'the lens was moved within what its calibration in air leaves open: take photographs '
             'in air that fill the image, or of a target that is better known'))
-    # Advice without a figure keeps its order, after all that has one.
-    return sorted(advice, key=lambda one: -one.gain)
+    return advice
 
 
 def _boards(cause: Cause) -> list[int]:

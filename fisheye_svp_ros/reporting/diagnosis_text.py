@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import Advice
+from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, Advice
 from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -291,6 +291,7 @@ def _next(d: Diagnosis) -> str:
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
+    steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
             if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections]
     refuted = d.named.heldout_rms_px >= d.base.heldout_rms_px
