@@ -6,6 +6,7 @@ Any leading shape: left and right image points (..., 2) and rigs (...) broadcast
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -256,4 +257,6 @@ class _Depth:
 
 def _linearise(model: ForwardModel, points: Array) -> LinearViews:
     """Linearise image points of points (M, 3) in the camera's own frame, as one view."""
-    return model.linearise(identity(1), views_of(points))
+    views = views_of(points)
+    linear = model.linearise(identity(1), views)
+    return replace(linear, d_pose=model.d_pose(linear, views))

@@ -5,6 +5,7 @@ import pytest
 from helpers.differences import jacobian
 from scipy.optimize import brentq, least_squares, minimize_scalar
 
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -193,6 +194,22 @@ def test_optimal_points_equal_scipy_and_beat_the_midpoint():
         own = np.concatenate([solved.left_residual[i], solved.right_residual[i]])
         np.testing.assert_allclose(own, residual(solved.points[i]), atol=1e-9)
         assert np.sum(own**2) < np.sum(residual(midpoint.points[i])**2)
+
+
+@pytest.mark.parametrize('name', ['sensor_tilt', 'decentering', 'detector_bias'])
+def test_no_correction_of_a_lens_keeps_a_point_from_being_found(name):
+    rng = np.random.default_rng(51)
+    effect = CATALOGUE[name]()
+    model = ForwardModel(SVP['fish180'].lens, [(effect, np.full(len(effect.parameters), 0.005))])
+    points, pose = random_points(rng, 300), rig('parallel')
+    left, right = (model.project(seen).uv + rng.normal(scale=0.3, size=(300, 2))
+                   for seen in (pose.into_body(points), points))
+    solved = triangulate_optimally(model, model, pose, left, right, 0.3)
+    assert np.array_equal(solved.valid, triangulate(model, model, pose, left, right).valid)
+    off = (solved.points - points)[solved.valid]
+    nees = np.einsum('ni,nij,nj->n', off, np.linalg.inv(solved.covariance[solved.valid]), off)
+    assert np.median(nees) == pytest.approx(2.37, rel=0.2)
+    assert np.isfinite(epipolar_offset(model, model, pose, left, right).distance).mean() > 0.99
 
 
 @pytest.mark.parametrize('style', STYLES)
