@@ -23,7 +23,9 @@ CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
 _ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
 _ABSURD = 30.0  # times what would be a large value of a parameter
-_HELD_OUT = 1.5  # standard errors by which held-out frames must be predicted better
+# Standard errors by which held-out frames must be predicted better to take an effect in, and to
+# keep it: beside what was found since it need not show so clearly.
+_HELD_OUT, _KEPT = 1.5, 1.0
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,13 @@ class HeldOutGain:
 
     @property
     def convincing(self) -> bool:
-        """Whether the gain is worth more than its error."""
+        """Whether the gain is worth more than its error, clearly."""
         return self.value > _HELD_OUT * self.stderr
+
+    @property
+    def enough(self) -> bool:
+        """Whether an effect that was taken in for its gain is still worth more than its error."""
+        return self.value > _KEPT * self.stderr
 
 
 @dataclass(frozen=True)

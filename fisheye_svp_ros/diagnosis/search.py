@@ -243,7 +243,7 @@ def _doubt(
         if quick or effect.per_frame:
             return None
         gain = held_out_gain(evidence, np.setdiff1d(included, columns), columns, effect)
-        if gain.convincing:
+        if gain.enough:
             return None
         why = 'removed: it does not predict better any more'
     return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
