@@ -27,7 +27,7 @@ publisher = node.create_publisher(String, 'chatter', {qos})
 count = 0
 def talk():
     global count
-    if publisher.get_subscription_count() and count < 5:
+    if publisher.get_subscription_count():
         count += 1
         publisher.publish(String(data=f'{{count}}'))
 node.create_timer(0.01, talk)
@@ -50,8 +50,10 @@ def test_messages_arrive_in_order(
     qos = f'QoSProfile(depth=10, reliability=ReliabilityPolicy.{reliability})'
     listener = run_node(_LISTEN.format(qos=qos), 'listener')
     run_node(_TALK.format(qos=qos), 'talker')
-    heard = [listener.wait_for('heard (.*)')[1] for _ in range(5)]
-    assert heard == ['1', '2', '3', '4', '5']
+    heard = [int(listener.wait_for('heard (.*)')[1]) for _ in range(5)]
+    assert heard == sorted(set(heard))
+    # The talker knows of the listener before the listener of it: best effort loses the first.
+    assert reliability == 'BEST_EFFORT' or heard == [1, 2, 3, 4, 5]
 
 
 def test_late_subscriber_receives_the_last_ones(run_node: Callable[..., NodeProcess]) -> None:
