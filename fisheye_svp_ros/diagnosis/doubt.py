@@ -20,7 +20,6 @@ from fisheye_svp_ros.effects.base import Effect
 
 _DOUBTFUL, _BEYOND_DOUBT = 0.01, 200.0  # p-value, statistic: between them more is asked
 _TURNS = (0.5, 2.0, 8.0, 32.0, 128.0, 512.0)  # variance over noise of an effect's coefficient
-_PATHS = tuple(8.0 * 4.0**i for i in range(12))  # the same, of a path's slowest wave
 
 
 def confident(
@@ -95,8 +94,7 @@ def _fields(evidence: Evidence, effect: Effect | None) -> Iterator[tuple[float, 
         for f in (evidence.without_frames, evidence.frames_anew):
             yield f.log_determinant, f.information
     if effect is not None and effect.abrupt:
-        for size in _PATHS:
-            yield integrated(evidence.factored, evidence.paths, evidence.roughness / size)
+        yield from evidence.with_paths
 
 
 def _direction(evidence: Evidence, estimate: Array, included: Index, columns: Index) -> Array:
@@ -132,24 +130,25 @@ def _by_landmark(
     left = evidence.residual_with(included)
     inverse, _ = pseudo_inverse(info[np.ix_(both, both)])
     left[both] -= inverse @ (info[both] @ left)
-    weight, _ = _rows(evidence, way)
-    remaining, offsets = _rows(evidence, left)
+    weight, remaining = _rows(evidence, way, left)
     used = evidence.linear.used
     slot = np.repeat(evidence.design.slot, 2, axis=-1)[used]
-    parts = np.bincount(slot, weights=(weight * (remaining + offsets))[used])
+    parts = np.bincount(slot, weights=(weight * remaining)[used])
     expected = float(way @ info @ way) * evidence.variances.sigma**2
     statistic = score.statistic / max(float(parts @ parts) / max(expected, 1e-300), 1.0)
     freedom = max(len(np.unique(slot)) - score.rank, 1)
     return float(special.fdtrc(score.rank, freedom, statistic / score.rank))
 
 
-def _rows(evidence: Evidence, way: Array) -> tuple[Array, Array]:
-    """Return a combination of the border (F, M), all that is random out, and landmarks' part."""
+def _rows(evidence: Evidence, way: Array, left: Array) -> Array:
+    """Return two combinations of the border (2, F, M), what is random out.
+
+    Of the second all but what landmarks have of their own.
+    """
     f, eq = evidence.factored, evidence.equations
-    frame, landmark, shared = (
-        part[..., None] for part in eq.sorted(*f.coefficients(way)))
+    parts = [eq.sorted(*f.coefficients(one)) for one in (way, left)]
+    frame, landmark, shared = (np.stack(both, axis=-1) for both in zip(*parts, strict=True))
+    landmark[..., 1] = 0.0
     pose = evidence.linear.frame_columns / eq.pose_scale[:, None]
-    design = evidence.design.kept(evidence.variances.alive)
-    every, other = (moves_of(design, pose, frame, own, shared, eq.landmarks)[..., 0]
-                    for own in (landmark, np.zeros_like(landmark)))
-    return evidence.border @ way - every, every - other
+    random = moves_of(evidence.random, pose, frame, landmark, shared, eq.landmarks)
+    return np.moveaxis(evidence.border @ np.stack([way, left], axis=-1) - random, -1, 0)

@@ -34,6 +34,7 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
 _FIELDS = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
+_PATHS = tuple(8.0 * 4.0**i for i in range(12))  # of the slowest wave of a path
 _ANEW = 6  # steps: the likelihood is flat around the best variances
 IDENTIFIABLE = 1e-8  # of a normalised column's square: what is left less cannot be told apart
 
@@ -84,6 +85,11 @@ class Evidence:
         return self.full.trimmed(self.variances.alive)
 
     @cached_property
+    def random(self) -> Design:
+        """The design of the components that are there."""
+        return self.design.kept(self.variances.alive)
+
+    @cached_property
     def factored(self) -> Factored:
         """The equations of the components that are there, factored."""
         return factored(self.equations, self.variances.lam, self.variances.weight)
@@ -96,8 +102,7 @@ class Evidence:
     @cached_property
     def left_out(self) -> LeftOut:
         """Each frame seen from all the others."""
-        alive = self.design.kept(self.variances.alive)
-        return left_out_in_turn(self.factored, alive, self.linear.frame_columns, self.border)
+        return left_out_in_turn(self.factored, self.random, self.linear.frame_columns, self.border)
 
     @cached_property
     def in_turn(self) -> Array:
@@ -186,6 +191,11 @@ class Evidence:
             logs, information = integrated(f, np.arange(count), prior)
             found.append((logs, information[count:, count:]))
         return found
+
+    @cached_property
+    def with_paths(self) -> list[tuple[float, Array]]:
+        """Log determinant and information of the border, for smooth paths of several sizes."""
+        return [integrated(self.factored, self.paths, self.roughness / size) for size in _PATHS]
 
     @cached_property
     def without_frames(self) -> Factored:

@@ -148,7 +148,7 @@ def fit_linear(linear: Linearised, variances: Variances) -> Fitted:
 def fit_of(evidence: Evidence) -> Fitted:
     """Solve the mixed-model equations of evidence for what is in its model."""
     basis = np.eye(len(evidence.scale), evidence.own)
-    random = evidence.design.kept(evidence.variances.alive)
+    random = evidence.random
     return _solved(evidence.linear, random, evidence.equations.bordered(basis),
                    evidence.variances, evidence.scale[: evidence.own])
 
