@@ -5,26 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import linalg, special
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.mixed import (
-    Equations,
-    factored,
-    posterior,
-    solve,
-    solve_lower,
-)
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import (
     GONE,
     Variances,
     estimate,
     nothing_random,
-    one_step,
     start_variances,
+    stepped,
     without,
 )
+from fisheye_svp_ros.diagnosis.solution import Posterior, Solution, posterior, ratio_without, solve
+from fisheye_svp_ros.diagnosis.solution import without as solution_without
+
+_Whole = tuple[Factored, Solution, Posterior]
 
 _CALLED, _CALLED_LATE = 0.3, 0.01
 _LATE = ('frame_bumps', 'image_finest')  # many coefficients: asked once the others are there
@@ -74,9 +72,10 @@ def _without_chance(eq: Equations, now: Variances) -> Variances:
     One at a time: two that do the same are each dispensable, but not both.
     """
     while doubtful := _hardly_known(now):
-        full, ratios = likelihood_ratios(eq, now, doubtful)
+        whole = _whole(eq, now)
+        ratios = _ratios(now, whole, doubtful)
         if _chance(min(ratios.values())) <= _CHANCE:
-            ratios = _followed(eq, now, full, ratios)
+            ratios = _followed(eq, now, whole, ratios)
         name = min(ratios, key=ratios.__getitem__)
         if _chance(ratios[name]) <= _CHANCE:
             break
@@ -100,7 +99,7 @@ def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[st
     models with random effects, Biometrika 84 (1997).
     """
     f = factored(eq.trimmed(now.alive), now.lam, now.weight)
-    solution = solve(f, spread=False)
+    solution = solve(f)
     change = np.append(-solution.values, 1.0)
     found = {}
     for name in names:
@@ -162,56 +161,42 @@ def significance(eq: Equations, now: Variances) -> dict[str, float]:
     Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
     JASA 82 (1987)); the other variances follow.
     """
-    full, ratios = likelihood_ratios(eq, now, NAMES)
-    return {n: _chance(ratio) for n, ratio in _followed(eq, now, full, ratios).items()}
+    whole = _whole(eq, now)
+    ratios = _followed(eq, now, whole, _ratios(now, whole, NAMES))
+    return {name: _chance(ratio) for name, ratio in ratios.items()}
 
 
 def _chance(ratio: float) -> float:
     return float(special.chdtrc(1, max(ratio, 0.0))) / 2
 
 
-def likelihood_ratios(
-    eq: Equations, now: Variances, names: Sequence[str]
-) -> tuple[float, dict[str, float]]:
-    """Return the deviance, and by how much it rises without each component that is there.
-
-    The other variances stay; from the posterior of the component's coefficients b with covariance
-    S: what is left grows by b' inv(S) b, the determinant by that of S.
-    """
+def _whole(eq: Equations, now: Variances) -> _Whole:
     f = factored(eq.trimmed(now.alive), now.lam, now.weight)
-    solution, known = solve(f, spread=False), posterior(f)
-    blocks, freedom = f.equations.blocks, f.equations.rows - f.equations.poses
-    freedom -= len(solution.values)
-    found = {}
-    for name in names:
-        kind = NAMES.index(name)
-        if not now.alive[kind]:
-            continue
-        e, r = blocks.e_label == kind, blocks.r_label == kind
-        values, prior = (np.concatenate([of_e[e], of_r[r]]) for of_e, of_r in (
-            (solution.e, solution.r), f.precision))
-        root = linalg.cholesky(known.covariance(f.equations, kind), lower=True)
-        half = solve_lower(root, values)
-        growth = np.log1p(float(half @ half) / solution.variance / max(freedom, 1))
-        logs = 2 * np.log(np.diag(root)).sum() + np.log(prior).sum()
-        found[name] = float(freedom * growth + logs)
-    return solution.deviance, found
+    known = posterior(f)
+    return f, solve(f, known), known
+
+
+def _ratios(now: Variances, whole: _Whole, names: Sequence[str]) -> dict[str, float]:
+    """Return by how much the deviance rises without each component that is there."""
+    kinds = {name: NAMES.index(name) for name in names}
+    return {name: ratio_without(*whole, kind) for name, kind in kinds.items() if now.alive[kind]}
 
 
 def _followed(
-    eq: Equations, now: Variances, full: float, ratios: dict[str, float]
+    eq: Equations, now: Variances, whole: _Whole, ratios: dict[str, float]
 ) -> dict[str, float]:
     """Return likelihood ratios once the other variances have taken up what they can.
 
     They only ever take up a part of it, so that only doubtful ones are asked for.
     """
-    found = dict(ratios)
+    found, (f, solution, _) = dict(ratios), whole
     for name, ratio in ratios.items():
         if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
-            rest, left = one_step(eq, without(now, name))
-            found[name] = _deviance(left, rest) - full
+            left = solution_without(*whole, NAMES.index(name))
+            others = stepped(f, left, without(now, name))
+            found[name] = _deviance(eq, others) - solution.deviance
     return found
 
 
 def _deviance(eq: Equations, now: Variances) -> float:
-    return solve(factored(eq.trimmed(now.alive), now.lam, now.weight), spread=False).deviance
+    return solve(factored(eq.trimmed(now.alive), now.lam, now.weight)).deviance

@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, random_roots
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored
 from fisheye_svp_ros.diagnosis.random_effects import Design
+from fisheye_svp_ros.diagnosis.solution import random_roots
 
 
 class LeftOut(NamedTuple):

@@ -13,7 +13,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy import linalg
@@ -173,6 +173,11 @@ class Factored:
     border: Array
     information: Array
 
+    @property
+    def freedom(self) -> int:
+        """Numbers in the residual less fixed coefficients, the border's and those of poses."""
+        return self.equations.rows - self.equations.poses - len(self.information) + 1
+
     @cached_property
     def root(self) -> Array:
         """Lower root of the information of the fixed columns.
@@ -190,12 +195,12 @@ class Factored:
         """Of the covariance of the numbers over the noise variance, poses projected out."""
         e, r = self.precision
         priors = np.concatenate([e.ravel(), r])
-        logs = _log_square(self.factor) - _log_square(self.inverse)
+        logs = log_square(self.factor) - log_square(self.inverse)
         return float(logs - np.log(priors[priors > 0]).sum())
 
     def coefficients(self, way: Array) -> tuple[Array, Array]:
         """Return the coefficients (E, k), (R,) that follow a combination (X,) of the border."""
-        r = _back(self.factor, self.border @ way)
+        r = solve_upper(self.factor, self.border @ way)
         right = self.block_border @ way - self.coupled @ r
         return (np.swapaxes(self.inverse, -1, -2) @ right[..., None])[..., 0], r
 
@@ -209,14 +214,13 @@ class Factored:
         bent = self.block_border.reshape(len(flat), len(x) + 1)[:, :-1]
         third = x - bent.T @ flat - self.border[:, :-1].T @ second
         values = linalg.solve(self.information[:-1, :-1], third, assume_a='pos')
-        rest = _back(self.factor, second - self.border[:, :-1] @ values)
+        rest = solve_upper(self.factor, second - self.border[:, :-1] @ values)
         right = first - self.block_border[..., :-1] @ values - self.coupled @ rest
         return np.swapaxes(self.inverse, -1, -2) @ right, rest, values
 
     def shares(self, e: Array, r: Array) -> Array:
         """Return the squares of coefficients over their prior variances, by component."""
-        b = self.equations.blocks
-        label = np.concatenate([b.e_label.ravel(), b.r_label])
+        label = self.equations.blocks.label
         squares = np.concatenate([(self.precision[0] * e**2).ravel(), self.precision[1] * r**2])
         mine = label >= 0
         return np.asarray(
@@ -286,102 +290,14 @@ def factored(eq: Equations, lam: Array, weight: Array) -> Factored:
     return Factored(eq, (e, r), inverse, coupled, block_border, factor, border, information)
 
 
-class Solution(NamedTuple):
-    """What the equations say: of the fixed columns, the noise variance, every coefficient.
-
-    values (X - 1,), variance, e (E, k), r (R,); spread_e, spread_r: posterior variances of the
-    coefficients over the noise variance; deviance: -2 log restricted likelihood.
-    """
-
-    values: Array
-    variance: float
-    e: Array
-    r: Array
-    spread_e: Array
-    spread_r: Array
-    deviance: float
-
-
-def solve(f: Factored, spread: bool = True) -> Solution:
-    """Solve for all coefficients; the border must be of full rank."""
-    root, gradient = f.root, f.information[:-1, -1]
-    half = solve_lower(root, gradient)
-    values = solve_lower(root, half, trans=1)
-    freedom = f.equations.rows - f.equations.poses - len(values)
-    variance = float(f.information[-1, -1] - half @ half) / max(freedom, 1)
-    e, r = f.coefficients(np.append(-values, 1.0))
-    deviance = _deviance(f, freedom, variance)
-    if not spread:
-        return Solution(values, variance, e, r, np.zeros(0), np.zeros(0), deviance)
-    known = posterior(f)
-    spread_e = np.diagonal(known.block, axis1=-2, axis2=-1) + np.reshape(
-        (known.e**2).sum(axis=1), e.shape)
-    return Solution(values, variance, e, r, spread_e, (known.r**2).sum(axis=1), deviance)
-
-
-def _back(factor: Array, right: Array) -> Array:
+def solve_upper(factor: Array, right: Array) -> Array:
+    """Solve the equations of the transpose of a lower triangle."""
     if not len(factor):
         return right
-    return np.asarray(
-        solve_lower(factor, right, trans=1)
-    )
+    return solve_lower(factor, right, trans=1)
 
 
-class Posterior(NamedTuple):
-    """Roots of the covariance of the coefficients, over the noise variance.
-
-    Of the rest it is r r', of the blocks e e' and, within each block, block (E, k, k);
-    e (E k, C), r (R, C).
-    """
-
-    block: Array
-    e: Array
-    r: Array
-
-    def covariance(self, eq: Equations, kind: int) -> Array:
-        """Return the covariance (n, n) of the coefficients of a component."""
-        chosen = eq.blocks.r_label == kind
-        if chosen.any():
-            return np.asarray(self.r[chosen] @ self.r[chosen].T)
-        block, column = np.nonzero(eq.blocks.e_label == kind)
-        root = self.e[block * self.block.shape[1] + column]
-        own = self.block[block[:, None], column[:, None], column]
-        return np.asarray(root @ root.T + np.where(block[:, None] == block, own, 0.0))
-
-
-def random_roots(f: Factored) -> tuple[Array, Array]:
-    """Return roots e (E k, R), r (R, R) of the covariance given the fixed columns.
-
-    That of the rest is r r'; of the blocks it is e e' and, within each, inverse' inverse.
-    """
-    count, width, rest = f.coupled.shape
-    flat = (np.swapaxes(f.inverse, -1, -2) @ f.coupled).reshape(count * width, rest)
-    if not rest:
-        return flat, np.zeros((0, 0))
-    inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0]
-    return linalg.blas.dtrmm(-1.0, inverse, flat.T, lower=1).T, inverse.T
-
-
-def posterior(f: Factored) -> Posterior:
-    """Return the covariance of all coefficients; the border must be of full rank."""
-    inverse_t = np.swapaxes(f.inverse, -1, -2)
-    by_border = _back(f.factor, f.border[:, :-1])
-    bent = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
-    e, r = random_roots(f)
-    if len(f.root):
-        fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
-        e = np.concatenate([e, bent.reshape(len(e), len(fixed)) @ fixed], axis=1)
-        r = np.concatenate([r, by_border @ fixed], axis=1)
-    return Posterior(inverse_t @ f.inverse, e, r)
-
-
-def _deviance(f: Factored, freedom: int, variance: float) -> float:
-    """Return -2 log restricted likelihood, the noise variance profiled out."""
-    logs = f.log_determinant + _log_square(f.root)
-    return float(freedom * np.log(max(variance, 1e-300)) + logs)
-
-
-def _log_square(root: Array) -> float:
+def log_square(root: Array) -> float:
     """Return the logarithm of the square of the determinant of triangular matrices."""
     diagonal = np.abs(np.diagonal(root, axis1=-2, axis2=-1))
     return 2 * float(np.log(np.maximum(diagonal, 1e-300)).sum())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.random_effects import Design
@@ -25,6 +27,11 @@ class Blocks(NamedTuple):
     xx: Array
     e_label: Index
     r_label: Index
+
+    @property
+    def label(self) -> Index:
+        """Components (E k + R,) of all coefficients, blocks first."""
+        return np.append(self.e_label, self.r_label)
 
 
 class Products(NamedTuple):
@@ -48,20 +55,13 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
     landmarks, shared, edge = len(design.landmark), design.shared, border.shape[-1]
     own = np.concatenate([pose, design.frame], axis=-1)
     across, flat = np.swapaxes(own, -1, -2), border.reshape(frames * height, edge)
-    offsets, count = design.offsets, shared.shape[1]
+    offsets = design.offsets
     lf = np.zeros((3 * landmarks, frames, own.shape[-1]))
-    sf = np.zeros((count, frames, own.shape[-1]))
-    ss, sx = np.zeros((count, count)), np.zeros((count, edge))
     for f in range(frames):
         lf[:, f] = offsets[f * height : (f + 1) * height].T @ own[f]
-        for axis in (0, 1):
-            # A frame fills a part of the image, and a bump moves u or v.
-            part = shared[f * height + axis : (f + 1) * height : 2]
-            seen = np.unique(part.indices)
-            dense = part[:, seen].toarray().T
-            sf[seen, f] += dense @ own[f, axis::2]
-            sx[seen] += dense @ border[f, axis::2]
-            ss[np.ix_(seen, seen)] += dense @ dense.T
+    with ThreadPoolExecutor(2) as pool:  # NumPy lets go of the interpreter
+        of_axes = pool.map(lambda axis: _shared_products(shared, own, border, axis), (0, 1))
+        ss, sf, sx = (u + v for u, v in zip(*of_axes, strict=True))
     place = design.place * (design.slot >= 0)[..., None, None]
     ll = np.zeros((landmarks, 3, 3))
     np.add.at(ll, design.slot, np.swapaxes(place, -1, -2) @ place)
@@ -72,6 +72,26 @@ def multiplied(design: Design, pose: Array, border: Array) -> Products:
         (offsets.T @ shared).toarray().reshape(landmarks, 3, -1), across @ border,
         (offsets.T @ flat).reshape(landmarks, 3, -1), sx, flat.T @ flat,
     )
+
+
+def _shared_products(
+    shared: sparse.csr_array, own: Array, border: Array, axis: int
+) -> tuple[Array, Array, Array]:
+    """Return the products of shared columns with themselves, frames' own and the border.
+
+    Over the rows of one axis of the image: a bump moves u or v, and a frame fills a part.
+    """
+    (frames, height, _), count = own.shape, shared.shape[1]
+    ss, sf, sx = (np.zeros((count, *shape)) for shape in (
+        (count,), (frames, own.shape[-1]), (border.shape[-1],)))
+    for f in range(frames):
+        part = shared[f * height + axis : (f + 1) * height : 2]
+        seen = np.unique(part.indices)
+        dense = part[:, seen].toarray().T
+        sf[seen, f] = dense @ own[f, axis::2]
+        sx[seen] += dense @ border[f, axis::2]
+        ss[np.ix_(seen, seen)] += dense @ dense.T
+    return ss, sf, sx
 
 
 def multiplied_by(design: Design, pose: Array, residual: Array) -> tuple[Array, Array, Array]:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.gathered import GatheredPoints, Setting
@@ -107,7 +108,8 @@ def design(linear: Linearised, finest: bool = False, setting: Setting | None = N
     static = list(_grids(points, finest) if setting is None else
                   _all_grids(points, setting.finest))
     grids, fields = [grid for grid, _ in static], _board_fields(points)
-    parts = [_moving_both(points.weight[..., None] * bumps) for _, bumps in static]
+    weight = sparse.diags_array(points.weight.ravel())
+    parts = [_moving_both(weight @ bumps) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
     names = [grid.name for grid in grids] + [field.name for field in fields]
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
@@ -141,8 +143,8 @@ def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]
             powers = np.stack([x ** (degree - j) * y**j for j in range(degree + 1)], axis=-1)
             blocks.append((name, _both(powers * weight[..., None])))
         pitch = 2 * half / _FRAME_CELLS
-        bumps = bump_values(points.uv, mine, _over(points, mine, pitch), pitch)
-        bumps = bumps * weight[..., None]
+        bumps = bump_values(points.uv, mine, _over(points, mine, pitch), pitch).toarray()
+        bumps = bumps.reshape(*mine.shape, -1) * weight[..., None]
         blocks.append(('frame_bumps', _both(_compact(bumps) if compact else bumps)))
     blocks.append(('frame_bend', _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
@@ -171,10 +173,10 @@ def _bend_columns(points: GatheredPoints) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, Array]]:
+def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.csr_array]]:
     """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
 
-    Each grid with its values (F, N, K) at the points.
+    Each grid with its values (F N, K) at the points.
     """
     for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
@@ -186,13 +188,15 @@ def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, Array]]
             pitch = max(float((high - low).max()) / cells, 1e-9)
             centres = hexagons(low, high, pitch)
             bumps = bump_values(points.uv, mine, centres, pitch)
-            seen = bumps.sum(axis=(0, 1)) > 4.0
+            seen = np.asarray(bumps.sum(axis=0)) > 4.0
             # A grid finer than the points is noise by another name.
             if seen.any() and mine.sum() >= fewest * seen.sum():
-                yield Grid(name, camera, centres[seen], pitch), bumps[..., seen]
+                yield Grid(name, camera, centres[seen], pitch), bumps[:, seen]
 
 
-def _all_grids(points: GatheredPoints, finest: float) -> Iterator[tuple[Grid, Array]]:
+def _all_grids(
+    points: GatheredPoints, finest: float
+) -> Iterator[tuple[Grid, sparse.csr_array]]:
     """Yield the bumps wherever there are points; finest: pitch of the finest grid, px, or NaN."""
     for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
@@ -218,7 +222,7 @@ def _board_fields(points: GatheredPoints) -> list[BoardField]:
         at = points.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
         centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
-        bumps = bump_values(at[None], np.ones((1, len(at)), dtype=bool), centres, pitch)[0]
+        bumps = bump_values(at, np.ones(len(at), dtype=bool), centres, pitch).toarray()
         stretch = np.zeros((len(points.at), 2))
         stretch[mine] = at - at.mean(axis=0)
         fields.append(BoardField('board_stretch', (0, 1), stretch))
@@ -254,16 +258,14 @@ def hexagons(low: Array, high: Array, pitch: float) -> Array:
     return np.array([(x + pitch / 2 * (j % 2), y) for j, y in enumerate(rows) for x in columns])
 
 
-def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> Array:
-    """Return Gaussian bumps (F, N, K) at places (F, N, 2), zero out of reach and not of `mine`."""
-    points = at[mine]
-    squares = np.zeros((len(points), len(centres)))
-    for i in (0, 1):
-        squares += (points[:, i, None] - centres[:, i]) ** 2
-    squares /= (_WIDTH * pitch) ** 2
-    values = np.zeros((*mine.shape, len(centres)))
-    values[mine] = np.where(squares < _REACH**2, np.exp(-squares / 2), 0.0)
-    return values
+def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.csr_array:
+    """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
+    sd = _WIDTH * pitch
+    near = cKDTree(at[mine]).sparse_distance_matrix(
+        cKDTree(centres), _REACH * sd, output_type='ndarray')
+    row = np.flatnonzero(mine)[near['i']]
+    values = np.exp(-((near['v'] / sd) ** 2) / 2)
+    return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))
 
 
 def _compact(columns: Array) -> Array:
@@ -284,8 +286,6 @@ def _both(values: Array) -> Array:
     return columns.reshape(*values.shape[:2], 2, -1)
 
 
-def _moving_both(values: Array) -> sparse.csr_array:
-    """Return columns (2 F N, 2 K), sparse, that move u and v apart by values (F, N, K)."""
-    return sparse.csr_array(
-        sparse.kron(sparse.csr_array(values.reshape(-1, values.shape[-1])), np.eye(2), 'csr')
-    )
+def _moving_both(values: sparse.csr_array) -> sparse.csr_array:
+    """Return columns (2 n, 2 K) that move u and v apart by values (n, K)."""
+    return sparse.csr_array(sparse.kron(values, np.eye(2), 'csr'))

@@ -14,15 +14,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.adjustment import moved
 from fisheye_svp_ros.diagnosis.evidence import Evidence
 from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
-from fisheye_svp_ros.diagnosis.mixed import (
-    Equations,
-    Factored,
-    Solution,
-    equations,
-    factored,
-    posterior,
-    solve,
-)
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, equations, factored
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.products import multiplied_by
 from fisheye_svp_ros.diagnosis.random_effects import (
@@ -34,6 +26,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
 )
 from fisheye_svp_ros.diagnosis.reml import Variances
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
+from fisheye_svp_ros.diagnosis.solution import Solution, posterior, solve
 from fisheye_svp_ros.diagnosis.target_map import at_landmarks
 
 _PARTS = (1.0, 0.3, 0.1, 0.03, 0.0)  # of a step
@@ -80,7 +73,8 @@ class Local(NamedTuple):
         uv = views.uv.copy()
         for grid, values in self.grids:
             mine = views.used & (data.camera_of[:, None] == grid.camera)
-            uv -= bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
+            moved_by = bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
+            uv -= moved_by.reshape(uv.shape)
         return replace(data, views=views._replace(points=points, uv=uv))
 
 
@@ -160,7 +154,7 @@ def _solved(
     ridge = np.append(np.full(len(scale), 1e-9), 0.0)
     eq = replace(eq, blocks=eq.blocks._replace(xx=eq.blocks.xx + np.diag(ridge)))
     f = factored(eq, variances.lam, variances.weight)
-    return Fitted(linear.state, linear, random, f, solve(f, spread=False), scale)
+    return Fitted(linear.state, linear, random, f, solve(f), scale)
 
 
 def local_offsets(fitted: Fitted) -> Local:
@@ -183,9 +177,11 @@ def target_modes(fitted: Fitted, sigma: float) -> tuple[Array, Array]:
     alone.  sigma: of the whitened noise.
     """
     known, eq = posterior(fitted.factored), fitted.factored.equations
+    shape, count = fitted.solution.e.shape, fitted.solution.e.size
     mean = _offsets(fitted, fitted.solution.e[..., None], fitted.solution.r[:, None])
-    root = _offsets(fitted, known.e.reshape(*fitted.solution.e.shape, len(known.r.T)), known.r)
-    root = np.concatenate([sigma * root, mean], axis=-1).reshape(mean.size, len(known.r.T) + 1)
+    width = known.root.shape[1]
+    root = _offsets(fitted, known.root[:count].reshape(*shape, width), known.root[count:])
+    root = np.concatenate([sigma * root, mean], axis=-1).reshape(mean.size, width + 1)
     square = root @ root.T
     if not eq.by_frame:  # what a landmark's own block leaves open
         there = (fitted.design.landmark_label >= 0)[eq.landmarks]

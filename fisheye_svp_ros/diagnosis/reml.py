@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, Solution, factored, solve
+from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.diagnosis.solution import Solution, posterior, solve
 
 FREEDOM = 3.0  # of the t distribution of landmarks' offsets
 GONE = 1e12  # lambda of a component that is not there
@@ -86,43 +87,44 @@ def estimate(eq: Equations, start: Variances, steps: int = _STEPS) -> tuple[Vari
     return replace(now, covariance=covariance), eq
 
 
-def one_step(eq: Equations, start: Variances) -> tuple[Variances, Equations]:
-    """Return what `estimate` has after its first step, without a covariance."""
-    return _stepped(eq, start, 1)[:2]
-
-
 def _stepped(
     eq: Equations, start: Variances, steps: int
 ) -> tuple[Variances, Equations, Factored, Solution]:
     """Return the variances after some steps, the equations, and what the last step solved."""
-    now, eq = start, eq.trimmed(start.alive)
-    ceiling, floor = (start_variances(eq, share).lam for share in (_NOTHING, _EVERYTHING))
-    last = np.inf
+    now, eq, last = start, eq.trimmed(start.alive), np.inf
+    floor = start_variances(eq, _EVERYTHING).lam
     for step in range(steps):
         now = replace(now, lam=np.maximum(now.lam, floor))
         f = factored(eq, now.lam, now.weight)
-        solution = solve(f)
-        size = f.shares(solution.e, solution.r) / solution.variance
-        gamma = _determined(eq, f, solution)
-        alive = now.alive
-        slope = np.where(alive, (size - gamma) / 2, 0.0)
-        fixed_point = np.log(np.maximum(size, 1e-9) / np.maximum(gamma, 1e-9)) * _PACE
-        change = np.where(alive, np.clip(fixed_point, -2, 2), 0.0)
-        if step and solution.deviance < last + 1e-3 * eq.rows:
-            change = _newton(f, solution, now, slope)
-        last = solution.deviance
-        lam = np.where(alive, now.lam * np.exp(-change), GONE)
-        gone = alive & (slope < 0) & ((lam > ceiling) | (gamma < 0.3))
-        moved = np.abs(change[alive & ~gone]).max(initial=0.0)
-        weight = _landmark_weights(eq, now, solution)
-        shifted = float(np.abs(np.log(weight / now.weight)).mean()) if len(weight) else 0.0
-        now = Variances(float(np.sqrt(solution.variance)), np.where(gone, GONE, lam), weight)
-        if gone.any():
+        solution = solve(f, posterior(f))
+        near = step > 0 and solution.deviance < last + 1e-3 * eq.rows
+        before, now, last = now, stepped(f, solution, now, near), solution.deviance
+        if (now.alive != before.alive).any():
             eq, last = eq.trimmed(now.alive), np.inf
             continue
+        moved = np.abs(np.log(now.lam / before.lam)[now.alive]).max(initial=0.0)
+        shifted = np.abs(np.log(now.weight / before.weight)).mean() if len(now.weight) else 0.0
         if moved < _TOLERANCE and shifted < _TOLERANCE / 2:
             break
     return now, eq, f, solution
+
+
+def stepped(f: Factored, solution: Solution, now: Variances, near: bool = False) -> Variances:
+    """Return the variances after one step; near: by Newton's method, not the fixed point."""
+    eq, alive = f.equations, now.alive
+    size = f.shares(solution.e, solution.r) / solution.variance
+    gamma = _determined(eq, f, solution)
+    slope = np.where(alive, (size - gamma) / 2, 0.0)
+    if near:
+        change = _newton(f, solution, now, slope)
+    else:
+        fixed_point = np.log(np.maximum(size, 1e-9) / np.maximum(gamma, 1e-9)) * _PACE
+        change = np.where(alive, np.clip(fixed_point, -2, 2), 0.0)
+    lam = np.where(alive, now.lam * np.exp(-change), GONE)
+    ceiling = start_variances(eq, _NOTHING).lam
+    gone = (slope < 0) & ((lam > ceiling) | (gamma < 0.3))
+    return Variances(float(np.sqrt(solution.variance)), np.where(gone, GONE, lam),
+                     _landmark_weights(eq, now, solution))
 
 
 def _newton(
@@ -158,9 +160,8 @@ def average_information(f: Factored, solution: Solution) -> Array:
     own[:count] = flat_e.T @ flat_ge + r.T @ gr
     own[:count, -1] = flat_e.T @ de.ravel() + r.T @ dr
     own[-1, :count] = own[:count, -1]
-    freedom = eq.rows - eq.poses - len(solution.values)
     ridge = float((de * solution.e).sum() + dr @ solution.r)
-    own[-1, -1] = solution.variance * freedom - ridge
+    own[-1, -1] = solution.variance * f.freedom - ridge
     taken = f.taken(ge, gr, gx)
     return np.asarray((own - taken) / 2 / solution.variance)
 
@@ -171,8 +172,7 @@ def _counts(eq: Equations) -> Array:
 
 def _sums(eq: Equations, e: Array, r: Array) -> Array:
     """Sum values (E, k), (R,) of coefficients by component."""
-    label = np.concatenate([eq.blocks.e_label.ravel(), eq.blocks.r_label])
-    values = np.concatenate([e.ravel(), r])
+    label, values = eq.blocks.label, np.append(e, r)
     mine = label >= 0
     sums = np.bincount(label[mine], weights=values[mine], minlength=len(NAMES))
     return np.asarray(sums, dtype=float)

@@ -9,9 +9,10 @@ from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
-from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve, solve_lower
+from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve_lower
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import GONE, landmark_labels, start_variances
+from fisheye_svp_ros.diagnosis.solution import solve
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
 
 # So many landmarks are no single ones any more: of those that are exact, and of those that err
@@ -60,7 +61,7 @@ def landmark_tests(evidence: Evidence) -> tuple[Array, Array, Array]:
     basis = identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
     eq = evidence.full.trimmed(lam < GONE).bordered(basis)
     f = factored(eq, lam, evidence.variances.weight)
-    solution = solve(f, spread=False)
+    solution = solve(f)
     _, landmark, _ = eq.sorted(solution.e, solution.r)
     label = landmark_labels(eq)
     table = np.where(label >= 0, lam[label], GONE)

@@ -12,12 +12,21 @@ from fisheye_svp_ros.diagnosis.components import score_components, significance
 from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
 from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
-from fisheye_svp_ros.diagnosis.mixed import equations, factored, solve
+from fisheye_svp_ros.diagnosis.mixed import equations, factored
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, design
 from fisheye_svp_ros.diagnosis.refit import fit_linear, in_sight, local_offsets, refit
-from fisheye_svp_ros.diagnosis.reml import GONE, Variances, estimate, start_variances
+from fisheye_svp_ros.diagnosis.reml import (
+    GONE,
+    Variances,
+    estimate,
+    start_variances,
+    stepped,
+    without,
+)
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
+from fisheye_svp_ros.diagnosis.solution import posterior, ratio_without, solve
+from fisheye_svp_ros.diagnosis.solution import without as solution_without
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.diagnosis_text import COMPONENTS
 
@@ -103,6 +112,32 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     assert solution.values[0] == pytest.approx(f.information[0, 1] / f.information[0, 0])
 
 
+@pytest.mark.parametrize('frames', [4, 24])
+@pytest.mark.parametrize('name', ['landmark_normal', 'image_coarse', 'frame_linear'])
+def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames, name):
+    linear = linearised(frames=frames, offsets=2e-3)
+    random = design(linear)
+    border = np.concatenate(
+        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1)
+    eq, kind = equations(random, linear.frame_columns, border), NAMES.index(name)
+    now = some_variances(eq)
+    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
+    known = posterior(f)
+    whole = f, solve(f, known), known
+    gone = without(now, name)
+    direct_f = factored(eq.trimmed(gone.alive), now.lam, now.weight)
+    direct = solve(direct_f, posterior(direct_f))
+    found = solution_without(*whole, kind)
+    assert ratio_without(*whole, kind) == pytest.approx(direct.deviance - whole[1].deviance)
+    assert found.deviance == pytest.approx(direct.deviance)
+    assert found.variance == pytest.approx(direct.variance)
+    after = stepped(direct_f, direct, gone)
+    there = after.alive
+    np.testing.assert_array_equal(stepped(f, found, gone).alive, there)
+    np.testing.assert_allclose(stepped(f, found, gone).lam[there], after.lam[there], rtol=1e-6)
+    np.testing.assert_allclose(stepped(f, found, gone).weight, after.weight, rtol=1e-6)
+
+
 def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():
     linear = linearised(frames=1)
     eq = equations(design(linear), linear.frame_columns, linear.residual[..., None])
@@ -120,7 +155,7 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     eq = equations(random, linear.frame_columns, border)
     now = some_variances(eq)
     f = factored(eq.trimmed(now.alive), now.lam, now.weight)
-    solution = solve(f)
+    solution = solve(f, posterior(f))
     z, label = dense_columns(linear, random)
     precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate([
         np.ones(5 * random.frame.shape[-1]), np.repeat(now.weight, 3),
