@@ -135,9 +135,7 @@ def held_out_gain(
 
     Of log p(all) - log p(all but one); a wide normal prior keeps what the others do not tell.
     """
-    prior = np.diag([1 / p.large**2 for p in effect.parameters]) / np.outer(
-        evidence.scale[columns], evidence.scale[columns]
-    )
+    prior = np.diag(evidence.wide_prior(columns, effect))
     everything, parts = (
         evidence.restored(information, included)
         for information in (evidence.information, evidence.in_turn)

@@ -162,6 +162,11 @@ class Evidence:
         """Return the border's columns of a form."""
         return self.forms.at[form] + self.own
 
+    def wide_prior(self, columns: Index, effect: Effect) -> Array:
+        """Return precisions (P,) of an effect's normalised columns: it is hardly beyond large."""
+        large = np.array([parameter.large for parameter in effect.parameters])
+        return np.asarray(1 / (large * self.scale[columns]) ** 2)
+
     def score(self, remaining: Array, columns: Index) -> Score:
         """Test columns by the information that remains once what is in the model is swept out."""
         block, gradient = remaining[np.ix_(columns, columns)], remaining[columns, -1]

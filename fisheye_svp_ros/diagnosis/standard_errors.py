@@ -98,9 +98,13 @@ def model_uncertainty(evidence: Evidence) -> Array:
     Each model with more effects, or with another effect in the place of one, is as probable as its
     evidence says (`_evidence_for`), and adds so much of the variance that it brings and of the
     square of the change.  Beside a further form of an effect, or without it, its parameters
-    mean something else: for them that model does not count.
+    mean something else: for them that model does not count.  What is added is hardly larger than
+    large, however little the data say of it.
     """
     own, information, reported = evidence.own, evidence.information, _reported(evidence)
+    prior = np.zeros(len(information))
+    for form, effect in enumerate(evidence.forms.effects):
+        prior[evidence.columns_of(form)] = evidence.wide_prior(evidence.columns_of(form), effect)
     estimate, variance, _ = _estimates(information, np.arange(own), reported)
     models = _likely_models(evidence)
     weights = special.softmax([one.merit / 2 for one in models])
@@ -109,7 +113,7 @@ def model_uncertainty(evidence: Evidence) -> Array:
         there = one.included < own
         at, more = one.included[there], np.zeros(own)
         other, wider, _ = _estimates(
-            evidence.restored(information, at), one.included, reported)
+            evidence.restored(information, at) + np.diag(prior), one.included, reported)
         change = other[there] - estimate[at]
         more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
         for effect, columns, _ in evidence.terms:

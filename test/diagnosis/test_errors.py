@@ -86,6 +86,21 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
         assert off < 2 * errors[1] and more[1] < 2 * errors[1]
 
 
+def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
+    """Noise leaves a tilt all but open; what it may add is bounded all the same."""
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, frames=16)
+    tilt = CATALOGUE['sensor_tilt']
+    data = prepare(observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views,
+                           12 * SIGMA, rng))
+    state, others = fit(data, start(data, lens()), ('cx', 'cy')), {*CATALOGUE} - {tilt.name}
+    evidence = gather_evidence(data, state, ('cx', 'cy'), left_out=[*others])
+    more = model_uncertainty(evidence)[1]
+    small = tuple(p._replace(large=p.large / 10) for p in tilt.parameters)
+    monkeypatch.setattr(tilt, 'parameters', small)
+    assert 0 < model_uncertainty(evidence)[1] < 0.7 * more
+
+
 def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_change():
     """Tilt named where there is decentering, which hardly differs: the centre is elsewhere."""
     rng = np.random.default_rng(31)
