@@ -119,25 +119,35 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
 
 def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
-    dictionary = dictionary_of(pattern)
-    if hasattr(_ARUCO, 'ArucoDetector'):
-        parameters = _ARUCO.DetectorParameters()
-        parameters.markerBorderBits = 2
-        tags, ids, _ = _ARUCO.ArucoDetector(dictionary, parameters).detectMarkers(image)
-    else:
-        parameters = _ARUCO.DetectorParameters_create()
-        parameters.markerBorderBits = 2
-        tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
-    if ids is None:
-        return None
-    known = {int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)
-             if tag < pattern.columns * pattern.rows}
+    known = _tags(image, pattern, 2)
     if not known:
         return None
     index = np.concatenate([4 * tag + np.arange(4) for tag in known])
     # OpenCV goes clockwise from a tag's upper left, Kalibr the other way from its lower left.
     uv = np.concatenate([corners.reshape(4, 2)[[3, 2, 1, 0]] for corners in known.values()])
     return index, uv.astype(float)
+
+
+def why_none(image: Grey, pattern: Pattern) -> str:
+    """Return why a board was not found, as far as the image tells."""
+    if pattern.kind == 'aprilgrid' and _tags(image, pattern, 1):
+        return ('no board found: its tags have a border of one cell; print the target of Kalibr, '
+                'whose tags have two')
+    return 'no board found'
+
+
+def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
+    """Return the corners of a pattern's tags by number; border: cells around their code."""
+    dictionary, modern = dictionary_of(pattern), hasattr(_ARUCO, 'ArucoDetector')
+    parameters = (_ARUCO.DetectorParameters if modern else _ARUCO.DetectorParameters_create)()
+    parameters.markerBorderBits = border
+    if modern:
+        tags, ids, _ = _ARUCO.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    else:
+        tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
+    return {} if ids is None else {
+        int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)
+        if tag < pattern.columns * pattern.rows}
 
 
 # Which patterns a detector is for, and its finder

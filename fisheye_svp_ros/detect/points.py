@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.circle_fit import fit_circles
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
-from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey
+from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey, why_none
 from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
@@ -66,7 +66,7 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
     found = _near(grey, pattern, finder, near) if near is not None else None
     found = found or finder(grey, pattern)
     if found is None:
-        return 'no board found'
+        return why_none(grey, pattern)
     index, uv = found
     if len(index) < _LEAST:
         return f'{len(index)} points found; {_LEAST} are needed'

@@ -353,6 +353,22 @@ class TestTags:
         expected = cv2.perspectiveTransform(flat_uv[None], turn)[0]
         assert np.abs(points.uv - expected).max() < 0.5
 
+    def test_tags_with_a_border_of_one_cell_are_told_from_none(self, tmp_path: Path) -> None:
+        if not hasattr(cv2, 'aruco'):
+            pytest.skip('this OpenCV has no markers')
+        path = tmp_path / 'april.yaml'
+        path.write_text('{target_type: aprilgrid, tagCols: 2, tagRows: 1, tagSize: 0.1, '
+                        'tagSpacing: 0.3}')
+        pattern = parse_pattern(f'aprilgrid:{path}')
+        flat = np.full((300, 500), 255, np.uint8)
+        assert find_points(flat, pattern, 'aprilgrid') == 'no board found'
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+        draw = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
+        for tag in range(2):
+            flat[70:230, 60 + 208 * tag:220 + 208 * tag] = draw(dictionary, tag, 160)
+        why = find_points(flat, pattern, 'aprilgrid')
+        assert isinstance(why, str) and 'a border of one cell' in why
+
     @pytest.mark.parametrize('spec', ['circles:6x5:40mm', 'circles:4x7:40mm:asymmetric'])
     def test_circles(self, spec: str) -> None:
         pattern = parse_pattern(spec)
