@@ -111,6 +111,7 @@ class Effect(ABC):
     stage: ClassVar[str]
     of_target: ClassVar[bool] = False  # whether another target would not have it
     rarer_than: ClassVar[str] = ''  # an effect that does nearly the same and is more common
+    of_motion: ClassVar[bool] = False  # whether it follows from how the camera moves
     abrupt: ClassVar[bool] = False  # whether what changes smoothly is no sign of it
     asked_after: ClassVar[tuple[str, ...]] = ()  # more common ones that it does, too, and more
     signature: ClassVar[str]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -61,7 +62,6 @@ class ForwardModel:
     def __init__(self, lens: Lens, terms: Sequence[Term] | None = None) -> None:
         """Take the corrections of the lens and of its target, or other effects in their place.
 
-        `plain`: what the lens's own curves do is all there is.
         Raises LensError for an effect that is unknown or incomplete.
         """
         own = load_effects(lens.corrections, lens.name) if terms is None else terms
@@ -69,13 +69,26 @@ class ForwardModel:
         self._target = Target.of(lens.target, lens.name) if terms is None else None
         self._given = lens
         self.lens = curved_lens(lens, self.terms)
-        self.plain = self._target is None and not self._acts('target', 'pose', 'image', 'detector')
+
+    @property
+    def plain(self) -> bool:
+        """Whether what the lens's own curves do is all there is."""
+        return self._target is None and not self._acts('target', 'pose', 'image', 'detector')
 
     def seeing(self, views: Views) -> ForwardModel:
         """Return the model without corrections of a target that none of the views shows."""
         if self._target is None or self._target.shown(views).any():
             return self
         return ForwardModel(self._given, self.terms)
+
+    def still(self) -> ForwardModel:
+        """Return the model of a camera that does not move; itself where that is the same."""
+        kept = tuple(term for term in self.terms if not term[0].of_motion)
+        if len(kept) == len(self.terms):
+            return self
+        model = copy(self)
+        model.terms = kept
+        return model
 
     def terms_for(self, views: Views) -> tuple[Term, ...]:
         """Return the corrections of the lens, and of its target if any of the views shows it."""

@@ -17,6 +17,7 @@ class RollingShutterEffect(Effect):
 
     name = 'rolling_shutter'
     stage = 'pose'
+    of_motion = True
     signature = (
         'residuals that grow with the distance from the middle row and with the camera speed'
     )

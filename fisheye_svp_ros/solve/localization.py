@@ -22,6 +22,7 @@ from fisheye_svp_ros.solve.least_squares import (
 )
 
 MIN_POINTS, FEW_POINTS = 4, 6
+_MOTIONS = 3  # times that velocities and poses follow from each other
 _UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
 
 
@@ -32,9 +33,26 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     small looks, tilted to one side, like tilted to the other, and the misfit has a minimum on
     either side (Schweighofer and Pinz, PAMI 2006; Collins and Bartoli, IJCV 2014): both are tried.
     So are all minima of views with fewer than FEW_POINTS points.
+    What a lens has that follows from motion (a rolling shutter) needs times: velocities are those
+    between the poses of neighbouring views.
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
-    model, anywhere = model.seeing(views), start is None
+    model = model.seeing(views)
+    still = model.still()
+    found = _localize(still, views, start)
+    for _ in range(_MOTIONS if still is not model else 0):
+        moving = views._replace(t=np.where(found.converged[:, None], views.t, np.nan))
+        moved, stood = (one.predict(found.pose, moving, False).uv for one in (model, still))
+        moved = np.nan_to_num(moved - stood)
+        if not moved.any():
+            break
+        found = _localize(still, views._replace(uv=views.uv - moved), found.pose)
+    return found
+
+
+def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localization:
+    """Return the poses of views whose cameras do not move, see `localize`."""
+    anywhere = start is None
     if start is None:
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers import scenes
 from helpers.differences import derivative, jacobian
 from scipy.optimize import least_squares
 
@@ -270,3 +271,21 @@ def test_points_that_do_not_fix_a_pose_are_reported(points):
     assert np.isnan(solved.covariance[0]).all()
     assert np.isfinite(solved.covariance[1]).all()
     assert np.abs(solved.pose.take([1]).difference(paper_pose(1))).max() < 1e-9
+
+
+def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
+    """Velocities that changed with every step of the poses lost a third of the frames."""
+    rng = np.random.default_rng(4)
+    pose, views = scenes.scene(rng, frames=30)
+    shutter = (CATALOGUE['rolling_shutter'](), np.array([0.04]))
+    model = ForwardModel(scenes.lens(), [shutter])
+    uv = model.predict(pose, views).uv + rng.normal(size=views.uv.shape) * 0.1
+    seen = views._replace(uv=uv, weight=np.where(np.isfinite(uv).all(axis=-1), 10.0, 0.0))
+    found, ignored = localize(model, seen), localize(model.still(), seen)
+    assert found.converged.all()
+    off, otherwise = (np.linalg.norm(one.pose.position - pose.position, axis=1)
+                      for one in (found, ignored))
+    assert np.median(off) < 0.5 * np.median(otherwise)
+    chi2 = np.nansum((found.residual / 0.1) ** 2) / (2 * (seen.weight > 0).sum() - 6 * 30)
+    assert chi2 == pytest.approx(1.0, abs=0.1)
+    assert localize(model, seen.take([7])).converged.all()
