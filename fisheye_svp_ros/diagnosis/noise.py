@@ -20,6 +20,7 @@ _GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to
 _GATE = 6.0  # and within which it belongs to another one
 _CHANCE = 0.01  # that so many do by chance
 _SUSPECT = 6.0  # below this no point is worth a robust fit
+_ORDINARY = 4.0  # and below this one is like all others
 SWAPPED = 'it lies where another landmark is predicted'
 FAR = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
@@ -187,6 +188,29 @@ def outlying(
     mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
     px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
     return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
+
+
+def taken_back(data: Data, fitted: Fitted, gross: Gross) -> tuple[Data, Gross]:
+    """Take back points that were set aside, where the causes predict them as well as others.
+
+    Beside a simulation that is wrong the nearest landmarks look like gross errors.
+    """
+    views, again = data.views, np.zeros(len(gross.rows), dtype=bool)
+    off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / _unsure(views)
+    scale, _ = _scale(views, np.where(views.used, off, np.nan))
+    near = ~views.used & (views.landmark >= 0) & (off < _ORDINARY * scale)
+    weight, row, table = views.weight.copy(), views.row.copy(), data.observations
+    for view, point in np.argwhere(near):
+        known = ((table.frame[gross.rows] == views.frame[view])
+                 & (table.camera[gross.rows] == views.camera[view])
+                 & (table.landmark[gross.rows] == views.landmark[view, point])
+                 & (table.uv[gross.rows] == views.uv[view, point]).all(axis=1))
+        for i in np.flatnonzero(known & ~again)[:1]:
+            again[i], row[view, point] = True, gross.rows[i]
+            weight[view, point] = 1 / np.nan_to_num(table.sigma[gross.rows[i]], nan=1.0)
+    why = tuple(one for one, back in zip(gross.why, again, strict=True) if not back)
+    return (replace(data, views=views._replace(weight=weight, row=row)),
+            Gross(gross.rows[~again], gross.px[~again], why))
 
 
 def _unsure(views: Views) -> Array:

@@ -33,6 +33,7 @@ from fisheye_svp_ros.diagnosis.noise import (
     NoiseCause,
     noise_growth,
     outlying,
+    taken_back,
     with_noise_growth,
 )
 from fisheye_svp_ros.diagnosis.refit import Fitted, fit_of, in_sight, refit
@@ -180,7 +181,10 @@ def _changed(
 def _cleaned(
     data: Data, fitted: Fitted, gross: Gross, wanted: Wanted
 ) -> tuple[Data, Gross, NoiseCause | None, bool]:
-    """Ask whether the noise grows with the angle, then set aside what is too far off for it."""
+    """Take back what the causes explain, set aside what is too far off for the noise.
+
+    Whether that grows with the angle is asked before.
+    """
     squares = standardised_squares(fitted)
     growth: NoiseCause | None = None
     if 'noise_vs_angle' not in wanted.left_out:
@@ -188,8 +192,10 @@ def _cleaned(
         squares = squares / growth.variance
         if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
             growth = None
-    cleaned, more = outlying(data, fitted, gross, squares)
-    return cleaned, more, growth, growth is not None or len(more.rows) > len(gross.rows)
+    cleaned, kept = taken_back(data, fitted, gross)
+    cleaned, more = outlying(cleaned, fitted, kept, squares)
+    changed = len(kept.rows) < len(gross.rows) or len(more.rows) > len(kept.rows)
+    return cleaned, more, growth, growth is not None or changed
 
 
 def _with_wanted(data: Data, state: State, free: Sequence[str], wanted: Wanted) -> State:

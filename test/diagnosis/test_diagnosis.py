@@ -24,6 +24,7 @@ from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.scene.observations import Observations, views_of
 
 SIGMA = 0.2
@@ -184,6 +185,27 @@ def test_landmarks_far_from_their_place_are_no_gross_errors():
     for parameter, true in zip(values.values(), moves, strict=True):
         assert abs(parameter['value'] - true) < 5 * parameter['stderr']
     assert [s.variable for s in found.remaining] == ['outliers']
+
+
+def test_near_points_that_a_cause_explains_are_no_gross_errors():
+    rng = np.random.default_rng(0)
+    pose, views = scene(rng)
+    pose.position[7] = views.points[7, 0] - [0.05, 0.0, 0.08]
+    pose.rotation[7] = np.eye(3)
+    hidden = replace(lens(), viewpoint_shift=Gennery(0.0, 0.004))
+    table = observe(hidden, (), pose, views, SIGMA / 2, rng)
+    wrong = np.flatnonzero(table.frame == 11)[3]
+    table.uv[wrong] += [9.0, -5.0]
+    data = prepare(table)
+    near = find_gross_errors(data, start(data, lens()))[1]
+    assert {7, 11} == set(table.frame[near.rows].tolist())
+    found = diagnose(table, lens())
+    assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
+    error, = found.causes[0].parameters.values()
+    assert abs(error['value'] - 0.004) < 3 * error['stderr'] < 0.0004
+    left = [(g['frame'], g['landmark']) for g in found.gross]
+    assert left == [(11, int(table.landmark[wrong]))]
+    assert found.after.data.views.used.sum() == len(table) - 1
 
 
 def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
