@@ -124,7 +124,7 @@ class Measured:
         if self.test is None:
             return frames_in_turn(self.evidence, without, local).take(self.predicted)
         if set(without) >= set(self.names):
-            state = self.found.base.linear.state
+            state = self.found.simulated.state
         elif without:
             state = without_causes(self.evidence, without, self.free)
         else:
@@ -157,7 +157,7 @@ class Measured:
     @property
     def before(self) -> Linearised:
         """The simulation as it was fitted."""
-        return self.found.base.linear if self.medium is None else self.medium.air
+        return self.found.simulated if self.medium is None else self.medium.air
 
     @cached_property
     def _prefixes(self) -> list[HeldOut]:
@@ -201,7 +201,7 @@ class Measured:
     @property
     def lens_only(self) -> FitQuality:
         """Only what moves with the lens, fitted without the rest."""
-        linear = self.found.base.linear
+        linear = self.found.simulated
         if set(self._elsewhere) < set(self.names):
             state = without_causes(self.evidence, self._elsewhere, self.free)
             data = self.evidence.linear.data
@@ -277,7 +277,7 @@ class Measured:
         base, after = self.found.base, self._free_errors()
         before = self._errors_of(base)
         rig = _rig_columns(base, self.free)
-        was, now = base.linear.state.parameters, self.found.state.parameters
+        was, now = self.found.simulated.state.parameters, self.found.state.parameters
         return {
             name: Intrinsic(
                 *self.given[name], was[name], float(before[rig + i]), now[name], after[name]

@@ -57,7 +57,8 @@ _ASTRAY = 400.0  # and so many: its columns lead nowhere, least squares find the
 class Found:
     """The state with its causes, the evidence around it, the fit, the trace.
 
-    base: the first evidence; growth: of the noise with the angle, if it is a cause; given: the
+    simulated: the simulation as it was fitted, without what the user knows; base: the first
+    evidence; growth: of the noise with the angle, if it is a cause; given: the
     effects that the lens came with.
     """
 
@@ -65,6 +66,7 @@ class Found:
     evidence: Evidence
     fitted: Fitted
     trace: list[TraceStep]
+    simulated: Linearised
     base: Evidence
     gross: Gross
     growth: NoiseCause | None
@@ -90,6 +92,7 @@ def search(
     given = tuple(effect for effect, _ in state.terms)
     # What the lens came with is as little asked for as what the user knows.
     known = (*wanted.included, *(effect.name for effect in given))
+    simulated = Linearised(data, state, free)
     state = _with_wanted(data, state, free, wanted)
     for turn in range(_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}',
@@ -147,7 +150,8 @@ def search(
         evidence = gather_evidence(data, state, free, evidence.variances, wanted.left_out, finest)
     fitted = fit_of(evidence)
     assert base is not None
-    return Found(evidence.linear.state, evidence, fitted, trace, base, gross, growth, given)
+    return Found(
+        evidence.linear.state, evidence, fitted, trace, simulated, base, gross, growth, given)
 
 
 def _names(steps: Sequence[TraceStep]) -> list[str]:

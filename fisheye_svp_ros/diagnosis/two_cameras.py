@@ -136,7 +136,7 @@ def two_cameras(found: Found, free: Sequence[str]) -> list[TwoCameras]:
 
 def _alone(found: Found, free: Sequence[str], camera: int, known: KnownTarget) -> _Camera:
     """Fit one camera by itself, under the null model of all."""
-    evidence, base = found.evidence, found.base.linear.state
+    evidence, base = found.evidence, found.simulated.state
     data, mine = evidence.linear.data, evidence.linear.data.camera_of == camera
     own = chosen_views(data, mine)
     own = replace(own, camera_of=np.zeros_like(own.camera_of), poses=None)

@@ -321,6 +321,19 @@ def table_of(seed, frames=12, cameras=1, terms=()):
     return observe(lens(), terms, pose, views, SIGMA, rng)
 
 
+def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
+    terms = [(CATALOGUE['skew'](), np.array([0.002]))]
+    table, held_out = table_of(27, terms=terms), table_of(28, terms=terms)
+    found, known = (
+        diagnose(table, lens(), held_out=held_out, wanted=Wanted(names, quick=True))
+        for names in ((), ('skew',)))
+    assert [cause.effect for cause in (*found.causes, *known.causes)] == ['skew', 'skew']
+    assert known.base.rms_px == pytest.approx(found.base.rms_px)
+    assert known.base.heldout_rms_px == pytest.approx(found.base.heldout_rms_px)
+    assert known.causes[0].gain == pytest.approx(found.causes[0].gain, rel=1e-3)
+    assert known.causes[0].gain > 0.5
+
+
 def test_what_the_lens_already_holds_is_no_cause_again():
     effect, values = CATALOGUE['decentering'](), np.array([0.002, -0.001])
     table = table_of(21, 24, terms=[(effect, values)])
