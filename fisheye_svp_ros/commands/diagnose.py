@@ -18,6 +18,7 @@ from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 
@@ -59,7 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'sharp; by default a little beyond those that there are')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for report.html and its pictures, diagnosis.json, '
-                        'extended_lens.yaml, residuals.csv')
+                        'extended_lens.yaml, residuals.csv; of a rig a folder in it for the lens '
+                        'of each camera, and rig.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -171,8 +173,9 @@ def _print(
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)
     if folder:
-        lenses = ', '.join(str(Path(camera) / text.EXTENDED) for camera in diagnosis.lenses)
-        print(f'{folder}: report.html, diagnosis.json, {lenses}, residuals.csv')
+        lenses = [str(Path(camera) / text.EXTENDED) for camera in diagnosis.lenses]
+        files = ', '.join([*lenses, *(['rig.yaml'] if diagnosis.rig else [])])
+        print(f'{folder}: report.html, diagnosis.json, {files}, residuals.csv')
 
 
 def _write(
@@ -191,6 +194,9 @@ def _write(
     write_json(folder / 'diagnosis.json', document)
     for camera, lens in diagnosis.lenses.items():
         save_lens(lens, folder / camera / EXTENDED)
+    if diagnosis.rig:
+        cameras, rig = diagnosis.rig
+        save_rig(rig, folder / 'rig.yaml', cameras)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations.cameras)
     write_report(diagnosis, points, known, Inputs(
         args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free

@@ -29,7 +29,13 @@ from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
 from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
 from fisheye_svp_ros.diagnosis.medium import find_medium
 from fisheye_svp_ros.diagnosis.model import Linearised, State, prepare
-from fisheye_svp_ros.diagnosis.moments import each_alone, few_shared, loose, unrelated
+from fisheye_svp_ros.diagnosis.moments import (
+    each_alone,
+    few_shared,
+    loose,
+    unrelated,
+    without_rig,
+)
 from fisheye_svp_ros.diagnosis.noise import (
     find_gross_errors,
     quantisation_step,
@@ -47,7 +53,7 @@ from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.two_sets import TwoSets
@@ -95,6 +101,16 @@ class Diagnosis:
     def lens(self) -> Lens:
         """The extended lens, of the first camera of a rig."""
         return next(iter(self.lenses.values()))
+
+    @property
+    def rig(self) -> tuple[tuple[str, str], Pose] | None:
+        """The two cameras of a rig and the first in the second, by the extended lenses."""
+        data, place = self.after.data, self.after.state.rig
+        names = rig_cameras(data.observations.cameras)
+        if names is None or without_rig(data):
+            return None
+        first, second = (place.take(data.observations.cameras.index(name)) for name in names)
+        return names, second.inverse().compose(first)
 
     @property
     def scatter_px(self) -> float:

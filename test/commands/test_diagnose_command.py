@@ -26,8 +26,9 @@ from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_table import CsvTable
-from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, write_observations, write_poses
+from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -208,7 +209,9 @@ class TestTerminal:
         given += ['--lens', f'right={lens}', '--quick', '-o', scene / 'rig']
         assert cli.main([*map(str, given)]) == 0
         out = capsys.readouterr().out
-        assert 'left/extended_lens.yaml, right/extended_lens.yaml' in out
+        assert 'left/extended_lens.yaml, right/extended_lens.yaml, rig.yaml' in out
+        assert np.abs(load_rig(scene / 'rig' / 'rig.yaml').position).max() < 1e-3
+        assert cameras_in(scene / 'rig') == ('left', 'right')
         page = (scene / 'rig' / 'report.html').read_text()
         assert 'The two cameras as each other&#39;s truth' in page
         assert f'--lens right={scene}/rig/right/extended_lens.yaml' in page

@@ -334,6 +334,19 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
     assert known.causes[0].gain > 0.5
 
 
+@pytest.mark.parametrize(('cameras', 'names', 'x'), [
+    (('left', 'right'), ('left', 'right'), -0.15), (('right', 'left'), ('left', 'right'), 0.15),
+    (('cam0', 'cam1'), ('cam0', 'cam1'), -0.15),
+])
+def test_a_rig_is_the_first_camera_in_the_second(cameras, names, x):
+    table = replace(table_of(29, cameras=2), cameras=cameras)
+    found = diagnose(table, lens(), wanted=Wanted(quick=True))
+    assert found.rig is not None and found.rig[0] == names
+    np.testing.assert_allclose(found.rig[1].position, [x, 0, 0], atol=2e-3)
+    alone = replace(table, frame=2 * table.frame + table.camera)
+    assert diagnose(alone, lens(), wanted=Wanted(quick=True)).rig is None
+
+
 def test_what_the_lens_already_holds_is_no_cause_again():
     effect, values = CATALOGUE['decentering'](), np.array([0.002, -0.001])
     table = table_of(21, 24, terms=[(effect, values)])
