@@ -30,7 +30,8 @@ from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
-from fisheye_svp_ros.solve.measured import localize_measured, rms_px
+from fisheye_svp_ros.solve.measured import localize_measured, rms_px, sigma_known
+from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
 from fisheye_svp_ros.study import budget as budgets
 from fisheye_svp_ros.study import sweep as sweeps
@@ -94,8 +95,8 @@ class Calibrated(Result):
 class CalibratedRig(Result):
     """A rig: the left camera in the right one.
 
-    covariance (6, 6), m and rad; frame (V,); pose (V,) of the right camera in the world; rms_px
-    over both cameras.
+    covariance (6, 6), m and rad, for the noise as in `Localized`; frame (V,); pose (V,) of the
+    right camera in the world; rms_px over both cameras.
     """
 
     rig: Pose
@@ -289,11 +290,14 @@ def calibrate_stereo(
 
     Raises ObservationError for a missing camera, GeometryError where the views fix no rig.
     """
-    views = stereo_views(_table(observations))
+    table = _table(observations)
+    views = stereo_views(table)
     found = stereo_calibration.calibrate_stereo(*_models(left, right), *views)
     residual = np.concatenate([found.left_residual, found.right_residual])
+    sigma = 1.0 if sigma_known(table) else noise_sigma(
+        float(found.cost[0]), int(np.isfinite(residual).sum()), 6 * (len(views[0].frame) + 1))
     return CalibratedRig(
-        found.rig.take(0), found.rig_covariance[0], views[0].frame, found.pose.take(0),
+        found.rig.take(0), sigma**2 * found.rig_covariance[0], views[0].frame, found.pose.take(0),
         rms_px(residual), bool(found.converged[0]),
     )
 

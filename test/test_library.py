@@ -75,6 +75,17 @@ def test_a_page_runs_as_printed(
         assert printed.getvalue() == expected
 
 
+def test_a_rig_is_as_uncertain_as_its_residuals_say(pair: library.Simulated) -> None:
+    lens, table = fsvp.load_lens('fish214'), pair.observations
+    assert pair.rig is not None
+    found, known = (
+        fsvp.calibrate_stereo(replace(table, sigma=np.full(len(table), sigma)), lens, lens)
+        for sigma in (np.nan, 0.2))
+    np.testing.assert_allclose(found.covariance, known.covariance, rtol=0.1)
+    off = found.rig.difference(pair.rig)
+    assert 1 < off @ np.linalg.solve(found.covariance, off) < 20  # chi-square of 6
+
+
 def _results(seen: library.Simulated, pair: library.Simulated) -> list[Result]:
     svp = seen.lens.svp()
     rig = pair.rig
