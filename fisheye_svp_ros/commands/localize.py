@@ -17,6 +17,7 @@ from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
+from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured, rms_px
 
 _SHOWN = 40  # frames in the table for people
@@ -102,8 +103,7 @@ def _write(
     write_poses(folder / 'poses.csv', views.frame, result.pose)
     used = views.used
     frame = np.broadcast_to(views.frame[:, None], used.shape)
-    theta = model.linearise(result.pose, views).image.incidence.theta
-    distance = np.linalg.norm(views.points - result.pose.position[:, None], axis=-1)
+    theta, distance = sight(model, result.pose, views)
     write_table(folder / 'residuals.csv', {
         'frame': frame[used], 'landmark': views.landmark[used],
         'u': views.uv[used][:, 0], 'v': views.uv[used][:, 1],

@@ -19,11 +19,10 @@ from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.markers import camera_shape
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms
-from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.localization import Localization
+from fisheye_svp_ros.solve.localization import Localization, sight
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import Solved, localized
@@ -145,8 +144,6 @@ def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
 
 def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:
     """Return the residuals of one view: px; incidence angle, rad, and range, m, as solved."""
-    points = solution.pose.into_body(views.points)[0]
-    theta = incidence(model.lens, points, limited=False).theta
-    distance = np.linalg.norm(points, axis=-1)
-    columns = (*views.uv[0].T, *solution.residual[0].T, theta, distance)
+    theta, distance = sight(model, solution.pose, views)
+    columns = (*views.uv[0].T, *solution.residual[0].T, theta[0], distance[0])
     return structured(RESIDUALS, views.landmark[0], *columns)

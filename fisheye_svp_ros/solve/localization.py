@@ -117,6 +117,12 @@ def residuals(model: ForwardModel, pose: Pose, views: Views) -> Array:
     return off
 
 
+def sight(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Array]:
+    """Return incidence angles, rad, and ranges, m, of points (S, N) from poses (S,), as solved."""
+    image = model.linearise(pose, views).image
+    return image.incidence.theta, np.linalg.norm(image.points, axis=-1)
+
+
 def start_poses(model: ForwardModel, views: Views) -> Pose:
     """Return rough poses (S,) of the views from the directions of their rays.
 

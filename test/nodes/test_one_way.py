@@ -14,17 +14,19 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: s
 from sensor_msgs.msg import PointCloud2  # isort: skip
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.io.csv_table import write_table
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.localizer import Localizer, residuals
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Observations, group_views
+from fisheye_svp_ros.scene.observations import Observations, group_views, make_observations
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
+from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 SETS = 116
@@ -99,3 +101,24 @@ def test_flat_boards_have_the_same_poses_by_every_way(
     # Some of them are on the wrong side where that fits better; hardly any is far off.
     off = np.linalg.norm(told - true.position, axis=1)
     assert np.quantile(off, 0.9) < 1.0
+
+
+def test_angles_and_ranges_are_those_of_the_corrected_target(tmp_path: Path) -> None:
+    grown = {'landmark_scale': {'axes': 1, 'parameters': {'relative': 0.05}}}
+    lens = Lens('wide', 1280, 960, 400.0, 400.0, 639.5, 479.5, Equidistant(), 1.5, target=grown)
+    save_lens(lens, tmp_path / 'wide.yaml')
+    target, count = plane(), len(plane().points)
+    pose = Pose(np.eye(3)[None], np.array([[0.05, 0.1, -0.15]]))
+    seen = pose.into_body(1.05 * target.points)[0]
+    theta, away = np.arctan2(np.hypot(*seen[:, :2].T), seen[:, 2]), np.linalg.norm(seen, axis=1)
+    uv = [639.5, 479.5] + 400 * theta[:, None] * seen[:, :2] / np.hypot(*seen[:, :2].T)[:, None]
+    table = make_observations(np.zeros(count), target.ids, uv, target.points)
+    write_observations(tmp_path / 'seen.csv', table)
+    assert main(['localize', f'{tmp_path}/seen.csv', '--lens', f'{tmp_path}/wide.yaml',
+                 '-o', f'{tmp_path}/out']) == 0
+    told = CsvTable(tmp_path / 'out' / 'residuals.csv', ['theta', 'range'])
+    model, views = ForwardModel(lens), group_views(table)
+    cloud = residuals(model, views, localize(model, views))
+    for name, true in (('theta', theta), ('range', away)):
+        np.testing.assert_allclose(told.numbers(name)[:, 0], true, atol=1e-8)
+        np.testing.assert_allclose(cloud[name], true, atol=1e-8)
