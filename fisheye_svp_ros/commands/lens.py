@@ -8,16 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.effects.forward import project
+from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.lens import PORT, Lens
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
+_AROUND = np.radians(np.arange(0, 360, 15))  # the axis
+_SEEN = 5e-4  # px
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,16 +78,20 @@ def _lost(lens: Lens, written: Lens) -> None:
     from fisheye_svp_ros.reporting.tables import print_table
 
     port = () if lens.port is None else (PORT,)
-    if port or lens.corrections or lens.target:
-        print(f'left out: {", ".join((*port, *lens.corrections, *lens.target))}')
-    if lens.viewpoint_shift is None or written.viewpoint_shift == lens.viewpoint_shift:
-        return
+    named = [name for name in (*port, *lens.corrections, *lens.target) if name != LANDMARKS]
+    if lens.viewpoint_shift is not None and written.viewpoint_shift != lens.viewpoint_shift:
+        named.insert(0, 'the viewpoint shift')
+    if named:
+        print(f'left out: {", ".join(named)}')
     angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]
-    rows = []
-    for angle in angles:
-        theta = np.radians(angle)
-        points = np.array(_RANGES)[:, None] * [np.sin(theta), 0.0, np.cos(theta)]
-        off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
-        rows.append((str(angle), *(f'{value:.3f}' for value in off)))
-    print_table('the viewpoint shift is left out; without it image points are off by, px',
-                ('deg', *(f'{distance:g} m' for distance in _RANGES)), rows)
+    theta = np.radians(angles)[:, None]
+    around = np.stack(np.broadcast_arrays(
+        np.sin(theta) * np.cos(_AROUND), np.sin(theta) * np.sin(_AROUND), np.cos(theta)), axis=-1)
+    points = np.array(_RANGES)[:, None, None] * around[:, None]
+    off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
+    worst = np.fmax.reduce(off, axis=-1)
+    if np.fmax.reduce(worst, axis=None) > _SEEN:
+        print_table('without it image points are off by up to, px',
+                    ('deg', *(f'{distance:g} m' for distance in _RANGES)),
+                    [(str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
+                     for angle, row in zip(angles, worst, strict=True)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -324,12 +325,28 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'ros.yaml'),
                      '--format', 'ros']) == 0
     said = capsys.readouterr().out
-    assert 'viewpoint shift is left out' in said
+    assert 'left out: the viewpoint shift\n' in said
     assert '0.1 m' in said
     assert cli.main(['lens', str(tmp_path / 'ros.yaml'), '-o', str(tmp_path / 'back.yaml')]) == 0
     assert load_lens(tmp_path / 'back.yaml').viewpoint_shift is None
     assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '--format', 'ros']) == 2
     assert '-o FILE' in capsys.readouterr().err
+
+
+def test_command_says_how_much_is_lost_with_corrections(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tilted = replace(
+        LENS, viewpoint_shift=None, image_height=Equidistant(), fx=400.0, fy=400.0,
+        corrections={'sensor_tilt': {'parameters': {'about_x': 0.002, 'about_y': 0.0}}},
+        target={'landmarks': [[0, 0, 0.0, 0.0, 0.0]]})
+    save_lens(tilted, tmp_path / 'lens.yaml')
+    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'kalibr.yaml'),
+                     '--format', 'kalibr']) == 0
+    said = capsys.readouterr().out
+    assert 'left out: sensor_tilt\n' in said
+    off = f'{400 * 0.002 * np.radians(60) ** 2:.3f}'
+    assert re.search(rf'^ *60 +{off} +{off} +{off} +{off} *$', said, re.MULTILINE)
 
 
 def test_command_shows_the_rig_of_calibrate(
