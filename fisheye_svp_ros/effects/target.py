@@ -57,11 +57,20 @@ class Target:
         return cls(terms, ids, table[first, 1].astype(np.int64), table[first, 2:])
 
     def labelled(self, views: Views) -> Views:
-        """Return views with the target's landmarks on the boards that they belong to."""
+        """Return views with the target's landmarks on the boards that they belong to.
+
+        Those that it was found without are where the views say; where these have no boards, or
+        others (as on topics), on that of the nearest landmark.
+        """
         if self.landmark is None or not len(self.landmark):
             return views
-        slot, _, same = self._lookup(views)
-        return views._replace(board=np.where(same, self.board[slot], views.board))
+        slot, known, same = self._lookup(views)
+        board = np.where(same, self.board[slot], views.board)
+        new = views.used & ~known
+        if new.any() and (board != views.board)[same & views.used].any():
+            away = np.linalg.norm(views.points[new][:, None] - self.points, axis=-1)
+            board[new] = self.board[away.argmin(axis=1)]
+        return views._replace(board=board)
 
     def shown(self, views: Views) -> Mask:
         """Return which landmarks (S, N) are the target's, or may be, in views that show it."""

@@ -184,6 +184,14 @@ class TestTarget:
         solved = localize(model, group_views(as_on_topics))
         assert np.nanmax(np.abs(solved.residual)) < 1e-6
 
+    def test_landmarks_that_it_was_found_without_are_on_the_board_they_lie_on(self):
+        table, term = bowed(SEEN)
+        found_on = table.take(table.landmark % 7 != 3)
+        model = ForwardModel(extend_lens(KB, [term], found_on))
+        for board in (table.board, np.zeros_like(table.board)):
+            solved = localize(model, group_views(replace(table, board=board)))
+            assert np.nanmax(np.abs(solved.residual)) < 1e-6
+
     def test_another_target_is_left_alone(self):
         table, term = bowed(SEEN)
         model = ForwardModel(extend_lens(KB, [term], table))
