@@ -51,6 +51,7 @@ from fisheye_svp_ros.diagnosis.uncertainty import ModelError
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
@@ -172,8 +173,10 @@ def diagnose(
     lenses = rig_lenses(observations, lens)
     free = free_names(lenses, free_intrinsics)
     first, *others = lenses.values()
+    observations = on_boards(observations, first.target.get(LANDMARKS))
     if held_out is not None:
         held_out = of_rig(held_out, observations.cameras)
+        held_out = on_boards(held_out, landmark_rows(observations))
         check_other(observations, held_out)
     wanted = wanted or Wanted()
     if wanted.quick:

@@ -178,7 +178,8 @@ class LensErrors:
 
     def linearised(self, views: Views, pose: Pose) -> Linearised:
         """Linearise views of this lens, with the numbers that are uncertain free."""
-        terms = ForwardModel(self.lens).terms_for(views)
+        model = ForwardModel(self.lens)
+        views, terms = model.labelled(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})
         own = [name for name in self.names if name in bare.parameters]
         count = len(views.frame)

@@ -95,6 +95,10 @@ class ForwardModel:
         target = self.seeing(views)._target
         return self.terms if target is None else (*self.terms, *target.terms)
 
+    def labelled(self, views: Views) -> Views:
+        """Return views with the landmarks of the lens's target on the boards that they are of."""
+        return views if self._target is None else self._target.labelled(views)
+
     @property
     def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
         """The effects that move no prediction, and their values."""
@@ -183,8 +187,7 @@ class ForwardModel:
         return np.asarray(stage @ columns)
 
     def _through(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
-        if self._target is not None:
-            views = self._target.labelled(views)
+        views = self.labelled(views)
         points = self._seen_points(pose, views)
         ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
         linear = LinearViews(ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited)

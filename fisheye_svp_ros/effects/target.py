@@ -8,7 +8,7 @@ landmarks, written by hand or by an older version, are applied to whatever is se
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Scene, Term
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.scene.observations import Observations, Views
+from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 
 LANDMARKS = 'landmarks'
 _SAME_PLACE = 1e-5  # m; no two targets are told apart by less
@@ -105,6 +105,21 @@ def landmark_rows(seen: Observations) -> list[list[float]]:
     ids, first = np.unique(seen.landmark, return_index=True)
     boards, places = seen.board[first].tolist(), seen.xyz[first].tolist()
     return [[*pair, *xyz] for *pair, xyz in zip(ids.tolist(), boards, places, strict=True)]
+
+
+def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Observations:
+    """Return observations of a target on the boards that its `landmark_rows` say.
+
+    A recording of topics tells of no boards, another table may call them otherwise.
+    """
+    if rows is None:
+        return seen
+    target, views = Target.of({LANDMARKS: rows}, seen.source), group_views(seen)
+    assert target is not None
+    mine = views.used & target.shown(views).any(axis=1, keepdims=True)
+    board = seen.board.copy()
+    board[views.row[mine]] = target.labelled(views).board[mine]
+    return replace(seen, board=board)
 
 
 def of_target(terms: Sequence[Term]) -> bool:

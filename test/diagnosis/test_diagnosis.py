@@ -22,6 +22,8 @@ from fisheye_svp_ros.diagnosis.search import search
 from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.extension import extend_lens
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
@@ -332,6 +334,20 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
     assert known.base.heldout_rms_px == pytest.approx(found.base.heldout_rms_px)
     assert known.causes[0].gain == pytest.approx(found.causes[0].gain, rel=1e-3)
     assert known.causes[0].gain > 0.5
+
+
+def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them():
+    model, seen = ForwardModel(lens(), ()), scene(np.random.default_rng(30))
+    shape = CATALOGUE['target_shape'].candidates(model.scene(*seen, model.linearise(*seen)))[0]
+    values = np.resize([0.004, -0.003, 0.005, 0.006], len(shape.parameters))
+    table, other = (observe(lens(), [(shape, values)], *seen, SIGMA, np.random.default_rng(seed))
+                    for seed in (1, 2))
+    bare = replace(other, board=np.zeros_like(other.board))
+    extended = extend_lens(lens(), [(shape, values)], table)
+    assert diagnose(bare, extended, wanted=Wanted(quick=True)).verdict == 'adequate'
+    found = diagnose(table, lens(), held_out=bare, wanted=Wanted(quick=True))
+    assert [cause.effect for cause in found.causes] == ['target_shape']
+    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
 @pytest.mark.parametrize(('cameras', 'names', 'x'), [

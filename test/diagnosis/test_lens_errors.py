@@ -186,3 +186,21 @@ def test_a_lens_without_errors_or_with_half_of_them_is_refused():
                         ('components', {'image_coarse': float('nan')})):
         with pytest.raises(LensError, match='uncertainty'):
             LensErrors.of(replace(lens, uncertainty={**lens.uncertainty, name: value}))
+
+
+def test_what_the_target_is_uncertain_by_needs_no_boards_to_be_told():
+    """Topics tell of none: the localizer's covariance is that of the command."""
+    points = np.column_stack([*np.mgrid[-3:4, -2:3].reshape(2, -1) * 0.04, np.zeros(35)])
+    rows = [[i, 4, *map(float, point)] for i, point in enumerate(points)]
+    bow = {'degree': 2, 'boards': [[4.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0, 0, 0.1]],
+           'parameters': {f'board4.z{name}': 0.001 for name in ('20', '11', '02')}}
+    base = uncertain()
+    lens = replace(base, target={'landmarks': rows, 'target_shape': bow}, uncertainty={
+        **base.uncertainty, 'parameters': ['target_shape.board4.z20'], 'covariance': [[1e-8]],
+        'components': {}})
+    pose = Pose(rotation_from_vector(np.array([[0.3, -0.2, 0.1]])), np.array([[0.05, 0.0, -0.3]]))
+    views = views_of(points, np.zeros((1, 35, 2)))
+    told, untold = (LensErrors.of(lens).of_poses(views._replace(board=board), pose).parameters
+                    for board in (np.full_like(views.board, 4), views.board))
+    assert np.sqrt(told[0, 2, 2]) > 1e-5
+    np.testing.assert_allclose(untold, told, rtol=1e-12)
