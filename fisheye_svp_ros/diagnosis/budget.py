@@ -11,11 +11,11 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
-from fisheye_svp_ros.diagnosis.components import component_traces
 from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed, pseudo_inverse, swept
 from fisheye_svp_ros.diagnosis.mixed import factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.reml import GONE
+from fisheye_svp_ros.diagnosis.score_tests import component_traces
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 

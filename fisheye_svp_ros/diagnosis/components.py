@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import (
@@ -19,6 +18,7 @@ from fisheye_svp_ros.diagnosis.reml import (
     stepped,
     without,
 )
+from fisheye_svp_ros.diagnosis.score_tests import score_components
 from fisheye_svp_ros.diagnosis.solution import Posterior, Solution, posterior, ratio_without, solve
 from fisheye_svp_ros.diagnosis.solution import without as solution_without
 
@@ -91,70 +91,6 @@ def _hardly_known(now: Variances) -> list[str]:
             if there and sd > _HARDLY]
 
 
-def score_components(eq: Equations, now: Variances, names: list[str]) -> dict[str, float]:
-    """Return p-values of variances at zero, for components that the data could hold.
-
-    The sum of squares of the columns' products with the residual against a gamma distribution of
-    the same mean and variance.  Source: Lin, Variance component testing in generalised linear
-    models with random effects, Biometrika 84 (1997).
-    """
-    f = factored(eq.trimmed(now.alive), now.lam, now.weight)
-    solution = solve(f)
-    change = np.append(-solution.values, 1.0)
-    found = {}
-    for name in names:
-        products = _products(eq, now, NAMES.index(name))
-        if products is None:
-            continue
-        own, ge, gr, gx = products
-        pull = gx.T @ change - np.einsum('ekc,ek->c', ge, solution.e) - gr.T @ solution.r
-        remaining = own - f.taken(ge, gr, gx[:-1])
-        mean, spread = float(np.trace(remaining)), 2 * float((remaining**2).sum())
-        size = float(pull @ pull) / solution.variance
-        if mean > 1e-9 and spread > 0:
-            found[name] = float(special.gammaincc(mean**2 / spread, size * mean / spread))
-    return found
-
-
-def component_traces(eq: Equations, now: Variances) -> dict[str, float]:
-    """Return what each component that is there adds per unit of its variance, poses out.
-
-    Sums of squares of its columns once poses are projected out, landmarks by their weights.
-    """
-    nothing = np.full(len(NAMES), GONE)
-    f = factored(eq.trimmed(nothing < GONE), nothing, now.weight)
-    found = {}
-    for name, there in zip(NAMES, now.alive, strict=True):
-        products = _products(eq, Variances(1.0, nothing, now.weight), NAMES.index(name))
-        if there and products is not None:
-            own, ge, gr, _ = products
-            found[name] = float(np.trace(own) - np.trace(f.taken(ge, gr, None)))
-    return found
-
-
-def _products(
-    eq: Equations, now: Variances, kind: int
-) -> tuple[Array, Array, Array, Array] | None:
-    """Return the products of a component's columns with themselves and all that is there."""
-    b = eq.blocks
-    keep, columns, rest = eq.kept(now.alive)
-    in_r = np.flatnonzero(b.r_label == kind)
-    if len(in_r):
-        ge = b.er[keep][:, columns][..., in_r]
-        return b.rr[np.ix_(in_r, in_r)], ge, b.rr[np.ix_(rest, in_r)], b.rx[in_r].T
-    block, column = np.nonzero(b.e_label == kind)
-    if not len(block):
-        return None
-    same = block[:, None] == block
-    own = np.where(same, b.ee[block[:, None], column[:, None], column], 0.0)
-    ge = np.zeros((int(keep.sum()), int(columns.sum()), len(block)))
-    place = np.cumsum(keep) - 1
-    at = np.flatnonzero(keep[block])
-    chosen = np.flatnonzero(columns)
-    ge[place[block[at]], :, at] = b.ee[block[at][:, None], chosen, column[at][:, None]]
-    return own, ge, b.er[block, column][:, rest].T, b.ex[block, column].T
-
-
 def significance(eq: Equations, now: Variances) -> dict[str, float]:
     """Return p-values of the components that are there, each by leaving it out.
 
@@ -189,13 +125,19 @@ def _followed(
 
     They only ever take up a part of it, so that only doubtful ones are asked for.
     """
-    found, (f, solution, _) = dict(ratios), whole
+    found = dict(ratios)
     for name, ratio in ratios.items():
         if _DOUBTFUL[0] < ratio < _DOUBTFUL[1]:
-            left = solution_without(*whole, NAMES.index(name))
-            others = stepped(f, left, without(now, name))
-            found[name] = _deviance(eq, others) - solution.deviance
+            found[name] = _deviance(eq, _step_without(eq, now, whole, name)) - whole[1].deviance
     return found
+
+
+def _step_without(eq: Equations, now: Variances, whole: _Whole, name: str) -> Variances:
+    f, kind, others = whole[0], NAMES.index(name), without(now, name)
+    if (f.equations.blocks.r_label == kind).any():
+        return stepped(f, solution_without(*whole, kind), others)
+    f = factored(eq.trimmed(others.alive), others.lam, others.weight)
+    return stepped(f, solve(f, posterior(f)), others)
 
 
 def _deviance(eq: Equations, now: Variances) -> float:

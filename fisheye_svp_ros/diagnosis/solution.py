@@ -28,15 +28,6 @@ class Posterior(NamedTuple):
         squares = np.einsum('ic,ic->i', self.root, self.root)
         return own + squares[: own.size].reshape(own.shape), squares[own.size :]
 
-    def covariance(self, rows: Index, columns: Index) -> Array:
-        """Return the covariance (m, n) of some coefficients (m,) with others (n,), by place."""
-        found = self.root[rows] @ self.root[columns].T
-        count, width, _ = self.block.shape
-        (of_row, i), (of_column, j) = np.divmod(rows, width), np.divmod(columns, width)
-        row, column = np.nonzero((of_row[:, None] == of_column) & (of_column < count))
-        found[row, column] += self.block[of_row[row], i[row], j[column]]
-        return found
-
 
 def random_roots(f: Factored) -> tuple[Array, Array]:
     """Return roots e (E k, R), r (R, R) of the covariance given the fixed columns.
@@ -102,37 +93,62 @@ def ratio_without(f: Factored, solution: Solution, known: Posterior, kind: int) 
     Of posterior mean b and covariance S of its coefficients: what is left grows by b' inv(S) b,
     the determinant by that of S.
     """
-    return _held(f, solution, known, kind)[0]
+    mine = np.flatnonzero(f.equations.blocks.label == kind)
+    values, prior = (np.append(e, r)[mine] for e, r in ((solution.e, solution.r), f.precision))
+    half, logs = _whitened(known, mine, values)
+    growth = np.log1p(half / solution.variance / max(f.freedom, 1))
+    return float(f.freedom * growth + logs + np.log(prior).sum())
+
+
+def _whitened(known: Posterior, mine: Index, values: Array) -> tuple[float, float]:
+    """Return b' inv(S) b of coefficients (n,), by place, and the log determinant of S.
+
+    S = D + r r' with D in blocks; of many small blocks nothing so large as S itself is made.
+    """
+    root, (count, width, _) = known.root[mine], known.block.shape
+    if mine[0] >= count * width:
+        return _squared(linalg.cholesky(root @ root.T, lower=True), values)
+    block, column = (part.reshape(len(np.unique(mine // width)), -1)
+                     for part in np.divmod(mine, width))
+    own = np.asarray(np.linalg.cholesky(
+        known.block[block[:, :, None], column[:, :, None], column[:, None]]))
+    split = np.column_stack([root, values]).reshape(*block.shape, -1)
+    both = np.linalg.solve(own, split).reshape(len(mine), -1)
+    root, values = both[:, :-1], both[:, -1]
+    if len(root) <= root.shape[1]:
+        whole = linalg.cholesky(root @ root.T + np.eye(len(root)), lower=True)
+        square, logs = _squared(whole, values)
+    else:
+        inside = linalg.cholesky(root.T @ root + np.eye(root.shape[1]), lower=True)
+        less, logs = _squared(inside, root.T @ values)
+        square = float(values @ values) - less
+    return square, logs + log_square(own)
+
+
+def _squared(root: Array, values: Array) -> tuple[float, float]:
+    """Return b' inv(S) b and the log determinant of S, from its lower root."""
+    half = solve_lower(root, values)
+    return float(half @ half), log_square(root)
 
 
 def without(f: Factored, solution: Solution, known: Posterior, kind: int) -> Solution:
-    """Return what the equations say without a component, given what they say with it."""
-    ratio, root, half, growth = _held(f, solution, known, kind)
-    every = np.arange(len(known.root))
-    across = known.covariance(every, np.flatnonzero(f.equations.blocks.label == kind))
-    steps = solve_lower(root, across.T)
-    moved, less, count = half @ steps, (steps**2).sum(axis=0), solution.e.size
-    shape = solution.e.shape
+    """Return what the equations say without a component of the rest, given what they say with it.
+
+    Its coefficients are held at nothing, the precisions of the others as they are.
+    """
+    ratio, count = ratio_without(f, solution, known, kind), solution.e.size
+    mine = count + np.flatnonzero(f.equations.blocks.r_label == kind)
+    root = linalg.cholesky(known.root[mine] @ known.root[mine].T, lower=True)
+    half = solve_lower(root, solution.r[mine - count])
+    steps = solve_lower(root, known.root[mine] @ known.root.T)
+    moved, less, shape = half @ steps, (steps**2).sum(axis=0), solution.e.shape
     return solution._replace(
-        variance=solution.variance * growth, deviance=solution.deviance + ratio,
+        variance=solution.variance + float(half @ half) / max(f.freedom, 1),
+        deviance=solution.deviance + ratio,
         e=solution.e - moved[:count].reshape(shape), r=solution.r - moved[count:],
         spread_e=solution.spread_e - less[:count].reshape(shape),
         spread_r=solution.spread_r - less[count:],
     )
-
-
-def _held(
-    f: Factored, solution: Solution, known: Posterior, kind: int
-) -> tuple[float, Array, Array, float]:
-    """Return the ratio, a root of S, its inverse times b, and the factor on the variance."""
-    mine = np.flatnonzero(f.equations.blocks.label == kind)
-    values, prior = (np.append(e, r)[mine] for e, r in (
-        (solution.e, solution.r), f.precision))
-    root = linalg.cholesky(known.covariance(mine, mine), lower=True)
-    half = solve_lower(root, values)
-    growth = 1 + float(half @ half) / solution.variance / max(f.freedom, 1)
-    logs = log_square(root) + float(np.log(prior).sum())
-    return f.freedom * float(np.log(growth)) + logs, root, half, growth
 
 
 def _deviance(f: Factored, freedom: int, variance: float) -> float:

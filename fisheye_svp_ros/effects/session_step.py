@@ -11,6 +11,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 
+_MOST = 32  # starts at pauses, and as many more, evenly spread
+_PAUSE = 2.0  # times the median time between instants
 _STEP = (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
 
 
@@ -39,10 +41,10 @@ class SessionStepEffect(Effect):
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         timed = bool(np.isfinite(scene.times).all())
-        instants = np.unique(scene.times if timed else scene.views.frame)
+        instants = np.unique(scene.times if timed else scene.views.frame.astype(float))
         if len(instants) < 6:
             raise Untestable('fewer than six frames')
-        return [cls((float(start),), timed) for start in instants[2:-1]]
+        return [cls((float(start),), timed) for start in _starts(instants)]
 
     def beside_intrinsics(self, scene: Scene) -> Effect:
         return replace(self, means=tuple(self._after(scene).mean(axis=0).tolist()))
@@ -81,3 +83,14 @@ class SessionStepEffect(Effect):
         """Return 1.0 where views (S,) come after the starts (K,), 0.0 where before: (S, K)."""
         instant = scene.times if self.timed else scene.views.frame
         return np.asarray(instant[:, None] >= np.array(self.starts), dtype=float)
+
+
+def _starts(instants: Array) -> Array:
+    """Return the instants to ask for: of a recording of many every few, and those after pauses."""
+    starts, pauses = instants[2:-1], np.diff(instants)[1:-1]
+    if len(starts) <= 2 * _MOST:
+        return starts
+    after = np.argsort(-pauses, kind='stable')[:_MOST]
+    after = after[pauses[after] > _PAUSE * np.median(pauses)]
+    spread = np.linspace(0, len(starts) - 1, _MOST).round().astype(int)
+    return np.asarray(starts[np.union1d(after, spread)])

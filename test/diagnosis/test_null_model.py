@@ -1,14 +1,15 @@
 """The null model: its equations are those of the dense matrices, its variances those put in."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
-from scipy import stats
+from scipy import special, stats
 
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.components import score_components, significance
+from fisheye_svp_ros.diagnosis.components import significance
 from fisheye_svp_ros.diagnosis.doubt import confident
 from fisheye_svp_ros.diagnosis.evidence import gather_evidence, identifiable, swept
 from fisheye_svp_ros.diagnosis.left_out import left_out_in_turn
@@ -25,6 +26,7 @@ from fisheye_svp_ros.diagnosis.reml import (
     without,
 )
 from fisheye_svp_ros.diagnosis.residuals import conditional_residuals, leverages
+from fisheye_svp_ros.diagnosis.score_tests import score_components
 from fisheye_svp_ros.diagnosis.solution import posterior, ratio_without, solve
 from fisheye_svp_ros.diagnosis.solution import without as solution_without
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -113,7 +115,8 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
 
 
 @pytest.mark.parametrize('frames', [4, 24])
-@pytest.mark.parametrize('name', ['landmark_normal', 'image_coarse', 'frame_linear'])
+@pytest.mark.parametrize('name', [
+    'landmark_normal', 'image_coarse', 'frame_linear', 'frame_bumps', 'board_in_plane'])
 def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames, name):
     linear = linearised(frames=frames, offsets=2e-3)
     random = design(linear)
@@ -127,15 +130,65 @@ def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames,
     gone = without(now, name)
     direct_f = factored(eq.trimmed(gone.alive), now.lam, now.weight)
     direct = solve(direct_f, posterior(direct_f))
-    found = solution_without(*whole, kind)
     assert ratio_without(*whole, kind) == pytest.approx(direct.deviance - whole[1].deviance)
+    if not (f.equations.blocks.r_label == kind).any():
+        return
+    found, after = solution_without(*whole, kind), stepped(direct_f, direct, gone)
     assert found.deviance == pytest.approx(direct.deviance)
     assert found.variance == pytest.approx(direct.variance)
-    after = stepped(direct_f, direct, gone)
     there = after.alive
     np.testing.assert_array_equal(stepped(f, found, gone).alive, there)
     np.testing.assert_allclose(stepped(f, found, gone).lam[there], after.lam[there], rtol=1e-6)
     np.testing.assert_allclose(stepped(f, found, gone).weight, after.weight, rtol=1e-6)
+
+
+@pytest.mark.parametrize('frames', [4, 24])
+@pytest.mark.parametrize('there', [(), ('landmark_in_plane', 'image_broad', 'frame_focal')])
+def test_score_tests_are_those_of_the_dense_matrices(frames, there):
+    linear = linearised(frames=frames, offsets=2e-3)
+    random = design(linear)
+    probe = linear.effect_columns(CATALOGUE['skew']())
+    eq = equations(random, linear.frame_columns,
+                   np.concatenate([probe, linear.residual[..., None]], axis=-1))
+    now = some_variances(eq)
+    now = replace(now, lam=np.where([name in there for name in NAMES], now.lam, GONE))
+    z, label = dense_columns(linear, random)
+    weight = np.concatenate([
+        np.ones(random.frame.shape[-1] * frames), np.repeat(now.weight, 3),
+        np.ones(random.shared.shape[1])])
+    v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
+    fixed = np.column_stack([dense_poses(linear), probe.reshape(-1, 1)[linear.used.ravel()]])
+    inverse = np.linalg.inv(v)
+    across = inverse @ fixed
+    p = inverse - across @ np.linalg.lstsq(fixed.T @ across, across.T, rcond=None)[0]
+    y = linear.residual[linear.used]
+    found = score_components(eq, now, list(NAMES))
+    assert len(found) > 10
+    for name, p_value in found.items():
+        columns = z[:, label == NAMES.index(name)]
+        remaining, pull = columns.T @ p @ columns, columns.T @ p @ y
+        mean, spread = np.trace(remaining), 2 * (remaining**2).sum()
+        variance = y @ p @ y / (len(y) - np.linalg.matrix_rank(fixed))
+        size = pull @ pull / variance
+        assert p_value == pytest.approx(
+            special.gammaincc(mean**2 / spread, size * mean / spread), rel=1e-3, abs=1e-12), name
+
+
+def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
+    """A recording of 340 frames took 15 GB."""
+    linear, kind = linearised(frames=150), NAMES.index('frame_bumps')
+    eq = equations(design(linear), linear.frame_columns, linear.residual[..., None])
+    count = (eq.blocks.e_label == kind).sum()
+    now = some_variances(eq)
+    f = factored(eq, now.lam, now.weight)
+    known = posterior(f)
+    solution = solve(f, known)
+    tracemalloc.start()
+    ratio_without(f, solution, known, kind)
+    score_components(eq, without(now, 'frame_bumps'), ['frame_bumps'])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert count > 3000 and peak < 2 * 8 * count**2
 
 
 def test_a_direction_that_random_parts_have_taken_up_stays_where_it_is():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, scene
 
-from fisheye_svp_ros.effects.base import Untestable
+from fisheye_svp_ros.effects.base import Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -216,3 +216,13 @@ def test_a_drift_stays_as_it_was_where_the_recording_ends(linearised):
         known, after = (np.nanmean(effect.plane_columns(one) / one.normalised()[..., None],
                                    axis=(1, 2)) for one in (scene_, later))
         np.testing.assert_allclose(after, np.broadcast_to(known[last], after.shape))
+
+
+def test_steps_are_asked_for_after_pauses_and_every_few_frames_of_a_long_recording():
+    t = 0.1 * np.arange(400) + 30.0 * (np.arange(400) >= 157)
+    pose, views = scene(np.random.default_rng(2), frames=400)
+    views = views._replace(t=np.broadcast_to(t[:, None], views.t.shape))
+    looked = Scene(views, lens(), pose, views.uv)
+    starts = [form.starts[0] for form in CATALOGUE['session_step'].candidates(looked)]
+    assert len(starts) < 70 and np.abs(np.array(starts) - t[157]).min() < 1e-6
+    assert max(np.diff(starts)) < 31.5
