@@ -31,10 +31,13 @@ Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 
 
 class Shown(NamedTuple):
-    """What the pictures are of: observations without gross errors, the lens, noise (px)."""
+    """What the pictures are of: observations without gross errors, lenses by camera, noise (px).
+
+    lenses: '' is that of all cameras.
+    """
 
     points: PointResiduals
-    lens: Lens
+    lenses: dict[str, Lens]
     noise: float
 
     @classmethod
@@ -43,31 +46,49 @@ class Shown(NamedTuple):
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)
-        return cls(shown, diagnosis.after.state.lens, diagnosis.scatter_px)
+        state = diagnosis.after.state
+        lenses = dict(zip(state.labels, state.lenses, strict=True))
+        return cls(shown, lenses, diagnosis.scatter_px)
+
+    def of_camera(self, camera: int) -> PointResiduals:
+        """Return the points that were seen through one of the lenses."""
+        if len(self.lenses) == 1:
+            return self.points
+        mine = self.points.camera == camera
+        return PointResiduals._make(array[mine] for array in self.points)
 
 
 def draw_field(path: Path, shown: Shown) -> None:
     """Residual vectors over the image: of single points, and means over cells of the image."""
-    points, cell = shown.points, shown.lens.width / _CELLS
-    step = max(1, len(points.uv) // _ARROWS)
+    lenses = list(shown.lenses.items())
+    sides = [lens.height / lens.width for _, lens in lenses for _ in range(2)]
+    with picture(path, _WIDTH, 1.1 * len(lenses) + (_WIDTH - 1) / 2 * sum(sides)) as figure:
+        axes = figure.subplots(len(sides), 2, squeeze=False, height_ratios=sides)
+        for camera, (name, lens) in enumerate(lenses):
+            _draw_field(axes[2 * camera:][:2], shown.of_camera(camera), name, lens)
+
+
+def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> None:
+    """Draw what one camera saw: single points above, means below, before and after."""
+    cell, step = lens.width / _CELLS, max(1, len(points.uv) // _ARROWS)
     fields = [
         ((points.uv[::step], residual[::step]), _cell_means(points.uv, residual, cell))
         for residual in (points.before, points.after)
     ]
-    height = 1.1 + (_WIDTH - 1) * shown.lens.height / shown.lens.width
-    with picture(path, _WIDTH, height) as figure:
-        axes = figure.subplots(2, 2, sharex=True, sharey=True)
-        for kind, row in enumerate(axes):
-            typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
-            for axis, field, (_, colour) in zip(row, fields, _SIDES, strict=True):
-                _image_frame(axis, shown.lens)
-                _arrows(axis, *field[kind], typical, cell, colour)
-        for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
-            axis.set_title(f'{side}: {rms_px(getattr(points, side)):.3f} px rms', color=colour)
-        axes[0, 0].set_ylabel('single points\nv / px')
-        axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
-        for axis in axes[1]:
-            axis.set_xlabel('u / px')
+    for kind, row in enumerate(axes):
+        typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
+        for axis, field, (_, colour) in zip(row, fields, _SIDES, strict=True):
+            _image_frame(axis, lens)
+            _arrows(axis, *field[kind], typical, cell, colour)
+            axis.label_outer()
+    for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
+        rms = rms_px(getattr(points, side))
+        axis.set_title(f'{name} {side}: {rms:.3f} px rms'.strip(), color=colour)
+    axes[0, 0].set_ylabel('single points\nv / px')
+    axes[1, 0].set_ylabel(f'means over {cell:.0f} px\nv / px')
+    for axis in axes[1]:
+        axis.tick_params(labelbottom=True)
+        axis.set_xlabel('u / px')
 
 
 def draw_against(path: Path, shown: Shown, x: Array, label: str, log: bool = False) -> None:
@@ -86,7 +107,7 @@ def draw_phase(path: Path, shown: Shown) -> None:
         (f'{name} residual / px', phase[:, i],
          {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES})
         for i, name in enumerate('uv')
-    ], 'distance of u (above) and v (below) from the middle of its pixel / px', False)
+    ], 'place of u (above) and v (below) in its pixel / px', False)
 
 
 def draw_histogram(path: Path, shown: Shown) -> None:
@@ -222,7 +243,8 @@ def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
 
 def _polar(shown: Shown, residual: Array) -> Array:
     """Return residuals (K, 2) along the radius and across it."""
-    arm = shown.points.uv - np.array([shown.lens.cx, shown.lens.cy])
+    centres = np.array([(lens.cx, lens.cy) for lens in shown.lenses.values()])
+    arm = shown.points.uv - (centres[shown.points.camera] if len(centres) > 1 else centres[0])
     radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-9)
     across = np.stack([-radial[:, 1], radial[:, 0]], axis=-1)
     return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)

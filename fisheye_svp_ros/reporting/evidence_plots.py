@@ -99,20 +99,27 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
 def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
     """Draw the standard deviation of a coordinate by noise, parameters and remaining misfit."""
     linear = diagnosis.after
-    views, lens = linear.data.views, linear.state.lens
+    data, state = linear.data, linear.state
     parts = diagnosis.errors.of_points(linear)._asdict()
-    uv = linear.data.blocks(views.uv).reshape(-1, 2)
-    with picture(path, 12.0, 3.6) as figure:
-        for axis, (name, part) in zip(figure.subplots(1, len(parts)), parts.items(), strict=True):
-            square = part.reshape(-1, 2).mean(axis=-1)
-            image = np.sqrt(_cells(uv, square, (lens.width, lens.height)))
-            shown = axis.imshow(image, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
-                                cmap='Blues', vmin=0.0, vmax=np.nanmax(image) or 1.0)
-            figure.colorbar(shown, ax=axis, label='px', shrink=0.8)
-            rms = np.sqrt(np.nanmean(square))
-            axis.set_title(f'{_TITLES[name]}: {rms:.3g} px', fontsize=9.5)
-            axis.set(xticks=[], yticks=[])
-            axis.grid(visible=False)
+    uv = data.blocks(data.views.uv).reshape(-1, 2)
+    through = np.broadcast_to(data.camera_of[:, None, None].astype(float), data.views.uv.shape)
+    camera = data.blocks(through).reshape(-1, 2)[:, 0] * (len(state.lenses) > 1)
+    rows = len(state.lenses)
+    with picture(path, 12.0, 3.6 * rows) as figure:
+        axes = figure.subplots(rows, len(parts), squeeze=False)
+        for i, (label, lens) in enumerate(zip(state.labels, state.lenses, strict=True)):
+            for axis, (name, part) in zip(axes[i], parts.items(), strict=True):
+                square = np.where(camera == i, part.reshape(-1, 2).mean(axis=-1), np.nan)
+                image = np.sqrt(_cells(uv, square, (lens.width, lens.height)))
+                shown = axis.imshow(
+                    image, extent=(-0.5, lens.width - 0.5, lens.height - 0.5, -0.5),
+                    cmap='Blues', vmin=0.0, vmax=np.nanmax(image) or 1.0)
+                figure.colorbar(shown, ax=axis, label='px', shrink=0.8)
+                rms = np.sqrt(np.nanmean(square))
+                title = f'{label} {_TITLES[name]}: {rms:.3g} px'.strip()
+                axis.set_title(title, fontsize=9.5)
+                axis.set(xticks=[], yticks=[])
+                axis.grid(visible=False)
 
 
 def _cells(uv: Array, values: Array, size: tuple[int, int]) -> Array:

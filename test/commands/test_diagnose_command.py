@@ -3,12 +3,14 @@
 import json
 import re
 from collections import namedtuple
+from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.targets import plane, poses_around
+from matplotlib.figure import Figure
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis.advice import Advice
@@ -19,6 +21,7 @@ from fisheye_svp_ros.diagnosis.points import point_residuals
 from fisheye_svp_ros.diagnosis.search import with_effect
 from fisheye_svp_ros.diagnosis.structure import Structure
 from fisheye_svp_ros.diagnosis.target_map import board_maps
+from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -32,6 +35,7 @@ from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import (
     advice_text,
@@ -430,6 +434,45 @@ def test_a_single_frame_is_drawn(tmp_path):
     for name, draw, arguments in residual_pictures(Shown.of(found, points)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
+
+
+def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatch):
+    figures = []
+
+    @contextmanager
+    def kept(path, width, height):
+        figures.append(Figure((width, height)))
+        yield figures[-1]
+
+    for module in (diagnosis_plots, evidence_plots):
+        monkeypatch.setattr(module, 'picture', kept)
+    table, _ = seen({})
+    step = np.array([LENS.width, 100.0])  # the other image lies beside the first
+    other = replace(table, camera=np.ones_like(table.camera), uv=table.uv + step)
+    both = {name: np.concatenate([getattr(table, name), getattr(other, name)])
+            for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
+    larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
+    found = diagnose(replace(table, cameras=('left', 'right'), **both),
+                     {'left': LENS, 'right': larger}, wanted=Wanted(quick=True))
+    shown = Shown.of(found, point_residuals(found.before, found.after))
+    named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
+    draw, arguments = named['field']
+    draw(tmp_path / 'field.png', *arguments)
+    axes = figures[-1].axes
+    assert [axis.get_xlim()[1] for axis in axes] == 4 * [LENS.width] + 4 * [larger.width]
+    assert [axis.get_title().split(':')[0] for axis in axes if axis.get_title()] == [
+        'left before', 'left after', 'right before', 'right after']
+    for axis in axes:
+        u = axis.collections[0].get_offsets()[:, 0]
+        assert len(u) and ((u >= LENS.width) == (axis in axes[4:])).all()
+    radial, across = diagnosis_plots._polar(
+        shown, shown.points.uv - (shown.points.camera == 1)[:, None] * step
+        - [LENS.cx, LENS.cy]).T
+    assert np.abs(across).max() < 1e-9 and radial.min() > 0
+    evidence_plots.draw_uncertainty(tmp_path / 'uncertainty.png', found)
+    images = [axis.images[0] for axis in figures[-1].axes if axis.images]
+    assert [image.get_extent()[1] for image in images] == (
+        3 * [LENS.width - 0.5] + 3 * [larger.width - 0.5])
 
 
 def test_the_bow_of_a_board_is_measured_between_its_extremes():
