@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help='true poses; unknown and fitted by default')
+                        help="true poses, of a rig's right camera; unknown and fitted by default")
     parser.add_argument('--free', choices=['intrinsics'],
                         help='fit the intrinsics too; always so for a lens from `calibrate`')
     parser.add_argument('--held-out', metavar='TEST',

@@ -22,6 +22,7 @@ from fisheye_svp_ros.diagnosis.inputs import (
     free_names,
     of_rig,
     rig_lenses,
+    right_first,
     thinned,
     without_copies,
 )
@@ -163,12 +164,15 @@ def diagnose(
 
     lens: of every camera, or the lenses of a rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
-    poses: true poses by frame; held_out: other frames of the same camera and target; wanted:
-    causes to take in or leave out; progress: told what is being done, and which share is done.
+    poses: true poses by frame, of a rig's right camera; held_out: other frames of the same camera
+    and target; wanted: causes to take in or leave out; progress: told what is being done, and
+    which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     observations, _ = without_copies(observations)
     observations.landmarks()  # each is in one place
+    if poses is not None:
+        observations = right_first(observations)
     check_cameras(observations)
     lenses = rig_lenses(observations, lens)
     free = free_names(lenses, free_intrinsics)

@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 from fisheye_svp_ros.solve.measured import posable_views
 
 _OUTSIDE = 0.02  # of the points of a camera: more than single gross errors
@@ -50,6 +50,14 @@ def of_rig(table: Observations, cameras: tuple[str, ...]) -> Observations:
                                + ', '.join(cameras))
     order = np.array([cameras.index(name) for name in table.cameras])
     return replace(table, cameras=cameras, camera=order[table.camera])
+
+
+def right_first(table: Observations) -> Observations:
+    """Return observations of a rig with its right camera first: true poses are of that one."""
+    names = rig_cameras(table.cameras)
+    if names is None or len(np.unique(table.camera)) < 2:
+        return table
+    return of_rig(table, (names[1], *(name for name in table.cameras if name != names[1])))
 
 
 def check_other(observations: Observations, other: Observations) -> None:

@@ -350,6 +350,18 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
     assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
+@pytest.mark.parametrize('cameras', [('left', 'right'), ('right', 'left')])
+def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, 2)
+    table = replace(observe(lens(), (), pose, views, SIGMA, rng), cameras=cameras)
+    right = np.flatnonzero(views.camera == cameras.index('right'))
+    poses = {int(views.frame[i]): pose.take(i) for i in right}
+    found = diagnose(table, lens(), poses=poses, wanted=Wanted(quick=True))
+    assert found.verdict == 'adequate'
+    assert found.base.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
+
+
 @pytest.mark.parametrize(('cameras', 'names', 'x'), [
     (('left', 'right'), ('left', 'right'), -0.15), (('right', 'left'), ('left', 'right'), 0.15),
     (('cam0', 'cam1'), ('cam0', 'cam1'), -0.15),
