@@ -71,7 +71,7 @@ def growths() -> list[Growth]:
         Growth('localizations, ShiftVP', 'views', (100, 1000, 10_000), _views),
         Growth('stereo calibration', 'views', (10, 40, 160), _stereo),
         Growth('null model and tests, 30 frames', 'effects', (5, 10, 20), _evidence),
-        Growth('diagnosis', 'frames', (10, 20, 40), _diagnosis),
+        Growth('diagnosis', 'frames', (20, 80, 320), _diagnosis),
     ]
 
 

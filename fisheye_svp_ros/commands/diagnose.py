@@ -13,7 +13,7 @@ from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of
 from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes, measured
 from fisheye_svp_ros.commands.plan import room_of
-from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
+from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -107,20 +107,28 @@ def run(args: argparse.Namespace) -> None:
                 'that of another camera, or of another image size? `localize` says how far each '
                 f'is off.{poses_too}'
             ) from cause
-        wanted = _wanted(args, diagnosis) if args.count else None
+        wanted, impossible = _wanted(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
             with together():
                 _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args.output, wanted)
+    if impossible is not None:
+        raise impossible
 
 
-def _wanted(args: argparse.Namespace, diagnosis: Diagnosis) -> Next:
+def _wanted(
+    args: argparse.Namespace, diagnosis: Diagnosis
+) -> tuple[Next | None, FisheyeSvpError | None]:
+    """Return the photographs to take next, or why there are none: what was found comes first."""
     from fisheye_svp_ros.diagnosis.next_question import next_photographs
 
     room = None if args.room is None else room_of(args.room)
-    return next_photographs(diagnosis.after, diagnosis.causes, diagnosis.noise_px, args.count,
-                            args.number, room)
+    try:
+        return next_photographs(diagnosis.after, diagnosis.causes, diagnosis.noise_px, args.count,
+                                args.number, room), None
+    except FisheyeSvpError as why:
+        return None, why
 
 
 def _read(

@@ -200,6 +200,13 @@ class TestTerminal:
                          ' '.join(out.split()))
         assert float(said[2]) < 0.5 * float(said[1])
 
+    def test_next_photographs_that_cannot_be_planned_take_nothing_away(self, scene, capsys):
+        """The target is not flat; what was found in a minute was lost with the refusal."""
+        assert run('shift.csv', scene, '--quick', '--next', '2', '-o', scene / 'found') == 2
+        said = capsys.readouterr()
+        assert 'not one flat board' in said.err and 'viewpoint_shift' in said.out
+        assert (scene / 'found' / 'report.html').stat().st_size > 1000
+
     def test_a_rig_has_a_lens_a_camera(self, scene, capsys):
         table, _ = seen({})
         other = replace(table, camera=np.ones_like(table.camera), uv=table.uv + 0.1)
