@@ -18,7 +18,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 # Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
-from helpers.nodes import ROOT, Caller, NodeProcess  # noqa: E402
+from helpers.nodes import GENUINE, ROOT, Caller, GenuineCaller, NodeProcess  # noqa: E402
 
 from fisheye_svp_ros.optics import engines  # noqa: E402
 
@@ -117,6 +117,18 @@ def run_node(
 
 @pytest.fixture
 def caller(ros_domain: int) -> Iterator[Caller]:
-    """Return a service client on the domain of the test."""
+    """Return a service client on the domain of the test, for nodes of the standalone client."""
     pytest.importorskip('cyclonedds')
     yield Caller(ros_domain)
+
+
+@pytest.fixture
+def node_caller(ros_domain: int) -> Iterator[Caller | GenuineCaller]:
+    """Return a service client for nodes that run on ROS 2 where it is installed."""
+    if not GENUINE:
+        pytest.importorskip('cyclonedds')
+        yield Caller(ros_domain)
+        return
+    caller = GenuineCaller(ros_domain)
+    yield caller
+    caller.close()

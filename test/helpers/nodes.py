@@ -9,6 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,13 @@ class NodeProcess:
         return status
 
 
+def services_of_cyclone() -> bool:
+    """Say whether services of the ROS 2 here are on the wire as the standalone client has them."""
+    from rclpy import get_rmw_implementation_identifier
+
+    return bool(get_rmw_implementation_identifier() == 'rmw_cyclonedds_cpp')
+
+
 class Caller:
     """A service client for tests, on the wire of the standalone client."""
 
@@ -110,6 +118,39 @@ class Caller:
             if taken[0][:2] == header[:2]:
                 return taken[1]
         raise AssertionError('no reply')
+
+
+class GenuineCaller:
+    """A service client for tests, on the RMW of an installed ROS 2, in a context of its own."""
+
+    def __init__(self, domain: int) -> None:
+        from rclpy.context import Context
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.node import Node
+
+        self._context = Context()
+        self._context.init(domain_id=domain)
+        self._node = Node('caller', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self._node)
+
+    def call(self, typename: str, service: str, **request: Any) -> Any:
+        """Call a service and return its response."""
+        package, kind, name = typename.split('/')
+        cls = getattr(import_module(f'{package}.{kind}'), name)
+        client = self._node.create_client(cls, service)
+        assert client.wait_for_service(TIMEOUT), service
+        future = client.call_async(cls.Request(**request))
+        self._executor.spin_until_future_complete(future, TIMEOUT)
+        self._node.destroy_client(client)
+        assert future.done(), 'no reply'
+        return future.result()
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        self._context.shutdown()
 
 
 def until(condition: Callable[[], Any], timeout: float = TIMEOUT) -> Any:
