@@ -136,12 +136,14 @@ def held_out_gain(
     Of log p(all) - log p(all but one); a wide normal prior keeps what the others do not tell.
     """
     prior = np.diag(evidence.wide_prior(columns, effect))
+    at = evidence.with_residual(np.concatenate([included, columns]))
     everything, parts = (
-        evidence.restored(information, included)
-        for information in (evidence.information, evidence.in_turn)
+        evidence.restored(information, included, at)
+        for information in (evidence.information[at[:, None], at], evidence.in_turn(at))
     )
-    return counted(_marginal(everything, included, columns, prior) - np.array([
-        _marginal(part, included, columns, prior) for part in parts
+    inside, more = np.searchsorted(at, included), np.searchsorted(at, columns)
+    return counted(_marginal(everything, inside, more, prior) - np.array([
+        _marginal(part, inside, more, prior) for part in parts
     ]))
 
 

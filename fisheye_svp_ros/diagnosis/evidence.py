@@ -104,10 +104,10 @@ class Evidence:
         """Each frame seen from all the others."""
         return left_out_in_turn(self.factored, self.random, self.linear.frame_columns, self.border)
 
-    @cached_property
-    def in_turn(self) -> Array:
-        """Information (F, X + 1, X + 1) of all frames but one."""
-        return self.information - self.left_out.information / self.variances.sigma**2
+    def in_turn(self, at: Index) -> Array:
+        """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
+        frames = self.left_out.information[:, at[:, None], at]
+        return self.information[at[:, None], at] - frames / self.variances.sigma**2
 
     @cached_property
     def untestable(self) -> dict[str, str]:
@@ -136,9 +136,16 @@ class Evidence:
         """Names of the effects in the model, for each camera of a rig that has one for itself."""
         return {kind for effect, _ in self.linear.state.terms for kind in effect.kinds}
 
-    def restored(self, information: Array, kept: Index) -> Array:
-        """Return information (..., X + 1, X + 1) as if only these of the effects were fitted."""
-        way = self.residual_with(kept)
+    def with_residual(self, columns: Index) -> Index:
+        """Return what is in the model, further columns and, last, the residual of the border."""
+        return np.unique(np.concatenate([np.arange(self.own), columns, [len(self.scale)]]))
+
+    def restored(self, information: Array, kept: Index, at: Index | None = None) -> Array:
+        """Return information (..., m, m) as if only these of the effects were fitted.
+
+        at (m,): what it is of, the residual last; None for the whole border.
+        """
+        way = self.residual_with(kept) if at is None else self.residual_with(kept)[at]
         found = information.copy()
         found[..., -1] = information @ way
         found[..., -1, :] = found[..., -1]

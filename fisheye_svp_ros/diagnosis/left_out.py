@@ -42,26 +42,29 @@ def left_out_in_turn(f: Factored, random: Design, pose: Array, border: Array) ->
     # Roots of the covariance of the coefficients and, given the border, their predictions.
     e, r = (np.concatenate([root, root @ f.border], axis=1) for root in (e, r))
     split = eq.sorted(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
+    found = LeftOut(np.empty((len(pose), *f.information.shape)), np.zeros_like(border))
 
-    def one(frame: int) -> LeftOut:
-        return _left_out(f, split, random, frame, pose[frame], border[frame])
+    def one(frame: int) -> None:
+        rows = found.rows[frame]
+        remaining = _left_out(f, split, random, frame, pose[frame], border[frame], rows)
+        np.matmul(remaining.T, rows, out=found.information[frame])
 
     # NumPy's linear algebra, unlike SciPy's, lets go of the interpreter.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        found = list(pool.map(one, range(len(pose))))
-    return LeftOut(*(np.stack(parts) for parts in zip(*found, strict=True)))
+        list(pool.map(one, range(len(pose))))
+    return found
 
 
 def _left_out(
     f: Factored, split: tuple[Array, Array, Array], random: Design, frame: int, pose: Array,
-    border: Array,
-) -> LeftOut:
-    """Return what a frame brings.
+    border: Array, rows: Array,
+) -> Array:
+    """Write what the others leave of a frame's rows (M, X); return it before inv(P_ff), as wide.
 
     split: roots of the covariance and what the border says, by frame, by landmark, shared.
     """
     used = np.flatnonzero(np.abs(pose).sum(axis=1) + np.abs(border).sum(axis=1))
-    height, rows = len(pose), np.zeros_like(border)
+    height, found = len(pose), np.zeros_like(border)
     own = np.concatenate(
         [pose[used] / f.equations.pose_scale[frame], random.frame[frame][used]], axis=1
     )
@@ -80,8 +83,8 @@ def _left_out(
     remaining = border[used] - at_border - told
     basis = _span(pose[used])
     remaining -= basis @ (basis.T @ remaining)
-    rows[used] = np.linalg.solve(p + basis @ basis.T, remaining)
-    return LeftOut(remaining.T @ rows[used], rows)
+    rows[used], found[used] = np.linalg.solve(p + basis @ basis.T, remaining), remaining
+    return found
 
 
 def _places(eq: Equations, random: Design, frame: int) -> tuple[Index, Array]:

@@ -133,10 +133,11 @@ def without_causes(evidence: Evidence, names: Sequence[str], free: Sequence[str]
 def _refitted(
     evidence: Evidence, information: Array, names: Collection[str], held: Collection[str]
 ) -> tuple[Index, Array, Array]:
-    """Return the columns that are fitted, their change, and (X + 1,) what is left.
+    """Return the columns that are fitted, their change, and (m,) what is left.
 
-    names: causes that are gone; held: causes that stay as they are.  The last is the combination
-    of the border that is the residual then.
+    information (m, m): of what is in the model and, last, the residual; more columns are left
+    alone.  names: causes that are gone; held: causes that stay as they are.  The last is the
+    combination of the border that is the residual then.
     """
     gone = np.zeros(evidence.own, dtype=bool)
     values = np.zeros(evidence.own)
@@ -170,10 +171,11 @@ def frames_in_turn(
     repeated = np.zeros_like(residual)
     if local is not None and local.views is not None:
         repeated = linear.data.blocks(local.views.own * linear.data.views.weight[..., None])
-    for frame, information in enumerate(evidence.in_turn):
+    at = evidence.with_residual(np.arange(evidence.own))
+    for frame, information in enumerate(evidence.in_turn(at)):
         _, _, way = _refitted(evidence, information, without, held)
         rows = evidence.border if local is None else evidence.left_out.rows
-        left, poses = rows[frame] @ way * even[frame], linear.frame_columns[frame]
+        left, poses = rows[frame][:, at] @ way * even[frame], linear.frame_columns[frame]
         left -= repeated[frame]
         poses = poses * even[frame][:, None]
         residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)

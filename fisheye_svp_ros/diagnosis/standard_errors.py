@@ -36,7 +36,7 @@ def standard_errors(evidence: Evidence, jackknife: bool = True) -> Array:
     estimate, variance, open_ = _estimates(evidence.information, own, reported)
     if jackknife and evidence.linear.data.frames > 2:
         changed, allowed = np.zeros(evidence.own), np.zeros(evidence.own)
-        for part in evidence.in_turn:
+        for part in evidence.in_turn(np.append(own, len(evidence.scale))):
             without, wider, lost = _estimates(part, own, reported)
             changed += np.where(lost, 0.0, (without - estimate) ** 2)
             allowed += np.where(lost, 0.0, wider - variance)

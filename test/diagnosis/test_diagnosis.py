@@ -449,7 +449,7 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
     values = spread * np.random.default_rng(27).normal(size=40)
     evidence = SimpleNamespace(
         own=1, terms=[], scale=np.array([2.0]), information=information(values),
-        in_turn=[information(np.delete(values, i)) for i in range(40)],
+        in_turn=lambda at: [information(np.delete(values, i)) for i in range(40)],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     expected = 1 if spread == 1 else values.std(ddof=1)
     assert standard_errors(evidence) == pytest.approx(expected / np.sqrt(40) / 2)
@@ -463,7 +463,7 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     without = [np.delete(rows, i, axis=0) for i in range(40)]
     evidence = SimpleNamespace(
         own=2, terms=[], scale=np.ones(2), information=rows.T @ rows,
-        in_turn=[w.T @ w for w in without],
+        in_turn=lambda at: [w.T @ w for w in without],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     assert standard_errors(evidence) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
 

@@ -122,7 +122,7 @@ def test_what_no_frame_tells_of_has_no_error():
     information = np.diag([0.0, 4.0, 1.0])
     evidence = SimpleNamespace(
         own=2, terms=[], scale=np.ones(2), information=information,
-        in_turn=np.stack([0.9 * information] * 3), linear=SimpleNamespace(
+        in_turn=lambda at: np.stack([0.9 * information] * 3), linear=SimpleNamespace(
             data=SimpleNamespace(frames=3)))
     np.testing.assert_allclose(standard_errors(evidence), [np.nan, 0.5])
 
