@@ -97,9 +97,9 @@ def model_uncertainty(evidence: Evidence) -> Array:
 
     Each model with more effects, or with another effect in the place of one, is as probable as its
     evidence says (`_evidence_for`), and adds so much of the variance that it brings and of the
-    square of the change.  Beside a further form of an effect, or without it, its parameters
-    mean something else: for them that model does not count.  What is added is hardly larger than
-    large, however little the data say of it.
+    square of the change.  Beside a further form of an effect or one that does nearly the same, or
+    without it, its parameters mean something else: for them that model does not count.  What is
+    added is hardly larger than large, however little the data say of it.
     """
     own, information, reported = evidence.own, evidence.information, _reported(evidence)
     prior = np.zeros(len(information))
@@ -117,7 +117,7 @@ def model_uncertainty(evidence: Evidence) -> Array:
         change = other[there] - estimate[at]
         more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
         for effect, columns, _ in evidence.terms:
-            if one.kinds & set(effect.kinds):
+            if one.kinds & _meaning(effect):
                 more[columns] = 0.0
         added += weight * more
     return np.asarray(np.sqrt(added) / evidence.scale[:own])
@@ -154,7 +154,7 @@ def _likely_models(evidence: Evidence) -> list[_Model]:
         forms, model = max(waiting.items(), key=lambda item: item[1].merit)
         found[forms] = waiting.pop(forms)
         for one in candidates(evidence, model.included, per_frame=False):
-            kinds, gain = set(one.effect.kinds), _evidence_for(evidence, one.score)
+            kinds, gain = _meaning(one.effect), _evidence_for(evidence, one.score)
             if gain <= 0 or model.kinds & kinds:
                 continue
             if (larger := forms | {one.form}) not in found:
@@ -181,6 +181,12 @@ def _exchanged(evidence: Evidence) -> Iterator[tuple[frozenset[int], _Model]]:
                 included = np.concatenate([rest, evidence.columns_of(one.form)])
                 yield frozenset({~i, one.form}), _Model(
                     gain, included, kinds | set(effect.kinds))
+
+
+def _meaning(effect: Effect) -> set[str]:
+    """Return the kinds of an effect, and of a more common one that does nearly the same."""
+    alike = effect.rarer_than or effect.name
+    return {*effect.kinds, *(kind.replace(effect.name, alike) for kind in effect.kinds)}
 
 
 def _lasts(effect: Effect) -> bool:

@@ -101,6 +101,21 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     assert 0 < model_uncertainty(evidence)[1] < 0.7 * more
 
 
+def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
+    """By chance e0 was 3.5 +- 1.7 mm in place of .05: so much glass would do nearly the same."""
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, frames=16)
+    shift, plate = CATALOGUE['viewpoint_shift'](), CATALOGUE['flat_port']()
+    near = replace(lens(), max_incidence=1.4)
+    terms = [(shift, np.array([3e-3])), (plate, np.array([4e-3]))]
+    data = prepare(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
+    begin = replace(start(data, near), terms=((shift, np.zeros(1)),))
+    others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
+    evidence = gather_evidence(data, fit(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
+    more = model_uncertainty(evidence)
+    assert more[1] > 0 and more[2] == 0.0
+
+
 def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_change():
     """Tilt named where there is decentering, which hardly differs: the centre is elsewhere."""
     rng = np.random.default_rng(31)
