@@ -108,8 +108,8 @@ def design(linear: Linearised, finest: bool = False, setting: Setting | None = N
     static = list(_grids(points, finest) if setting is None else
                   _all_grids(points, setting.finest))
     grids, fields = [grid for grid, _ in static], _board_fields(points)
-    weight = sparse.diags_array(points.weight.ravel())
-    parts = [_moving_both(weight @ bumps) for _, bumps in static]
+    weight = points.weight.reshape(-1, 1)
+    parts = [_moving_both(bumps.multiply(weight).tocsr()) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
     names = [grid.name for grid in grids] + [field.name for field in fields]
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
