@@ -22,7 +22,6 @@ NAMED = 0.002
 CLASS_SIGNIFICANCE = 0.002
 CLASS_STRENGTH = 0.3
 _ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
-_ABSURD = 30.0  # times what would be a large value of a parameter
 # Standard errors by which held-out frames must be predicted better to take an effect in, and to
 # keep it: beside what was found since it need not show so clearly.
 _HELD_OUT, _KEPT = 1.5, 1.0
@@ -88,6 +87,8 @@ def candidates(
         score = evidence.score(remaining, columns)
         if not score.rank or _impossible(effect, score) or effect.per_frame > per_frame:
             continue
+        if effect.absurd(score.estimate, evidence.linear.scene):
+            continue
         gain, count = score.statistic, score.rank
         if effect.per_frame:  # what it is in single frames is one variance, as in its twins
             gain, count = random_gain(evidence, included, columns), 1
@@ -103,14 +104,9 @@ def _corrected(evidence: Evidence, effect: Effect, score: Score) -> float:
 
 
 def _impossible(effect: Effect, score: Score) -> bool:
-    """Whether a size comes out negative where only a positive one has a meaning, or is absurd.
-
-    A scale that poses take up all but entirely would have to be a hundred per cent.
-    """
-    sizes = list(zip(score.estimate, effect.parameters, strict=True))
-    if any(value < 0 for value, parameter in sizes if parameter.positive):
-        return True
-    return all(abs(value) > _ABSURD * parameter.large for value, parameter in sizes)
+    """Whether a size comes out negative where only a positive one has a meaning."""
+    sizes = zip(score.estimate, effect.parameters, strict=True)
+    return any(value < 0 for value, parameter in sizes if parameter.positive)
 
 
 def eligible(evidence: Evidence, included: Index) -> Iterator[Candidate]:

@@ -165,6 +165,12 @@ class Evidence:
         """Return what is left of information once what is included, and no more, is swept out."""
         return swept(self.restored(information, included), included)
 
+    def ordinary(self, landmarks: Sequence[int]) -> Variances:
+        """Return the variances with the offsets of some landmarks drawn as those of most are."""
+        now = self.variances
+        own = np.isin(self.design.landmark, landmarks)
+        return replace(now, weight=np.where(own, 1.0, now.weight))
+
     def columns_of(self, form: int) -> Index:
         """Return the border's columns of a form."""
         return self.forms.at[form] + self.own

@@ -29,6 +29,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.scene.boards import spacing
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 
@@ -100,9 +101,8 @@ class Board:
         """The points (N, 3), m, moved outwards by their spacing: squares end beyond corners."""
         middle = self.points.mean(axis=0)
         local = (self.points - middle) @ self.facing.T
-        spacing = np.median(np.asarray(KDTree(self.points).query(self.points, 2)[0])[:, 1])
         half = np.abs(local[:, :2]).max(axis=0)
-        return np.asarray(middle + local * [*(1 + spacing / half), 1.0] @ self.facing)
+        return np.asarray(middle + local * [*(1 + spacing(self.points) / half), 1.0] @ self.facing)
 
     @property
     def corners(self) -> Index:

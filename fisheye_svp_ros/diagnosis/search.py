@@ -112,6 +112,8 @@ def search(
             effect, offset, step = found
             trace.append(step)
             state, changed = with_effect(state, effect, offset), True
+            # Their random offsets must not stand in for them.
+            before = evidence.ordinary(effect.landmarks)
         fitted: Fitted | None = None
         if not (changed or wanted.quick or (cleaned and finest)):
             fitted = fit_of(evidence)
@@ -285,7 +287,7 @@ def _estimated(
 
 def _landmarks(
     evidence: Evidence, state: State, wanted: Wanted
-) -> tuple[Effect, Array, TraceStep] | None:
+) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
     name = LandmarkSurveyEffect.name
     if name in wanted.left_out or any(effect.name == name for effect, _ in state.terms):
         return None

@@ -29,6 +29,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.scene.observations import Views
 
+_ABSURD = 30.0  # times what would be a large value of a parameter
 STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 
 
@@ -134,6 +135,14 @@ class Effect(ABC):
     def displacement(self, scene: Scene, values: Array) -> Array:
         """Displacement (S, N, D) at this effect's stage."""
         return np.asarray(self.columns(scene) @ values)
+
+    def absurd(self, values: Array, scene: Scene) -> bool:
+        """Whether there can be no such values (P,), whatever the data say.
+
+        A scale that poses take up all but entirely would have to be a hundred per cent.
+        """
+        sizes = zip(values, self.parameters, strict=True)
+        return all(abs(value) > _ABSURD * parameter.large for value, parameter in sizes)
 
     def curved(self, lens: Lens, values: Array) -> Lens:
         """Return the lens with what this effect adds to its curves; others leave them alone."""

@@ -10,6 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 from fisheye_svp_ros.optics.camera import project
+from fisheye_svp_ros.scene.boards import spacing
 
 _RIM = 12  # points on the rim of the dot whose image is taken as a polygon
 _EQUAL = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon the disc's moments
@@ -33,6 +34,14 @@ class DotCentroidEffect(Effect):
         return [cls()]
 
     parameters = (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
+
+    def absurd(self, values: Array, scene: Scene) -> bool:
+        """Whether the dots would reach the centres of their neighbours on every board."""
+        views = scene.views
+        places = [views.points[views.used & (views.board == board.id)]
+                  for board in scene.boards if board.flat]
+        apart = [spacing(np.unique(np.round(points, 9), axis=0)) for points in places]
+        return bool(values[0] > max(apart) ** 2)
 
     def columns(self, scene: Scene) -> Array:
         views = scene.views

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 
@@ -33,6 +34,11 @@ class Board(NamedTuple):
     def local(self, points: Array) -> Array:
         """Return points (..., 3) in the board's axes, over its size."""
         return np.asarray((points - self.centre) @ self.axes.T / self.size)
+
+
+def spacing(points: Array) -> float:
+    """Return the median distance of points (M, 3) to their nearest neighbours."""
+    return float(np.median(np.asarray(KDTree(points).query(points, 2)[0])[:, 1]))
 
 
 def find_boards(points: Array, board: Index) -> list[Board]:

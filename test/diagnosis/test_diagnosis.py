@@ -171,6 +171,22 @@ def test_swapped_ids_are_found_and_left_out():
     assert found.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
+@pytest.mark.parametrize('seed', [0, 1])
+def test_a_single_landmark_keeps_its_name_beside_landmarks_that_are_all_a_little_off(seed):
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng)
+    moves = 2e-4 * rng.normal(size=(60, 3))
+    moves[7] = [3e-3, -3e-3, 3e-3]
+    all_of_them = LandmarkSurveyEffect(tuple(range(60)))
+    table = observe(lens(), [(all_of_them, moves.ravel())], pose, views, SIGMA, rng)
+    found = diagnose(table, lens())
+    assert [cause.effect for cause in found.causes] == ['landmark_survey']
+    values = found.causes[0].parameters
+    assert list(values) == ['7.x', '7.y', '7.z']
+    for parameter, true in zip(values.values(), moves[7], strict=True):
+        assert abs(parameter['value'] - true) < 4 * parameter['stderr']
+
+
 def test_landmarks_far_from_their_place_are_no_gross_errors():
     rng = np.random.default_rng(20)
     pose, views = scene(rng)

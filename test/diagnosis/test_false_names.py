@@ -15,8 +15,10 @@ from fisheye_svp_ros.diagnosis.known_truth import known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.scene.observations import views_of
 
 SIGMA = 0.2
 
@@ -38,6 +40,28 @@ def test_landmarks_that_scatter_more_are_no_noise_that_grows_with_the_angle():
     found = diagnose(replace(clean, uv=clean.uv + rng.normal(size=clean.uv.shape) * sigma), lens())
     assert [cause.effect for cause in found.causes] == []
     assert 'scatter_vs_theta' in [s.variable for s in found.remaining]
+
+
+@pytest.mark.parametrize(('radius', 'size'), [(0.07, 2), (0.12, 4)])
+def test_large_dots_of_large_boards_are_no_boards_out_of_place(radius, size):
+    rng = np.random.default_rng(0)
+    pose, views = scene(rng)
+    pose = Pose(pose.rotation, size * pose.position)
+    views = views._replace(points=size * views.points)
+    dots = CATALOGUE['dot_centroid']()
+    table = observe(lens(), [(dots, np.array([radius**2]))], pose, views, SIGMA / 2, rng)
+    found = diagnose(table, lens())
+    assert [cause.effect for cause in found.causes] == ['dot_centroid']
+    area = found.causes[0].parameters['radius_squared']
+    assert abs(area['value'] - radius**2) < 3 * area['stderr']
+
+
+def test_no_dot_reaches_its_neighbours():
+    points = 0.02 * np.stack(np.meshgrid(np.arange(5), np.arange(4), [0]), -1).reshape(-1, 3)
+    seen = Scene(views_of(points, np.zeros((1, 20, 2))), lens(), identity(1), np.zeros(0))
+    dots = CATALOGUE['dot_centroid']()
+    assert not dots.absurd(np.array([0.019**2]), seen)
+    assert dots.absurd(np.array([0.021**2]), seen)
 
 
 @pytest.mark.parametrize('seed', [3, 8, 10])
