@@ -6,7 +6,8 @@ chosen for the intrinsics alone: where they expect the least error over the imag
 criterion of the Calibration Wizard (Peng and Sturm, ICCV 2019).  Counted is how many it takes for
 a standard error of e0, and to be 95 % sure that a shift of 2 mm is not a lens curve or a bent
 board.  Predicted errors are held against refits.  With --data the same is done by choosing among
-the frames that there are.  Writes docs/next/*.json.
+the frames that there are, and counted is, too, how many it takes for `diagnose` to name the shift.
+Writes docs/next/*.json.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.next_photographs import (
     Board,
@@ -35,6 +37,7 @@ from fisheye_svp_ros.diagnosis.next_photographs import (
 )
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import lens_columns, project_with_jacobian
@@ -42,12 +45,13 @@ from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 NOISE, SHIFT, MOST, RANDOM = 0.1, 0.002, 60, 10
+_ORDERS = 10  # random orders of real frames that are diagnosed
 SURE = 0.95
 EFFECT = ViewpointShiftEffect(1)
 
@@ -233,11 +237,31 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
         'named': {'chosen': fewest(design, name, lambda sure: sure >= SURE),
                   'intrinsics': sure(name, design, by_image),
                   'random': float(np.median([sure(name, design, o) for o in random]))},
+        'diagnosed': {
+            'chosen': diagnosed(table, lens, lambda n: design.choose(name, n)[0]),
+            'intrinsics': diagnosed(table, lens, lambda n: by_image[:n]),
+            'random': [diagnosed(table, lens, lambda n, o=o: o[:n]) for o in random[:_ORDERS]],
+        },
         'stderr_m': {str(n): {'chosen': design.choose(e0, n)[1][-1],
                               'intrinsics': error(by_image[:n]),
                               'random': float(np.median([error(o[:n]) for o in random]))}
                      for n in (3, 5, 10)},
     }
+
+
+def diagnosed(table: Observations, lens: Lens, chosen: Callable[[int], Index]) -> float:
+    """Return how many frames of a table it takes for `diagnose` to name the viewpoint shift."""
+    for count in range(1, len(table.frames) + 1):
+        some = table.take(np.isin(table.frame, table.frames[chosen(count)]))
+        try:
+            size = (lens.width, lens.height)
+            own = calibrate(some, 'kannala_brandt', size).adjusted.lens
+            causes = diagnose(some, own, free_intrinsics=True).causes
+        except FisheyeSvpError:
+            continue  # too few to tell anything
+        if any(cause.effect == EFFECT.name for cause in causes):
+            return float(count)
+    return np.inf
 
 
 class Taken(Design):
