@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import optimize, special
+from scipy import optimize, special, stats
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
@@ -19,6 +19,7 @@ from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEff
 # from landmark to landmark anyway.
 _MANY, _MANY_OF_BULK = 0.12, 3
 _OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
+_TAILS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom
 _LANDMARK = np.array([name.startswith('landmark') for name in NAMES])
 
 
@@ -28,25 +29,48 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, T
     None where there is none, or where so many do that they are no single ones.
     """
     statistic, rank, offset = landmark_tests(evidence)
-    count = len(statistic)
+    count, bulk = len(statistic), evidence.variances.alive[_LANDMARK].any()
     p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
-    corrected = np.where(rank > 0, p * 2 * count * evidence.forms.names(), 1.0)
-    found = np.flatnonzero(corrected < SIGNIFICANCE)
-    bulk = evidence.variances.alive[_LANDMARK].any()
+    tests = 2 * count * evidence.forms.names()
+    found = np.flatnonzero((rank > 0) & (p * tests < SIGNIFICANCE))
+    if bulk and found.size:
+        p = beside_bulk(statistic, rank, found)
+        found = found[p[found] * tests < SIGNIFICANCE]
     most = _MANY_OF_BULK if bulk else max(3, int(_MANY * count))
     if found.size > most:
         # A landmark that is far off makes others seem so.
         found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED]
     if not found.size or found.size > most:
         return None
-    found = found[np.argsort(corrected[found], kind='stable')]
+    found = found[np.argsort(p[found], kind='stable')]
     ids = evidence.design.landmark[found]
     effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
     step = TraceStep(
         effect.key, float(statistic[found].sum()), int(rank[found].sum()), float(p[found[0]]),
-        float(corrected[found[0]]), np.nan, np.nan, True, 'further off than the bulk of landmarks',
+        float(p[found[0]] * tests), np.nan, np.nan, True, 'further off than the bulk of landmarks',
     )
     return effect, offset[found].ravel(), step
+
+
+def beside_bulk(statistic: Array, rank: Array, found: Index) -> Array:
+    """Return p-values (L,) beside landmarks whose offsets have tails as long as the others' have.
+
+    An F distribution of the statistics, its median theirs, its denominator's degrees of freedom
+    the likeliest for those that do not stand out: one that is far off is no bulk, and of those
+    that scatter by very different amounts the largest is no single one.
+    """
+    others = np.setdiff1d(np.flatnonzero(rank > 0), found)
+    size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
+    best, likeliest = -np.inf, (1.0, _TAILS[-1])
+    for freedom in _TAILS:
+        scale = float(np.median(of / stats.f.median(size, freedom)))
+        density = np.asarray(stats.f.logpdf(of / scale, size, freedom))
+        likelihood = float(density.sum() - len(of) * np.log(scale))
+        if likelihood > best:
+            best, likeliest = likelihood, (max(scale, 1.0), freedom)
+    scale, freedom = likeliest
+    one = np.maximum(rank, 1)
+    return np.asarray(stats.f.sf(statistic / one / scale, one, freedom))
 
 
 def landmark_tests(evidence: Evidence) -> tuple[Array, Array, Array]:

@@ -48,7 +48,8 @@ def test_the_catalogue_is_hidden_whole():
     assert not set(OUTSIDE) & set(CATALOGUE)
 
 
-@pytest.mark.parametrize(('number', 'size'), [(82, 0.5), (112, 1.0)])
+@pytest.mark.parametrize(
+    ('number', 'size'), [(82, 0.5), (112, 1.0), (76, 1.0), (118, 0.5), (100, 1.0)])
 def test_landmarks_of_two_colours_have_no_name(number, size):
     """The lens magnifies one of them more; the landmarks of a cloud are seen unevenly."""
     outcome = run_trial(Task('outside', size, ('colour',), 71, number))

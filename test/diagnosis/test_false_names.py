@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
+from scipy import stats
 
 from fisheye_svp_ros.diagnosis import search
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
@@ -15,6 +16,7 @@ from fisheye_svp_ros.diagnosis.known_truth import known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.refit import refit
 from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.diagnosis.single_landmarks import beside_bulk
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
@@ -172,3 +174,14 @@ def test_what_was_taken_in_stays_for_as_long_as_it_gains_more_than_its_error(
     table = observe(lens(), terms, pose, views, SIGMA, rng)
     monkeypatch.setattr(search, 'held_out_gain', lambda *_: HeldOutGain(gain, 1.0))
     assert [cause.effect for cause in diagnose(table, lens()).causes] == named
+
+
+def test_the_largest_of_landmarks_with_long_tails_is_no_single_one():
+    rank, spots = np.full(60, 3), (np.arange(60) + 0.5) / 60
+    normal, long = stats.f.ppf(spots, 3, 1e6) * 3, stats.f.ppf(spots, 3, 5) * 3
+    assert normal.max() < long.max()
+    far = beside_bulk(np.append(normal[:-1], long.max()), rank, np.array([59]))[59]
+    assert far < 1e-4
+    assert beside_bulk(long, rank, np.array([59]))[59] > 1e-3
+    # One that is far beyond any tail is a single one beside either.
+    assert beside_bulk(np.append(long[:-1], 2000.0), rank, np.array([59]))[59] < 1e-5
