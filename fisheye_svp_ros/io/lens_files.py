@@ -17,6 +17,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
+from fisheye_svp_ros.io.share import without_camera
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
 from fisheye_svp_ros.optics.lens import INTRINSICS, PORT, Lens, check_lens, field_of_view
@@ -141,7 +142,7 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
 
 def _read(path: str | Path) -> tuple[str, str]:
     """Return the text of a file and the camera after its name, as in FILE#cam1."""
-    file, _, camera = str(path).rpartition('#') if '#' in str(path) else (str(path), '', '')
+    file, camera = without_camera(str(path))
     if Path(file).is_dir():
         lenses = _in_folder(Path(file))
         camera = camera or next(iter(lenses))

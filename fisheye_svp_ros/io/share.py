@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -42,12 +43,13 @@ def sweep_path(name: str) -> Path:
 def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Path:
     given, named = Path(name), config_path(f'{folder}/{name}.yaml')
     # FILE#cam1 names one of the lenses of a file, or of a folder.
-    if given.suffix in ('.yaml', '.yml') or _is_file(Path(name.partition('#')[0])):
+    holder = Path(without_camera(name)[0])
+    if given.suffix in ('.yaml', '.yml') or _is_there(holder, Path.is_file):
         return given
     # What has no slash may come over the network, and is a name in config/ then.
-    if '/' in name and Path(name.partition('#')[0]).is_dir():
+    if '/' in name and _is_there(holder, Path.is_dir):
         return given
-    if not _is_file(named):
+    if not _is_there(named, Path.is_file):
         if given.is_dir():
             raise error(f'{name!r} is a folder and not among the {folder} of this package; with a '
                         f'slash, {name}/, it is one of files')
@@ -56,8 +58,20 @@ def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Pat
     return named
 
 
-def _is_file(path: Path) -> bool:
+def without_camera(name: str) -> tuple[str, str]:
+    """Return the file or folder of FILE#cam1 and the camera, '' where there is none.
+
+    Folders and cameras may have a # in their names: the shortest part that is there counts.
+    """
+    for place in [*(i for i, letter in enumerate(name) if letter == '#'), len(name)]:
+        if _is_there(Path(name[:place]), Path.exists):
+            return name[:place], name[place + 1:]
+    file, _, camera = name.rpartition('#') if '#' in name else (name, '', '')
+    return file, camera
+
+
+def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
     try:
-        return path.is_file()
+        return test(path)
     except (OSError, ValueError):  # a name that no file can have
         return False

@@ -182,6 +182,19 @@ def test_lenses_of_one_file_go_by_name_or_by_order(tmp_path: Path) -> None:
     assert not load_lenses([f'{tmp_path}/two.yaml#cam1']).in_file
 
 
+@pytest.mark.parametrize('folder', ['rig', 'run#3/rig'])
+def test_lenses_of_a_folder_may_have_any_name(tmp_path: Path, folder: str) -> None:
+    (tmp_path / folder).mkdir(parents=True)
+    cameras = 'cam#0', 'links (Süd) #1'
+    for i, camera in enumerate(cameras):
+        save_lens(replace(LENS, fx=LENS.fx + i), tmp_path / folder / f'{camera}.yaml')
+    for given in (f'{tmp_path}/{folder}', f'{tmp_path}/{folder}/'):
+        lenses = lenses_of(cameras, load_lenses([given]))
+        assert [lens.fx - LENS.fx for lens in lenses.values()] == pytest.approx([0, 1])
+        one = load_lenses([f'{given}#links (Süd) #1'])['']
+        assert one.fx == pytest.approx(LENS.fx + 1)
+
+
 def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     where = poses(8, 3)
     image = project(LENS, where.into_body(PRINTED.corners))
