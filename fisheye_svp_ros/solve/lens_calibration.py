@@ -26,7 +26,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_adjustment import Adjusted, adjust, adjust_batch, parameter_values
-from fisheye_svp_ros.solve.lens_start import focal_candidates, thinned
+from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, thinned
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import posable_views, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
@@ -73,7 +73,8 @@ def calibrate(
     is fitted too, whatever it says.
     Raises LensError for an impossible model, image size or name; ObservationError for rows of
     several cameras or far outside the image; GeometryError where the views do not determine the
-    lens.
+    lens.  Where only a few views with points in another order stand in the way, it is fitted
+    without them.
     """
     start = replace(_start_lens(model, image_size, free or (), name), port=port)
     names = (*INTRINSICS, *start.image_height.coefficient_names) if free is None else tuple(free)
@@ -82,8 +83,15 @@ def calibrate(
     _check_inside(observations, image_size)
     views, left_out = posable_views(observations)
     _check_rows(observations.source, views, names)
-    adjusted = _from_nothing(start, views, names)
-    return _finished(observations, adjusted, views, left_out)
+    try:
+        return _finished(observations, _from_nothing(start, views, names), views, left_out)
+    except GeometryError:
+        lost = lost_views(start.svp(), thinned(views, len(views.frame)))
+        if not lost.any():
+            raise
+    views = views.take(np.flatnonzero(~lost))
+    _check_rows(observations.source, views, names)
+    return _finished(observations, _from_nothing(start, views, names), views, left_out)
 
 
 def calibrate_port(

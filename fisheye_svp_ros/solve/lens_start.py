@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, monotone_limit
 from fisheye_svp_ros.pose import Pose
@@ -18,6 +18,7 @@ from fisheye_svp_ros.solve.initial_pose import initial_poses
 _CORNER_ANGLES = np.geomspace(np.radians(4.0), np.radians(160.0), 24)
 _VIEWS, _POINTS = 20, 60  # enough for a start
 _GOLDEN = (np.sqrt(5) - 1) / 2
+_LOST, _FEW_LOST = 6.0, 0.2  # times the median view; of the views
 
 
 def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
@@ -26,6 +27,27 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     The image height is that of `lens` with the coefficients it has (kannala_brandt without any is
     equidistant), the centre is the lens's.  Candidates are ranked by what their poses leave over.
     """
+    focals, pose, rms = _scan(lens, views)
+    # A sum of root mean squares forgives one lost view.
+    best = np.argsort(rms.sum(axis=1))[:keep]
+    return focals[best], pose.take(best)
+
+
+def lost_views(lens: Lens, views: Views) -> Mask:
+    """Return which views (V,) are far worse than most at the focal length that suits most.
+
+    No pose goes with their points, as those are in another order, say.  None where a fifth or
+    more of the views are: then it is another lens that is wanted.
+    """
+    rms = _scan(lens, views)[2]
+    middle = np.median(rms, axis=1)
+    best = int(np.argmin(middle))
+    lost: Mask = rms[best] > _LOST * middle[best]
+    return lost if lost.mean() < _FEW_LOST else np.zeros_like(lost)
+
+
+def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
+    """Return focal lengths (C,), px, the poses (C, V) under each, and rms of each view, px."""
     corner = np.hypot(lens.width, lens.height) / 2
     heights, _ = lens.image_height.value_and_slope(
         np.minimum(_CORNER_ANGLES, monotone_limit(lens))
@@ -38,20 +60,17 @@ def focal_candidates(lens: Lens, views: Views, keep: int) -> tuple[Array, Pose]:
     points = np.broadcast_to(views.points, (*shape, 3)).reshape(-1, *views.points.shape[1:])
     weight = np.broadcast_to(views.weight, shape).reshape(-1, shape[-1])
     pose = initial_poses(points, direction.reshape(points.shape), weight).reshape(*shape[:2])
-    misfit = np.array([
-        _misfit(one, pose.take(i), views) for i, one in enumerate(lenses)
-    ])
-    best = np.argsort(misfit)[:keep]
-    return focals[best], pose.take(best)
+    rms = np.array([_view_rms(one, pose.take(i), views) for i, one in enumerate(lenses)])
+    return focals, pose, rms
 
 
-def thinned(views: Views) -> Views:
+def thinned(views: Views, most: int = _VIEWS) -> Views:
     """Return the views that spread widest in the image, with a few evenly spread points each."""
     used = views.used[..., None]
     count = used.sum(axis=(1, 2))
     centre = (views.uv * used).sum(axis=1, keepdims=True) / count[:, None, None]
     spread = ((views.uv - centre) ** 2 * used).sum(axis=(1, 2)) / count
-    widest = np.sort(np.argsort(-spread, kind='stable')[:_VIEWS])
+    widest = np.sort(np.argsort(-spread, kind='stable')[:most])
     chosen = views.take(widest)
     # Multiples of the golden ratio do not fall into step with the rows of a board.
     steps = np.arange(min(_POINTS, int(count.max()))) * _GOLDEN % 1
@@ -61,9 +80,9 @@ def thinned(views: Views) -> Views:
     return views_of(points, uv, np.take_along_axis(chosen.weight, slot, axis=1))
 
 
-def _misfit(lens: Lens, pose: Pose, views: Views) -> float:
-    """Sum over the views of the residuals' root mean square, px: one lost view is forgiven."""
+def _view_rms(lens: Lens, pose: Pose, views: Views) -> Array:
+    """Return the root mean square of the residuals of each view (V,), px."""
     image = project(lens, pose.into_body(views.points), limited=False)
     distance2 = np.where(views.used, ((image.uv - views.uv) ** 2).sum(axis=-1), 0.0)
     mean = distance2.sum(axis=1) / views.used.sum(axis=1)
-    return float(np.sqrt(np.where(np.isfinite(mean), mean, np.inf)).sum())
+    return np.sqrt(np.where(np.isfinite(mean), mean, np.inf))

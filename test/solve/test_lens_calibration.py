@@ -145,6 +145,33 @@ def test_covariances_hold():
     assert np.mean(pose_nees) == pytest.approx(6, abs=4 * np.sqrt(12 / SAMPLES))
 
 
+@pytest.mark.parametrize('order', ['scrambled', 'begun elsewhere'])
+def test_a_view_of_another_order_is_fitted_around(order):
+    true = make_lens('equidistant', 80.0)
+    table = make_table(true, plane, 8, 7)
+    rows = np.flatnonzero(table.frame == 3)
+    rng = np.random.default_rng(0)
+    other = rng.permutation(rows) if order == 'scrambled' else np.roll(rows, len(rows) // 2)
+    uv = table.uv.copy()
+    uv[rows] = uv[other]
+    found = calibrate(replace(table, uv=uv), 'kannala_brandt', (true.width, true.height))
+    assert [*found.views.frame] == [f for f in np.unique(table.frame) if f != 3]
+    assert not found.left_out
+    assert rms_px(found.adjusted.residual) < 0.2
+    assert found.adjusted.lens.fx == pytest.approx(true.fx, rel=0.01)
+
+
+def test_many_views_of_another_order_are_not_fitted_around():
+    true = make_lens('equidistant', 80.0)
+    table = make_table(true, plane, 8, 7)
+    uv, rng = table.uv.copy(), np.random.default_rng(0)
+    for frame in (1, 3, 5):
+        rows = np.flatnonzero(table.frame == frame)
+        uv[rows] = uv[rng.permutation(rows)]
+    with pytest.raises(GeometryError, match='belong together'):
+        calibrate(replace(table, uv=uv), 'kannala_brandt', (true.width, true.height))
+
+
 def test_estimated_and_given_sigma_agree():
     lens = make_lens('equidistant', 60)
     table = make_table(lens, plane, 8, 7, sigma=0.3)
