@@ -158,10 +158,11 @@ def _print(
 ) -> None:
     from fisheye_svp_ros.reporting import diagnosis_text as text
     from fisheye_svp_ros.reporting import external_text, shot_list
+    from fisheye_svp_ros.reporting.headline import headline
     from fisheye_svp_ros.reporting.tables import print_paragraphs, print_table
 
     external = external_text.sections(diagnosis)
-    print_paragraphs(text.VERDICTS[diagnosis.verdict], [
+    print_paragraphs(headline(diagnosis), [
         *text.verdict_sentences(diagnosis, known), *(one.sentence for one in external)
     ])
     print_table(

@@ -22,6 +22,7 @@ from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
+from fisheye_svp_ros.reporting.headline import headline
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
@@ -79,7 +80,7 @@ def write_report(
     report = inputs.folder / 'report.html'
     write_text(report, page(
         'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED,
-        headline=text.VERDICTS[diagnosis.verdict],
+        headline=headline(diagnosis),
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
                   **{p.stem: data_uri(p) for p in pictures}},

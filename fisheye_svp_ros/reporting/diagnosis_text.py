@@ -16,15 +16,10 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
 from fisheye_svp_ros.diagnosis.target_map import board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.reporting.headline import only_gross
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
 
 EXTENDED = 'extended_lens.yaml'
-VERDICTS = {
-    'adequate': 'Adequate: the simulation describes these data',
-    'explained': 'Explained: what is wrong has a name',
-    'partly_explained': 'Partly explained: something remains without a name',
-    'unexplained': 'Unexplained: something is wrong that no effect accounts for',
-}
 VARIABLES = {
     'image': 'the place in the image',
     'theta': 'the incidence angle',
@@ -284,6 +279,8 @@ def _next(d: Diagnosis) -> str:
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
         return '; '.join([elsewhere or 'Keep the lens as it is', *_loose(d)]) + f'{blind}.'
     steps = [*([elsewhere] if elsewhere else []), *_loose(d)]
+    if not d.causes and not steps and only_gross(d):
+        steps.append('keep the lens as it is')
     steps += [
         f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '

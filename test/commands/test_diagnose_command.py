@@ -43,6 +43,7 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     intrinsic_rows,
     verdict_sentences,
 )
+from fisheye_svp_ros.reporting.headline import VERDICTS, headline
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
@@ -361,6 +362,23 @@ class TestWords:
             extended=extended))
         assert '2 points lie far off, furthest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma says' in wrong
+
+    def test_points_that_are_set_aside_are_no_riddle(self, found):
+        gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
+        left = [Structure('outliers', 0.0, 0.5)]
+        clean = replace(found, verdict='unexplained', causes=[], advice=[], remaining=left,
+                        gross=gross)
+        assert headline(clean) == ('Unexplained: 2 points lie far off, and these data show '
+                                   'nothing else wrong')
+        *_, following = verdict_sentences(clean)
+        assert following.startswith('Keep the lens as it is; look for the reason of what remains')
+        partly = replace(found, verdict='partly_explained', remaining=left, gross=gross)
+        assert headline(partly) == (
+            'Partly explained: 2 points lie far off, all else that is wrong has a name')
+        more = [*left, Structure('range', 1e-9, 0.3)]
+        assert headline(replace(clean, remaining=more)) == VERDICTS['unexplained']
+        *_, following = verdict_sentences(replace(clean, remaining=more))
+        assert following.startswith('Look for the reason')
 
     def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
         cause = replace(found.causes[0], effect='rolling_shutter', to_separate='use a tripod')
