@@ -187,7 +187,7 @@ def test_boofcv() -> None:
      'it has none of'),
     ('<!DOCTYPE a [<!ENTITY b "c">]><opencv_storage></opencv_storage>',
      'document types are not read'),
-    ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper'),
+    ('%YAML:1.0\n---\na: ' + '[' * 100_000, 'nested deeper|nesting depth'),
     ('<opencv_storage><K>3</K><D>3</D><width>4</width><height>4.5</height></opencv_storage>',
      'a matrix of 3 x 3'),
     (CAMCHAIN.replace('[512, 512]', '[512, 512.5]', 1), 'whole numbers are needed'),
