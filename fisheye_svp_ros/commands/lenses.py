@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from pathlib import Path
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
-from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.io.share import is_there, lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
 
 
@@ -37,7 +38,8 @@ def load_lenses(given: Sequence[str]) -> Lenses:
     lenses = Lenses()
     for text in given:
         camera, equals, path = text.partition('=')
-        camera, path = (camera, path) if equals else ('', text)
+        if not equals or is_there(Path(without_camera(text)[0])):
+            camera, path = '', text
         if camera in lenses:
             raise LensError(f'--lens {text}: there is one {camera or "without a camera"} already')
         file = lens_path(path)

@@ -30,6 +30,8 @@ _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift'
            'target', 'calibration', 'uncertainty', 'provenance'}
 LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
+_EXTENDED = 'extended_lens'
+_DEPTH = 3  # folders, one in the other
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
@@ -155,9 +157,18 @@ def _read(path: str | Path) -> tuple[str, str]:
 
 def _in_folder(folder: Path) -> dict[str, Path]:
     """Return the lens files of a rig by camera; raise LensError where there is none."""
-    found = {file.stem: file for file in sorted(folder.glob('*.yaml')) if file.stem != 'rig'}
-    found = found or {file.parent.name: file
-                      for file in sorted(folder.glob('*/extended_lens.yaml'))}
+    found: dict[str, Path] = {}
+    # Names of cameras may have slashes, and then their files are further down.
+    for depth in range(_DEPTH):
+        above = '*/' * depth
+        found = found or {
+            str(file.relative_to(folder).with_suffix('')): file
+            for file in sorted(folder.glob(f'{above}*.yaml'))
+            if file.stem not in ('rig', _EXTENDED)
+        } or {
+            str(file.parent.relative_to(folder)): file
+            for file in sorted(folder.glob(f'{above}*/{_EXTENDED}.yaml'))
+        }
     if not found:
         raise LensError(f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '
                         'CAMERA/extended_lens.yaml')

@@ -44,12 +44,12 @@ def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Pat
     given, named = Path(name), config_path(f'{folder}/{name}.yaml')
     # FILE#cam1 names one of the lenses of a file, or of a folder.
     holder = Path(without_camera(name)[0])
-    if given.suffix in ('.yaml', '.yml') or _is_there(holder, Path.is_file):
+    if given.suffix in ('.yaml', '.yml') or is_there(holder, Path.is_file):
         return given
     # What has no slash may come over the network, and is a name in config/ then.
-    if '/' in name and _is_there(holder, Path.is_dir):
+    if '/' in name and is_there(holder, Path.is_dir):
         return given
-    if not _is_there(named, Path.is_file):
+    if not is_there(named, Path.is_file):
         if given.is_dir():
             raise error(f'{name!r} is a folder and not among the {folder} of this package; with a '
                         f'slash, {name}/, it is one of files')
@@ -64,13 +64,14 @@ def without_camera(name: str) -> tuple[str, str]:
     Folders and cameras may have a # in their names: the shortest part that is there counts.
     """
     for place in [*(i for i, letter in enumerate(name) if letter == '#'), len(name)]:
-        if _is_there(Path(name[:place]), Path.exists):
+        if is_there(Path(name[:place])):
             return name[:place], name[place + 1:]
     file, _, camera = name.rpartition('#') if '#' in name else (name, '', '')
     return file, camera
 
 
-def _is_there(path: Path, test: Callable[[Path], bool]) -> bool:
+def is_there(path: Path, test: Callable[[Path], bool] = Path.exists) -> bool:
+    """Say whether a path is that of a file or folder, or passes another `test`."""
     try:
         return test(path)
     except (OSError, ValueError):  # a name that no file can have

@@ -182,16 +182,22 @@ def test_lenses_of_one_file_go_by_name_or_by_order(tmp_path: Path) -> None:
     assert not load_lenses([f'{tmp_path}/two.yaml#cam1']).in_file
 
 
-@pytest.mark.parametrize('folder', ['rig', 'run#3/rig'])
-def test_lenses_of_a_folder_may_have_any_name(tmp_path: Path, folder: str) -> None:
-    (tmp_path / folder).mkdir(parents=True)
-    cameras = 'cam#0', 'links (Süd) #1'
+@pytest.mark.parametrize('file', ['{}.yaml', '{}/extended_lens.yaml'])
+@pytest.mark.parametrize(('folder', 'cameras'), [
+    ('rig', ('cam#0', 'links (Süd) #1')),
+    ('f=8,run#3/rig', ('cam#0', 'links (Süd) #1')),
+    ('rig', ('front/left', 'front/links (Süd) #1')),
+])
+def test_lenses_of_a_folder_may_have_any_name(
+    tmp_path: Path, folder: str, cameras: tuple[str, str], file: str
+) -> None:
     for i, camera in enumerate(cameras):
-        save_lens(replace(LENS, fx=LENS.fx + i), tmp_path / folder / f'{camera}.yaml')
+        save_lens(replace(LENS, fx=LENS.fx + i), tmp_path / folder / file.format(camera))
+    save_lens(LENS, tmp_path / folder / 'rig.yaml')
     for given in (f'{tmp_path}/{folder}', f'{tmp_path}/{folder}/'):
         lenses = lenses_of(cameras, load_lenses([given]))
         assert [lens.fx - LENS.fx for lens in lenses.values()] == pytest.approx([0, 1])
-        one = load_lenses([f'{given}#links (Süd) #1'])['']
+        one = load_lenses([f'{given}#{cameras[1]}'])['']
         assert one.fx == pytest.approx(LENS.fx + 1)
 
 
