@@ -57,8 +57,12 @@ def note_gross_errors(table: Observations, gross: Gross) -> None:
         worst = ', '.join(
             f'frame {table.frame[gross.rows[i]]} landmark {table.landmark[gross.rows[i]]} '
             f'({gross.px[i]:.1f} px)' for i in (-gross.px).argsort()[:3])
+        frames = table.frame[gross.rows]
+        whole = [frame for frame in dict.fromkeys(frames.tolist())
+                 if (frames == frame).sum() == (table.frame == frame).sum()]
+        views = f'; all points of {_frames(whole)}: in another order?' if whole else ''
         say(f'{len(gross.rows)} of {len(table)} points lie too far off and are left out, '
-            f'furthest {worst}')
+            f'furthest {worst}{views}')
 
 
 def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
