@@ -11,6 +11,7 @@ from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.reml import (
     GONE,
+    OF_LANDMARKS,
     Variances,
     estimate,
     nothing_random,
@@ -22,6 +23,8 @@ from fisheye_svp_ros.diagnosis.score_tests import score_components
 from fisheye_svp_ros.diagnosis.solution import Posterior, Solution, posterior, ratio_without, solve
 from fisheye_svp_ros.diagnosis.solution import without as solution_without
 
+_LANDMARKS, _OTHERS = (
+    tuple(np.array(NAMES)[kinds].tolist()) for kinds in (OF_LANDMARKS, ~OF_LANDMARKS))
 _Whole = tuple[Factored, Solution, Posterior]
 
 _CALLED, _CALLED_LATE = 0.3, 0.01
@@ -95,10 +98,14 @@ def significance(eq: Equations, now: Variances) -> dict[str, float]:
     """Return p-values of the components that are there, each by leaving it out.
 
     Restricted likelihood ratio on the boundary: half the tail of chi-square(1) (Self and Liang,
-    JASA 82 (1987)); the other variances follow.
+    JASA 82 (1987)); the other variances follow.  Offsets of landmarks are drawn as alike there:
+    a scale for each would fit chance with as many numbers as there are landmarks.
     """
-    whole = _whole(eq, now)
-    ratios = _followed(eq, now, whole, _ratios(now, whole, NAMES))
+    ratios: dict[str, float] = {}
+    for names, variances in ((_OTHERS, now), (_LANDMARKS, now.drawn_alike)):
+        if any(now.alive[NAMES.index(name)] for name in names):
+            whole = _whole(eq, variances)
+            ratios |= _followed(eq, variances, whole, _ratios(variances, whole, names))
     return {name: _chance(ratio) for name, ratio in ratios.items()}
 
 

@@ -20,6 +20,7 @@ from fisheye_svp_ros.diagnosis.mixed import Equations, Factored, factored
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.solution import Solution, posterior, solve
 
+OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
 FREEDOM = 3.0  # of the t distribution of landmarks' offsets
 GONE = 1e12  # lambda of a component that is not there
 _STEPS = 25
@@ -54,9 +55,10 @@ class Variances:
         return np.where(self.alive, self.sigma / np.sqrt(self.lam), 0.0)
 
     @property
-    def spread(self) -> float:
-        """Mean factor on the variance of landmarks' offsets: a few are far off."""
-        return float(np.mean(1 / self.weight)) if len(self.weight) else 1.0
+    def drawn_alike(self) -> Variances:
+        """The same without a scale for each landmark: offsets are as large in the mean."""
+        more = np.where(OF_LANDMARKS & self.alive, np.mean(1 / self.weight), 1.0)
+        return replace(self, lam=self.lam / more, weight=np.ones_like(self.weight))
 
 
 def nothing_random(landmarks: int) -> Variances:

@@ -10,8 +10,7 @@ from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE, TraceStep
 from fisheye_svp_ros.diagnosis.evidence import Evidence, identifiable
 from fisheye_svp_ros.diagnosis.gathered import MILLIMETRE
 from fisheye_svp_ros.diagnosis.mixed import Factored, factored, solve_lower
-from fisheye_svp_ros.diagnosis.random_effects import NAMES
-from fisheye_svp_ros.diagnosis.reml import GONE, landmark_labels, start_variances
+from fisheye_svp_ros.diagnosis.reml import GONE, OF_LANDMARKS, landmark_labels, start_variances
 from fisheye_svp_ros.diagnosis.solution import solve
 from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
 
@@ -20,7 +19,6 @@ from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEff
 _MANY, _MANY_OF_BULK = 0.12, 3
 _OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
 _TAILS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom
-_LANDMARK = np.array([name.startswith('landmark') for name in NAMES])
 
 
 def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
@@ -29,7 +27,7 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, T
     None where there is none, or where so many do that they are no single ones.
     """
     statistic, rank, offset = landmark_tests(evidence)
-    count, bulk = len(statistic), evidence.variances.alive[_LANDMARK].any()
+    count, bulk = len(statistic), evidence.variances.alive[OF_LANDMARKS].any()
     p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
     tests = 2 * count * evidence.forms.names()
     found = np.flatnonzero((rank > 0) & (p * tests < SIGNIFICANCE))
@@ -80,7 +78,7 @@ def landmark_tests(evidence: Evidence) -> tuple[Array, Array, Array]:
     """
     lam = evidence.variances.lam.copy()
     tiny = start_variances(evidence.full, 1e-7).lam
-    lam[_LANDMARK] = np.where(lam < GONE, lam, tiny)[_LANDMARK]
+    lam[OF_LANDMARKS] = np.where(lam < GONE, lam, tiny)[OF_LANDMARKS]
     own = np.arange(evidence.own)
     basis = identifiable(evidence.linear.frame_columns, evidence.border[..., :-1], own)
     eq = evidence.full.trimmed(lam < GONE).bordered(basis)

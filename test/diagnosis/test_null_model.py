@@ -412,3 +412,14 @@ def test_predicted_offsets_are_near_the_true_ones():
 
 def test_every_component_has_words():
     assert set(NAMES) <= set(COMPONENTS)
+
+
+@pytest.mark.parametrize('seed', [9, 28])
+def test_a_scale_for_each_landmark_does_not_make_more_of_chance(seed):
+    linear = linearised(seed)
+    evidence = gather_evidence(linear.data, linear.state, ())
+    fitted, eq = evidence.variances, evidence.beside(np.arange(evidence.own))
+    assert fitted.weight.min() < 0.8
+    p = significance(eq, fitted)['landmark_in_plane']
+    assert p > 0.1
+    assert significance(eq, fitted.drawn_alike)['landmark_in_plane'] == pytest.approx(p, rel=1e-6)
