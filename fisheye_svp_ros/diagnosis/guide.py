@@ -39,7 +39,7 @@ _STILL, _STANDS = 0.003, 0.5  # of the image's width, and s
 _KEPT = 200  # images
 _PATIENCE = 20.0  # s; then a view is one that cannot be had
 _LIVE = 0.1  # px, noise where the detector does not say
-_HOPE = 0.3  # that a few more photographs tell two causes apart, below which none will
+HOPE = 0.3  # that a few more photographs tell two causes apart, below which none will
 _HOPING = _JUDGED + _AHEAD  # photographs; what they have not told apart, more will not
 _EFFECT = ViewpointShiftEffect(1)
 
@@ -129,7 +129,7 @@ def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
         if len(names) == 1 or _EFFECT.name not in names:
             continue
         wanted = next_photographs(found.after, (cause,), found.noise_px, _AHEAD, room=room)
-        if wanted.answers[-1] > _HOPE and len(session.taken) < _HOPING:
+        if wanted.answers[-1] > HOPE and len(session.taken) < _HOPING:
             return _stand(session, _model(found.after), wanted, named=(cause.effect,),
                           alike=names[1:])
         # No photograph will tell: what is it, if it is what is asked for?

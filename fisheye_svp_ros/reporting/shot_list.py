@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from fisheye_svp_ros.diagnosis.guide import HOPE
 from fisheye_svp_ros.diagnosis.next_photographs import Shots
 from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -56,8 +57,11 @@ def then(wanted: Next, taken: int) -> str:
 def purpose(wanted: Next) -> str:
     """Return what the photographs are for, and where matters stand."""
     if wanted.others:
+        known = '' if wanted.answers[-1] > HOPE else (
+            '; photographs hardly tell: what you know is not there can be left out, '
+            + ' '.join(f'--without {name}' for name in wanted.others))
         return (f'to tell {wanted.asked} from {" and ".join(wanted.others)}; now '
-                f'{then(wanted, 0)}')
+                f'{then(wanted, 0)}{known}')
     what = 'the whole lens' if wanted.asked == 'lens' else wanted.asked
     if wanted.unit:
         return f'for {what}; now {then(wanted, 0)}'

@@ -29,7 +29,7 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.pose import rotation_from_vector
-from fisheye_svp_ros.reporting.shot_list import instruction, rows
+from fisheye_svp_ros.reporting.shot_list import instruction, purpose, rows
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.simulation import simulate
@@ -148,6 +148,9 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
     doubt = next_photographs(linear, [cause(['radial_profile'])], NOISE, 2, room=ROOM)
     assert (doubt.asked, doubt.others) == ('viewpoint_shift', ('radial_profile',))
     assert [len(row) for row in rows(doubt)] == [6, 6] and 'sure' in rows(doubt)[-1][-1]
+    assert '--without' not in purpose(doubt._replace(answers=(0.1, 0.5, 0.9)))
+    hardly = doubt._replace(answers=(0.02, 0.03, 0.04), others=('flat_port',))
+    assert purpose(hardly).endswith('can be left out, --without flat_port')
     sized = next_photographs(linear, [cause([])], NOISE, 2, room=ROOM)
     assert (sized.asked, sized.unit) == ('viewpoint_shift', 'm')
     assert 'mm' in rows(sized)[0][-1]
