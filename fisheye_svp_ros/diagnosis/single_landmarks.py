@@ -18,7 +18,8 @@ from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEff
 # from landmark to landmark anyway.
 _MANY, _MANY_OF_BULK = 0.12, 3
 _OUTWEIGHED = 10.0  # times smaller a statistic may be the doing of the largest
-_TAILS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom
+_TAILS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom, the last: normal
+_LONGER = 2.0  # what longer tails add to the log likelihood if they are no chance
 
 
 def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
@@ -59,14 +60,13 @@ def beside_bulk(statistic: Array, rank: Array, found: Index) -> Array:
     """
     others = np.setdiff1d(np.flatnonzero(rank > 0), found)
     size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
-    best, likeliest = -np.inf, (1.0, _TAILS[-1])
+    fits = []
     for freedom in _TAILS:
-        scale = float(np.median(of / stats.f.median(size, freedom)))
+        scale = max(float(np.median(of / stats.f.median(size, freedom))), 1.0)
         density = np.asarray(stats.f.logpdf(of / scale, size, freedom))
-        likelihood = float(density.sum() - len(of) * np.log(scale))
-        if likelihood > best:
-            best, likeliest = likelihood, (max(scale, 1.0), freedom)
-    scale, freedom = likeliest
+        fits.append((float(density.sum() - len(of) * np.log(scale)), scale, freedom))
+    normal, best = fits[-1], max(fits)
+    _, scale, freedom = best if best[0] > normal[0] + _LONGER else normal
     one = np.maximum(rank, 1)
     return np.asarray(stats.f.sf(statistic / one / scale, one, freedom))
 

@@ -185,3 +185,11 @@ def test_the_largest_of_landmarks_with_long_tails_is_no_single_one():
     assert beside_bulk(long, rank, np.array([59]))[59] > 1e-3
     # One that is far beyond any tail is a single one beside either.
     assert beside_bulk(np.append(long[:-1], 2000.0), rank, np.array([59]))[59] < 1e-5
+
+
+@pytest.mark.parametrize('size', [0.7, 1.0, 30.0])
+def test_no_tails_are_read_into_landmarks_that_are_off_by_noise_or_alike(size):
+    rank, far = np.full(60, 3), 45.0 * max(size, 1.0)
+    ordinary = size * stats.chi2.ppf((np.arange(60) + 0.5) / 60, 3)
+    p = beside_bulk(np.append(ordinary[:-1], far), rank, np.array([59]))
+    assert p[59] == pytest.approx(stats.chi2.sf(45.0, 3), rel=1.0)
