@@ -56,9 +56,12 @@ def beside_bulk(statistic: Array, rank: Array, found: Index) -> Array:
 
     An F distribution of the statistics, its median theirs, its denominator's degrees of freedom
     the likeliest for those that do not stand out: one that is far off is no bulk, and of those
-    that scatter by very different amounts the largest is no single one.
+    that scatter by very different amounts the largest is no single one.  One far beyond them all
+    is in no tail of theirs, and makes others seem off.
     """
-    others = np.setdiff1d(np.flatnonzero(rank > 0), found)
+    one, others = np.maximum(rank, 1), np.setdiff1d(np.flatnonzero(rank > 0), found)
+    if not others.size:
+        return np.asarray(stats.chi2.sf(statistic, one))
     size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
     fits = []
     for freedom in _TAILS:
@@ -67,8 +70,9 @@ def beside_bulk(statistic: Array, rank: Array, found: Index) -> Array:
         fits.append((float(density.sum() - len(of) * np.log(scale)), scale, freedom))
     normal, best = fits[-1], max(fits)
     _, scale, freedom = best if best[0] > normal[0] + _LONGER else normal
-    one = np.maximum(rank, 1)
-    return np.asarray(stats.f.sf(statistic / one / scale, one, freedom))
+    beyond = statistic > _OUTWEIGHED * statistic[others].max()
+    freedom_of_each = np.where(beyond, normal[2], freedom)
+    return np.asarray(stats.f.sf(statistic / one / scale, one, freedom_of_each))
 
 
 def landmark_tests(evidence: Evidence) -> tuple[Array, Array, Array]:

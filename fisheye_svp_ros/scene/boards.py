@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 
@@ -38,6 +37,7 @@ class Board(NamedTuple):
 
 def spacing(points: Array) -> float:
     """Return the median distance of points (M, 3) to their nearest neighbours."""
+    from scipy.spatial import KDTree  # not loaded for the help of a command
     return float(np.median(np.asarray(KDTree(points).query(points, 2)[0])[:, 1]))
 
 

@@ -193,3 +193,14 @@ def test_no_tails_are_read_into_landmarks_that_are_off_by_noise_or_alike(size):
     ordinary = size * stats.chi2.ppf((np.arange(60) + 0.5) / 60, 3)
     p = beside_bulk(np.append(ordinary[:-1], far), rank, np.array([59]))
     assert p[59] == pytest.approx(stats.chi2.sf(45.0, 3), rel=1.0)
+
+
+def test_landmarks_far_beyond_all_others_belong_to_no_tail():
+    """They make others seem off, and so their tails long."""
+    rank = np.full(60, 3)
+    long = stats.f.ppf((np.arange(60) + 0.5) / 60, 3, 5) * 3
+    both = np.append(long[:-2], [20.0 * long.max(), 2.0 * long.max()])
+    p = beside_bulk(both, rank, np.array([58, 59]))
+    assert p[58] < 1e-100 < 1e-6 < p[59]
+    everything = beside_bulk(np.full(60, 30.0), rank, np.arange(60))
+    assert everything == pytest.approx(stats.chi2.sf(30.0, 3))
