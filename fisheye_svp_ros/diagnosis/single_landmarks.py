@@ -31,15 +31,17 @@ def single_landmarks(evidence: Evidence) -> tuple[LandmarkSurveyEffect, Array, T
     count, bulk = len(statistic), evidence.variances.alive[OF_LANDMARKS].any()
     p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
     tests = 2 * count * evidence.forms.names()
-    found = np.flatnonzero((rank > 0) & (p * tests < SIGNIFICANCE))
-    if bulk and found.size:
-        p = beside_bulk(statistic, rank, found)
-        found = found[p[found] * tests < SIGNIFICANCE]
+    standing_out = found = np.flatnonzero((rank > 0) & (p * tests < SIGNIFICANCE))
     most = _MANY_OF_BULK if bulk else max(3, int(_MANY * count))
     if found.size > most:
         # A landmark that is far off makes others seem so.
         found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED]
-    if not found.size or found.size > most:
+    if found.size > most:
+        return None
+    if bulk and found.size:
+        p = beside_bulk(statistic, rank, standing_out)
+        found = found[p[found] * tests < SIGNIFICANCE]
+    if not found.size:
         return None
     found = found[np.argsort(p[found], kind='stable')]
     ids = evidence.design.landmark[found]
