@@ -30,7 +30,6 @@ _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift'
            'target', 'calibration', 'uncertainty', 'provenance'}
 LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
-_EXTENDED = 'extended_lens'
 _DEPTH = 3  # folders, one in the other
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
@@ -163,11 +162,10 @@ def _in_folder(folder: Path) -> dict[str, Path]:
         above = '*/' * depth
         found = found or {
             str(file.relative_to(folder).with_suffix('')): file
-            for file in sorted(folder.glob(f'{above}*.yaml'))
-            if file.stem not in ('rig', _EXTENDED)
+            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem != 'rig'
         } or {
             str(file.parent.relative_to(folder)): file
-            for file in sorted(folder.glob(f'{above}*/{_EXTENDED}.yaml'))
+            for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))
         }
     if not found:
         raise LensError(f'{folder}: a folder without lenses; those of a rig are CAMERA.yaml or '

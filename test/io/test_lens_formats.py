@@ -273,6 +273,12 @@ def test_the_folder_of_a_rig_is_its_lenses(
         load_lens(lens_path(str(tmp_path / 'empty')))
 
 
+def test_the_folder_of_one_camera_is_its_lens(tmp_path: Path) -> None:
+    """As `diagnose` writes it."""
+    save_lens(LENS, tmp_path / 'diagnosis' / 'extended_lens.yaml')
+    assert load_lens(lens_path(f'{tmp_path}/diagnosis/')).name == LENS.name
+
+
 ECHO = """\
 header:
   stamp: {sec: 1, nanosec: 2}
