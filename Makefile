@@ -1,5 +1,10 @@
 # Two commands: `make demo` and `make test`.  Both install what they need into .venv.
-PYTHON ?= python3
+# The first Python that is supported; any other with `make PYTHON=...`.
+PYTHON := $(firstword $(foreach python,python3 python3.14 python3.13 python3.12 python3.11,\
+	$(shell $(python) -c 'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(python)")' 2>&-)) python3)
+COMMA := ,
+# ROS 2 out of pip, but not beside one that is sourced.
+ROS := $(if $(shell $(PYTHON) -c 'import rclpy.node; print("sourced")' 2>&-),,$(COMMA)ros)
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
@@ -60,7 +65,7 @@ bench: .venv-bench/ready
 	@echo "Installing what is compared into .venv-bench: some minutes, this once"
 	$(PYTHON) -m venv .venv-bench
 	.venv-bench/bin/pip install --quiet --upgrade pip
-	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[standalone]' -r benchmark/requirements.txt
+	$(QUIETLY) .venv-bench/bin/pip install --quiet -e '.[fast$(ROS)]' -r benchmark/requirements.txt
 	test -d .venv-bench/mrcal || git clone --quiet --depth 1 https://github.com/dkogan/mrcal \
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
@@ -107,14 +112,14 @@ mutation: $(VENV)/ready
 test-oldest:
 	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
-	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[standalone,fast,parquet,test]' -c test/oldest.txt
+	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[fast,parquet,test$(ROS)]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
 
 $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(QUIETLY) $(BIN)/pip install --quiet -e '.[standalone,fast,parquet,dask,test,lint]'
+	$(QUIETLY) $(BIN)/pip install --quiet -e '.[fast,parquet,dask,test,lint$(ROS)]'
 	touch $@
 
 clean:

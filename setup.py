@@ -16,6 +16,8 @@ nodes = (
     'model_critic',
 )
 
+wheels = "sys_platform == 'linux' and platform_machine == 'x86_64' and python_version < '3.15'"
+
 
 def tree(folder):
     """Return data_files entries that keep a folder's layout below share/."""
@@ -51,7 +53,11 @@ setup(
         'mcap>=1.1',
     ],
     extras_require={
-        'standalone': ['cyclonedds>=11.0.1'],
+        # Genuine ROS 2 Jazzy, where there are wheels of it; elsewhere an installation is sourced.
+        'ros': [f'{package}; {wheels}' for package in (
+            'ros-jazzy-rclpy[fastrtps]>=7.1.6,<7.2', 'ros-jazzy-common-interfaces>=5.3.6,<5.4',
+            'ros-jazzy-std-srvs>=5.3.6,<5.4',
+        )],
         'fast': ['numba>=0.59'],
         'parquet': ['pyarrow>=15'],
         'dask': ['distributed>=2023.7'],

@@ -18,24 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
 
-from fisheye_svp_ros import standalone
-
-standalone.install()
-
-import rclpy  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
-from sensor_msgs.msg import Image  # noqa: E402
-
-from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
-from fisheye_svp_ros.io.lens_files import save_lens  # noqa: E402
-from fisheye_svp_ros.nodes.messages import image_message  # noqa: E402
-from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt  # noqa: E402
-from fisheye_svp_ros.optics.lens import Lens  # noqa: E402
-from fisheye_svp_ros.pose import Pose  # noqa: E402
-from fisheye_svp_ros.simulate.render import Exposure, Print, render  # noqa: E402
-from fisheye_svp_ros.simulate.targets import board_views  # noqa: E402
+from fisheye_svp_ros.io.decoding import stamp_of
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.nodes.messages import image_message
+from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.simulate.render import Exposure, Print, render
+from fisheye_svp_ros.simulate.targets import board_views
 
 LENS = Lens('wide', 848, 800, 285.2, 284.9, 424.3, 398.7,
             KannalaBrandt(-0.011, 0.0041, -0.0012, 0.0001), np.radians(95.0), Gennery(e0=0.003))

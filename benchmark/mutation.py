@@ -47,7 +47,7 @@ FORK = get_context('fork')
 # What the tests import of others, loaded once for all mutants.
 PRELOADED = ('pytest', 'hypothesis', 'numpy', 'scipy.optimize', 'scipy.stats', 'scipy.spatial',
              'scipy.sparse.linalg', 'numba', 'cv2', 'matplotlib.pyplot', 'rosbags.highlevel',
-             'yaml', 'pyarrow.parquet', 'cyclonedds.domain', 'rich.console', 'jinja2')
+             'yaml', 'pyarrow.parquet', 'rclpy.node', 'rich.console', 'jinja2')
 BY_HAND = '\n<!-- what the survivors are: by hand -->\n'  # kept from here on
 KINDS = {
     'NumberReplacer': 'a number one off',

@@ -1,8 +1,8 @@
 """What becomes of sets that come faster than they are solved: python -m benchmark.overload.
 
 A localizer, a process of its own, is told so many sets of 33 points a second; its /diagnostics
-says what became of each, and its results are counted where they come to.  Runs with ROS 2 and
-without it.  Leave the machine alone meanwhile.
+says what became of each, and its results are counted where they come to.
+Leave the machine alone meanwhile.
 """
 
 from __future__ import annotations
@@ -14,19 +14,15 @@ import sys
 import time
 from collections.abc import Callable
 
-from fisheye_svp_ros import standalone
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
 
-standalone.install()
-
-import rclpy  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import PointCloud2  # noqa: E402
-
-from fisheye_svp_ros.io.decoding import read_key_values, stamp_of  # noqa: E402
-from fisheye_svp_ros.io.landmark_files import environment  # noqa: E402
-from fisheye_svp_ros.nodes import messages  # noqa: E402
-from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario  # noqa: E402
+from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 RATES = (10, 30, 100, 300, 1000)
 FATES = ('solved', 'not solved', 'dropped', 'incomplete', 'waiting')

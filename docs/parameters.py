@@ -16,7 +16,6 @@ import yaml
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
-from fisheye_svp_ros import standalone  # noqa: E402
 from fisheye_svp_ros.io.parameters import Row  # noqa: E402
 from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 
@@ -48,7 +47,6 @@ def parameter_file(node: str, table: list[Row]) -> str:
 
 def documents() -> dict[Path, str]:
     """Return what the files should hold."""
-    standalone.install()
     page = ROOT / 'docs' / 'nodes.md'
     text, wanted = page.read_text(encoding='utf-8'), {}
     for node in NODES:

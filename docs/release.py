@@ -26,7 +26,7 @@ KEYS = {
     'lz4': '', 'zstandard': '',
 }
 # Extras, which the package does without where they are not installed; and what else is no package
-OPTIONAL = {'apriltag_msgs', 'cyclonedds', 'distributed', 'numba', 'pyarrow'}
+OPTIONAL = {'apriltag_msgs', 'distributed', 'numba', 'pyarrow'}
 
 
 def findings() -> list[str]:
@@ -81,8 +81,6 @@ def imported() -> set[str]:
     """Return the modules that the package and its launch files import, but for Python's own."""
     found = set()
     for path in [*(ROOT / PACKAGE).rglob('*.py'), *(ROOT / 'launch').glob('*.py')]:
-        if 'standalone' in path.relative_to(ROOT).parts:
-            continue  # not on the path where ROS 2 is
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 found |= {name.name.partition('.')[0] for name in node.names}

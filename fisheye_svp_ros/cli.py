@@ -32,7 +32,7 @@ COMMANDS = {
     'plot': 'pictures of a recording, a table or a sweep',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'render': 'photographs of a chessboard through a lens, and the truth about them',
-    'run': 'one node: on ROS 2 where it is installed, otherwise on the standalone client',
+    'run': 'one node, as `ros2 run` starts it',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
     'table': 'a recording to a table, one row an input stamp',
     'watch': 'the results of running nodes, live, in the terminal',

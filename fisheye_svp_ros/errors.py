@@ -44,5 +44,5 @@ class SweepError(FisheyeSvpError):
     """A sweep cannot go on, for want of somebody who works on it."""
 
 
-class StandaloneError(FisheyeSvpError):
-    """Something was asked of the standalone client that it does not cover."""
+class GraphError(FisheyeSvpError):
+    """A graph of nodes cannot be: ROS 2 or a part of it is missing, or a process has failed."""

@@ -18,11 +18,9 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 # Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
-from helpers.nodes import GENUINE, ROOT, Caller, GenuineCaller, NodeProcess  # noqa: E402
+from helpers.nodes import Caller, NodeProcess  # noqa: E402
 
 from fisheye_svp_ros.optics import engines  # noqa: E402
-
-_INSTALL = 'from fisheye_svp_ros import standalone; standalone.install()\n'
 
 
 def _is_free(domain: int) -> bool:
@@ -97,38 +95,8 @@ def start_process(
 
 
 @pytest.fixture
-def run_node(
-    ros_domain: int, start_process: Callable[..., NodeProcess]
-) -> Callable[..., NodeProcess]:
-    """Return a function that runs Python code or a script as a standalone node."""
-    def run(source: str | Path, *args: str, genuine: bool = False) -> NodeProcess:
-        env = os.environ | {'PYTHONUNBUFFERED': '1', 'ROS_DOMAIN_ID': str(ros_domain)}
-        # Without the path of an installed ROS 2, the standalone client takes its place.
-        env['PYTHONPATH'] = os.pathsep.join(
-            [str(ROOT), *(env.get('PYTHONPATH', '').split(os.pathsep) if genuine else [])])
-        code = source
-        if isinstance(source, Path):
-            code = f'import runpy; runpy.run_path({str(source)!r}, run_name="__main__")'
-        text = code if genuine else _INSTALL + str(code)
-        return start_process([sys.executable, '-c', str(text), *args], env)
-
-    return run
-
-
-@pytest.fixture
 def caller(ros_domain: int) -> Iterator[Caller]:
-    """Return a service client on the domain of the test, for nodes of the standalone client."""
-    pytest.importorskip('cyclonedds')
-    yield Caller(ros_domain)
-
-
-@pytest.fixture
-def node_caller(ros_domain: int) -> Iterator[Caller | GenuineCaller]:
-    """Return a service client for nodes that run on ROS 2 where it is installed."""
-    if not GENUINE:
-        pytest.importorskip('cyclonedds')
-        yield Caller(ros_domain)
-        return
-    caller = GenuineCaller(ros_domain)
-    yield caller
-    caller.close()
+    """Return a service client on the domain of the test."""
+    one = Caller(ros_domain)
+    yield one
+    one.close()

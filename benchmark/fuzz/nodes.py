@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 
 from benchmark.fuzz.mutations import WORDS, mutated, nasty
 from benchmark.fuzz.surfaces import Surface, Trial
+from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.parameters import rows
@@ -94,10 +94,10 @@ class _Node:
 
 def seeds() -> dict[str, list[bytes]]:
     """Return valid messages by type name, CDR."""
+    from rclpy.serialization import serialize_message
     from sensor_msgs.msg import CompressedImage, Image
 
     from fisheye_svp_ros.nodes import messages
-    from fisheye_svp_ros.standalone.messages import serialize
 
     found = simulate_scenario(Scenario(shift_scale=0.0))
     seen, world = found.observations, environment('whole', 2.0)
@@ -117,7 +117,7 @@ def seeds() -> dict[str, list[bytes]]:
         'CompressedImage': [CompressedImage(header=messages.header(7), format='png', data=data)
                             for data in files],
     }
-    return {kind: [serialize(one) for one in several] for kind, several in made.items()}
+    return {kind: [serialize_message(one) for one in several] for kind, several in made.items()}
 
 
 def spoilt(data: bytes, rng: Random) -> bytes:
@@ -136,20 +136,18 @@ def spoilt(data: bytes, rng: Random) -> bytes:
 
 def tags(rng: Random) -> bytes:
     """Return a scenario with two odd values, CDR."""
+    from rclpy.serialization import serialize_message
+
     from fisheye_svp_ros.nodes import messages
-    from fisheye_svp_ros.standalone.messages import serialize
 
     values = {'lens': 'fish214', 'shift_scale': 0.5}
     names = (*values, 'radius', 'scenario', 'scenarios', 'set', 'sets', 'x')
     values |= {rng.choice(names): str(rng.choice((*WORDS, nasty(rng, float)))).replace('\0', '')
                for _ in range(2)}
-    return serialize(messages.key_values_message('s', values, rng.randrange(5)))
+    return serialize_message(messages.key_values_message('s', values, rng.randrange(5)))
 
 
 def _callbacks(name: str, folder: Path) -> Trial:
-    from fisheye_svp_ros import standalone
-
-    standalone.install()
     one, valid = _Node(name, folder), seeds()
     good = _Good(one) if name == 'localizer' else None
     table = {row.name: row for row in rows(type(one.node).SETTINGS) if not row.fixed}
@@ -200,15 +198,16 @@ class _Good:
 
     def wrong(self) -> str:
         """Say what is wrong with the answer."""
+        from rclpy.serialization import serialize_message
+
         from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
         from fisheye_svp_ros.nodes import messages
-        from fisheye_svp_ros.standalone.messages import serialize
 
         self._stamp += 1
         seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
-        self._one.hear('landmarks', serialize(
+        self._one.hear('landmarks', serialize_message(
             messages.landmarks_message(environment('whole', 2.0), 0, 'world')))
-        self._one.hear('image_points', serialize(
+        self._one.hear('image_points', serialize_message(
             messages.image_points_message(seen.landmark, seen.uv, self._stamp, 'camera')))
         result = self._one.told['~/result']
         for _ in range(200):
@@ -220,10 +219,8 @@ class _Good:
 
 
 def node_surfaces() -> list[Surface]:
-    """Return the surfaces of the nodes' callbacks, where the standalone client can be had."""
-    from fisheye_svp_ros import standalone
-
-    if standalone.is_genuine() or find_spec('cyclonedds') is None:
+    """Return the surfaces of the nodes' callbacks, where there is an rclpy."""
+    if missing_rclpy():
         return []
 
     def maker(name: str) -> Callable[[Path], Trial]:

@@ -169,9 +169,6 @@ def _quietly(read: Read) -> Callable[[Path], str]:
 
 def _recording(folder: Path) -> bytes:
     """Return a small recording, MCAP, of the nodes' topics."""
-    from fisheye_svp_ros import standalone
-
-    standalone.install()
     from rclpy.serialization import serialize_message
 
     from fisheye_svp_ros.nodes import messages

@@ -16,14 +16,9 @@ from pathlib import Path
 
 os.environ.setdefault('ROS_DOMAIN_ID', '77')
 
-from fisheye_svp_ros import standalone
-
-standalone.install()
-
-from benchmark.soak import answers  # noqa: E402
-from benchmark.soak.victims import KINDS, Victim, Watch  # noqa: E402
-from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
-from fisheye_svp_ros.standalone import dds  # noqa: E402
+from benchmark.soak import answers
+from benchmark.soak.victims import KINDS, Victim, Watch, Wire
+from fisheye_svp_ros.reporting.progress import progress
 
 _AHEAD = 1000  # messages that a node has not counted, and sets that wait, in the first round
 _CHUNK = 100
@@ -34,11 +29,11 @@ _BEGIN, _END = '<!-- soak -->', '<!-- end of soak -->'
 
 
 def round_of(
-    names: list[str], total: int, exactly: bool, folder: Path, participant: dds.Participant
+    names: list[str], total: int, exactly: bool, folder: Path, wire: Wire
 ) -> tuple[list[str], list[str], int]:
     """Attack nodes with `total` messages; return rows, faults, the number of messages sent."""
-    watch = Watch(participant)
-    victims = {name: Victim(name, participant, folder, exactly) for name in names}
+    watch = Watch(wire)
+    victims = {name: Victim(name, wire, folder, exactly) for name in names}
     try:
         return _attacked(victims, watch, total, exactly)
     finally:
@@ -163,10 +158,10 @@ def main() -> int:
     parser.add_argument('--no-docs', action='store_true', help='leave docs/reliability.md alone')
     asked = parser.parse_args()
     flood = round(asked.flood * asked.messages)
-    participant = dds.Participant(int(os.environ['ROS_DOMAIN_ID']))
+    wire = Wire()
     with tempfile.TemporaryDirectory() as place:
-        first = round_of(asked.nodes, asked.messages - flood, True, Path(place), participant)
-        second = round_of(asked.nodes, flood, False, Path(place), participant)
+        first = round_of(asked.nodes, asked.messages - flood, True, Path(place), wire)
+        second = round_of(asked.nodes, flood, False, Path(place), wire)
     how = ' '.join(['python -m benchmark.soak', *sys.argv[1:]])
     text = section([first[0], second[0]], first[2] + second[2], how)
     print(text)

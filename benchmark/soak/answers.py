@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import PointCloud2
 
 from benchmark.soak import hostile
-from benchmark.soak.hostile import CLOUD, TAGS
 from benchmark.soak.victims import Victim, Watch
 from fisheye_svp_ros.io.decoding import read_image_points, read_key_values, stamp_of
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.standalone.messages import serialize
 
 _LONG = 120.0  # s
 _FRAMES = 24  # of which the critic needs 20
@@ -32,10 +33,10 @@ def wrong(victim: Victim, watch: Watch, victims: dict[str, Victim]) -> str:
 
 
 def _solver(victim: Victim, until: Callable[[Callable[[], bool]], bool]) -> str:
-    reader = victim.reader(f'{victim.name}/result', TAGS)
+    results = victim.hear_topic(f'{victim.name}/result', DiagnosticArray)
     critic = victim.name == 'model_critic'
     latest: dict[str, str] = {}
-    if not until(lambda: bool(reader.entity.get_matched_publications())):
+    if not until(lambda: victim.has_publisher(f'{victim.name}/result')):
         return 'no results'
     stamps = set()
     for stamp, told in victim.good(_FRAMES if critic else 3):
@@ -45,7 +46,8 @@ def _solver(victim: Victim, until: Callable[[Callable[[], bool]], bool]) -> str:
         time.sleep(0.05)
 
     def answered() -> bool:
-        while (message := reader.take()) is not None:
+        while results:
+            message = results.popleft()
             if stamp_of(message) in stamps:
                 latest.update(read_key_values(message))
         return bool(latest.get('verdict') if critic else latest)
@@ -61,29 +63,26 @@ def _solver(victim: Victim, until: Callable[[Callable[[], bool]], bool]) -> str:
 
 
 def _detector(victim: Victim, until: Callable[[Callable[[], bool]], bool]) -> str:
-    reader = victim.reader('image_points', CLOUD)
-    found: list[Any] = []
+    found = victim.hear_topic('image_points', PointCloud2)
 
     def seen() -> bool:
         victim.stamp += 1
         victim.tell('image', hostile.good_image(victim.stamp))
         time.sleep(0.2)
-        while (message := reader.take()) is not None:
-            found.append(message)
-        return any(len(read_image_points(message).uv) == 30 for message in found)
+        return any(len(read_image_points(message).uv) == 30 for message in list(found))
 
     return '' if until(seen) else 'a good image is not answered'
 
 
 def _camera(victim: Victim, until: Callable[[Callable[[], bool]], bool]) -> str:
-    reader = victim.reader('image_points', CLOUD)
+    heard = victim.hear_topic('image_points', PointCloud2)
     stamps: list[int] = []
 
     def goes_on() -> bool:
-        while (message := reader.take()) is not None:
-            stamps.append(stamp_of(message))
+        while heard:
+            stamps.append(stamp_of(heard.popleft()))
             answer = messages.key_values_message('a', {'rms_px': 0.1}, stamps[-1])
-            victim.tell('answer', serialize(answer))
+            victim.tell('answer', serialize_message(answer))
         return len(stamps) > 3
 
     return '' if until(goes_on) else f'it has published {len(stamps)} sets since'

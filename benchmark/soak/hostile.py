@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from random import Random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from benchmark.fuzz.nodes import seeds, spoilt, tags
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -15,16 +17,11 @@ from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.inputs import Count, Unread
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
-from fisheye_svp_ros.standalone.messages import message_class, serialize
 
 _STAMP = slice(4, 12)
-_HEADS = (b'\0\0', b'\0\1')  # of CDR; Cyclone DDS sends nothing else
 _SQUARE = 24  # px
 NOISE = 0.1  # px, of good sets
 BOARD = 'chessboard:6x5:25mm'
-CLOUD, POSE, TAGS = ('sensor_msgs/msg/PointCloud2', 'geometry_msgs/msg/PoseStamped',
-                     'diagnostic_msgs/msg/DiagnosticArray')
-IMAGE, COMPRESSED = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage'
 Told = list[tuple[str, bytes]]  # topic and CDR, in their order
 
 
@@ -49,39 +46,36 @@ def messages_stamp(stamp: int) -> bytes:
 
 
 def pool(
-    topic: str, kind: str, count: int, rng: Random, sends: Callable[[bytes], bool]
+    topic: str, kind: Any, count: int, rng: Random, sends: Callable[[bytes], bool]
 ) -> list[Attack]:
     """Return hostile messages of a topic, some of which a decoder takes all the same.
 
-    sends: whether DDS sends a message; Cyclone DDS refuses much that is not CDR of the type.
+    sends: whether the middleware sends a message at all.
     """
-    name = kind.rpartition('/')[2]
-    good = seeds()[name]
-    if kind == CLOUD:
+    good = seeds()[kind.__name__]
+    if kind is PointCloud2:
         good = good[:1] if topic == 'landmarks' else good[1:]
     made: list[Attack] = []
     while len(made) < count:
         scenario = topic == 'scenario' and len(made) % 2
         data = tags(rng) if scenario else spoilt(rng.choice(good), rng)
-        data = data if data[:2] in _HEADS else b'\0\1\0\0' + data[4:]
-        data += bytes(-len(data) % 4)  # as DDS does
         if not sends(data):
             continue
         stamped = bool(scenario) or data[:12] in {one[:12] for one in good}
         # Of images a node looks at few: which could be used is not asked for.
-        usable = kind in (IMAGE, COMPRESSED) or is_usable(topic, kind, data)
+        usable = kind in (Image, CompressedImage) or is_usable(topic, kind, data)
         made.append(Attack(data, stamped, usable))
     return made
 
 
-def is_usable(topic: str, kind: str, data: bytes) -> bool:
+def is_usable(topic: str, kind: Any, data: bytes) -> bool:
     """Say whether the decoder of a topic takes a message."""
     last = topic.rpartition('/')[2]
     decode = {
         'landmarks': decoding.read_landmarks, 'image_points': decoding.read_image_points,
         'true_pose': decoding.read_pose,
     }.get(last, decoding.read_key_values)
-    unread = Unread(topic, message_class(kind), data, decode, Count())
+    unread = Unread(topic, kind, data, decode, Count())
     try:
         _ = unread.stamp, unread.read()
     except FisheyeSvpError:
@@ -107,7 +101,7 @@ def good_sets(cameras: Sequence[str], count: int, first: int) -> Iterator[tuple[
             told += [(f'{camera}true_pose', messages.pose_message(pose, stamp, 'world')),
                      (f'{camera}image_points', messages.image_points_message(
                          seen.landmark, seen.uv, stamp, 'camera'))]
-        yield stamp, [(topic, serialize(message)) for topic, message in told]
+        yield stamp, [(topic, serialize_message(message)) for topic, message in told]
 
 
 def good_image(stamp: int) -> bytes:
@@ -115,4 +109,4 @@ def good_image(stamp: int) -> bytes:
     squares = np.indices((6, 7)).sum(axis=0) % 2
     board = np.kron(squares, np.ones((_SQUARE, _SQUARE))) * 180 + 40
     image = np.pad(board.astype(np.uint8), 2 * _SQUARE, constant_values=220)
-    return serialize(messages.image_message(image, stamp, 'camera'))
+    return serialize_message(messages.image_message(image, stamp, 'camera'))

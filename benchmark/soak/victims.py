@@ -6,43 +6,47 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from random import Random
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from cyclonedds.core import DDSException
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, QoSProfile
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from benchmark.soak import hostile
-from benchmark.soak.hostile import COMPRESSED, IMAGE, TAGS, Attack
-from fisheye_svp_ros.standalone import dds
-from fisheye_svp_ros.standalone.messages import message_class
-from fisheye_svp_ros.standalone.qos import HistoryPolicy, QoSProfile
+from benchmark.soak.hostile import Attack
 
 _POOL = 2000  # messages a topic, over and over with other stamps
 _VALID = 0.15  # of the messages of a set, so that some sets are solved
 _STEREO = ('left/', 'right/')
-_READER = QoSProfile(history=HistoryPolicy.KEEP_ALL)
+_ALL = QoSProfile(history=HistoryPolicy.KEEP_ALL, depth=0)
 
 
 class Kind(NamedTuple):
     """A node: its cameras, what it hears but sets (topic: type), its arguments."""
 
     cameras: tuple[str, ...] = ()
-    others: Mapping[str, str] = MappingProxyType({})
+    others: Mapping[str, Any] = MappingProxyType({})
     arguments: tuple[str, ...] = ()
 
 
-_CAMERA = {'answer': TAGS}
+_CAMERA = {'answer': DiagnosticArray}
 KINDS = {
     'localizer': Kind(('',)),
     'stereo_calibrator': Kind(_STEREO),
     'stereo_depth': Kind(_STEREO),
     'model_critic': Kind(('',), arguments=('every_frames:=5000', 'max_frames:=20')),
-    'detector': Kind((), {'image': IMAGE, 'image/compressed': COMPRESSED},
+    'detector': Kind((), {'image': Image, 'image/compressed': CompressedImage},
                      (f'board:={hostile.BOARD}',)),
     'synthetic_camera': Kind((), _CAMERA, ('lock_step:=answer',)),
     'measured_camera': Kind((), _CAMERA, ('lock_step:=answer', 'observations:={observations}')),
@@ -50,21 +54,36 @@ KINDS = {
 _SOLVING = ('patience:=0.5', 'backlog:=10000')
 
 
+class Wire:
+    """The attacker's own node; a thread takes in what comes."""
+
+    def __init__(self) -> None:
+        rclpy.init(args=[])
+        self.node = Node('attacker')
+        executor = SingleThreadedExecutor()
+        executor.add_node(self.node)
+        threading.Thread(target=executor.spin, daemon=True).start()
+
+    def hear(self, topic: str, kind: Any) -> deque[Any]:
+        """Return a queue that fills with the messages of a topic."""
+        heard: deque[Any] = deque()
+        self.node.create_subscription(kind, topic, heard.append, _ALL)
+        return heard
+
+
 class Victim:
     """A node under attack; exactly: nothing is lost in its readers, so that all can be counted."""
 
-    def __init__(
-        self, name: str, participant: dds.Participant, folder: Path, exactly: bool
-    ) -> None:
+    def __init__(self, name: str, wire: Wire, folder: Path, exactly: bool) -> None:
         self.name, self._kind = name, KINDS[name]
         self._space = f'/{"counted" if exactly else "flooded"}{os.getpid()}/{name}'
         self.title = f'{self._space}/{name}: inputs'  # of its diagnostics
         self.topics = dict(self._kind.others)
         if self._kind.cameras:
-            self.topics |= {'landmarks': hostile.CLOUD, 'scenario': TAGS}
+            self.topics |= {'landmarks': PointCloud2, 'scenario': DiagnosticArray}
             for camera in self._kind.cameras:
-                self.topics[f'{camera}true_pose'] = hostile.POSE
-                self.topics[f'{camera}image_points'] = hostile.CLOUD
+                self.topics[f'{camera}true_pose'] = PoseStamped
+                self.topics[f'{camera}image_points'] = PointCloud2
         self.sent: Counter[str] = Counter()
         self.hostile: Counter[str] = Counter()
         self.unusable: Counter[str] = Counter()
@@ -73,15 +92,14 @@ class Victim:
         self.memory: list[float] = []
         self.rng = Random(f'soak {name}')
         self.stamp = 10**9
-        self._participant = participant
+        self._wire = wire
         self._start(folder, exactly)
         rng = Random(f'pool {name}')
         self._pools = {topic: hostile.pool(topic, kind, _POOL, rng, self._sends(kind))
                        for topic, kind in self.topics.items()}
         self._writers = {topic: self._writer(topic, kind) for topic, kind in self.topics.items()}
         # A detector looks at images where somebody wants to know what is in them.
-        self._listener = dds.Reader(participant, f'rt{self._space}/image_points',
-                                    message_class(hostile.CLOUD), QoSProfile(depth=1))
+        self._listener = self.hear_topic('image_points', PointCloud2)
         self._good = dict(self.good(1)[-1][1])
 
     def _start(self, folder: Path, exactly: bool) -> None:
@@ -103,29 +121,24 @@ class Victim:
                  f'__ns:={self._space}', *(w for text in given for w in ('-p', text))],
                 stdout=log, stderr=log, env={**os.environ, 'OMP_NUM_THREADS': '1'})
 
-    def _writer(self, topic: str, kind: str) -> dds.Writer:
-        return dds.Writer(self._participant, f'rt{self._space}/{topic}', kind,
-                          QoSProfile(history=HistoryPolicy.KEEP_ALL))
+    def _writer(self, topic: str, kind: Any) -> Any:
+        return self._wire.node.create_publisher(kind, f'{self._space}/{topic}', _ALL)
 
-    def _sends(self, kind: str) -> Callable[[bytes], bool]:
-        nowhere = self._writer(f'nowhere/{kind.rpartition("/")[2]}', kind)
+    def _sends(self, kind: Any) -> Callable[[bytes], bool]:
+        nowhere = self._writer(f'nowhere/{kind.__name__}', kind)
+        return lambda data: _publish(nowhere, data)
 
-        def sends(data: bytes) -> bool:
-            try:
-                return nowhere.write(data)
-            except DDSException:
-                return False
+    def hear_topic(self, topic: str, kind: Any) -> deque[Any]:
+        """Return a queue that fills with the messages of a topic in the node's namespace."""
+        return self._wire.hear(f'{self._space}/{topic}', kind)
 
-        return sends
-
-    def reader(self, topic: str, kind: str) -> dds.Reader:
-        """Return a reader of a topic in the node's namespace."""
-        return dds.Reader(
-            self._participant, f'rt{self._space}/{topic}', message_class(kind), _READER)
+    def has_publisher(self, topic: str) -> bool:
+        """Say whether somebody publishes on a topic in the node's namespace."""
+        return bool(self._wire.node.count_publishers(f'{self._space}/{topic}'))
 
     def connected(self) -> bool:
         """Say whether the node hears every topic."""
-        return all(writer.matched() for writer in self._writers.values())
+        return all(writer.get_subscription_count() for writer in self._writers.values())
 
     def alive(self) -> bool:
         """Say whether the process has not ended."""
@@ -133,7 +146,8 @@ class Victim:
 
     def trouble(self) -> str:
         """Return why the node is not up."""
-        deaf = [topic for topic, writer in self._writers.items() if not writer.matched()]
+        deaf = [topic for topic, writer in self._writers.items()
+                if not writer.get_subscription_count()]
         return f'{self.name}: {deaf} {self._log.read_text(errors="replace")[-500:]}'
 
     def good(self, count: int) -> list[tuple[int, hostile.Told]]:
@@ -162,7 +176,7 @@ class Victim:
     def tell(self, topic: str, data: bytes) -> None:
         """Send a message."""
         self.sent[topic] += 1
-        self.lost[topic] += not self._writers[topic].write(data)
+        self.lost[topic] += not _publish(self._writers[topic], data)
 
     def hear(self, values: dict[str, str]) -> None:
         """Take in what the node counts."""
@@ -197,6 +211,15 @@ class Victim:
         return text[text.index('Traceback'):][:3000] if 'Traceback' in text else ''
 
 
+def _publish(publisher: Any, data: bytes) -> bool:
+    """Publish CDR as it is; return whether the middleware took it."""
+    try:
+        publisher.publish(data)
+    except RuntimeError:  # RCLError
+        return False
+    return True
+
+
 def _tree(pid: int) -> Iterator[int]:
     yield pid
     try:
@@ -218,13 +241,13 @@ def _resident(pid: int) -> float:
 class Watch:
     """Reads `/diagnostics` of all nodes."""
 
-    def __init__(self, participant: dds.Participant) -> None:
-        self._reader = dds.Reader(participant, 'rt/diagnostics', message_class(TAGS), _READER)
+    def __init__(self, wire: Wire) -> None:
+        self._heard = wire.hear('/diagnostics', DiagnosticArray)
 
     def look(self, victims: dict[str, Victim]) -> None:
         """Hand every node's counts to its account."""
-        while (message := self._reader.take()) is not None:
-            status: Any = message.status[0]  # type: ignore[attr-defined]
+        while self._heard:
+            status = self._heard.popleft().status[0]
             for victim in victims.values():
                 if status.name == victim.title:
                     victim.hear({pair.key: pair.value for pair in status.values})

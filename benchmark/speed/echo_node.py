@@ -5,16 +5,12 @@ from __future__ import annotations
 import sys
 from contextlib import suppress
 
-from fisheye_svp_ros import standalone
-
-standalone.install()
-
-import rclpy  # noqa: E402
-from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from rclpy.executors import ExternalShutdownException  # noqa: E402
-from rclpy.node import Node  # noqa: E402
-from rclpy.qos import QoSProfile  # noqa: E402
-from sensor_msgs.msg import PointCloud2  # noqa: E402
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
 
 QOS = QoSProfile(depth=100)
 

@@ -22,26 +22,16 @@ _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 
 
 def tables(count: int = 300) -> list[Table]:
-    """Return the table: a line a transport."""
+    """Return the table: a line an engine."""
     rows, notes = [], []
-    worlds = {'standalone': {k: v for k, v in os.environ.items() if k != 'PYTHONPATH'}}
-    if _has_rclpy():
-        worlds['ROS 2'] = dict(os.environ)
-    else:
-        notes.append('ROS 2: rclpy is not importable; source an installation first.')
-    setups = {
-        f'{world}, {engine}': {**environment, VARIABLE: engine}
-        for world, environment in worlds.items() for engine in engines()
-    }
-    for name, environment in setups.items():
-        run = subprocess.run(
-            [*_RUN, str(count)], env=environment, stdout=subprocess.PIPE, text=True, check=False
-        )
+    for name in engines():
+        run = subprocess.run([*_RUN, str(count)], env={**os.environ, VARIABLE: name},
+                             stdout=subprocess.PIPE, text=True, check=False)
         if run.returncode:
             notes.append(f'{name}: the nodes did not run.')
             continue
         rows.append(_line(name, json.loads(run.stdout)))
-    header = ('on', 'echo node, ms', 'localizer, ms', 'adds, ms', 'goal, ms', 'met',
+    header = ('engine', 'echo node, ms', 'localizer, ms', 'adds, ms', 'goal, ms', 'met',
               'echo node, sets/s', 'localizer, sets/s')
     return [Table('Nodes', header, rows, _TEXT, notes)]
 
@@ -61,8 +51,3 @@ def _throughput(rates: list[tuple[float, float]]) -> str:
     lossy = [(rate, answered) for rate, answered in rates if answered < 1]
     text = f'{max(whole, default=0):.0f}'
     return text + ''.join(f'; {100 * part:.0f} % at {rate:.0f}' for rate, part in lossy)
-
-
-def _has_rclpy() -> bool:
-    look = [sys.executable, '-c', 'import rclpy']
-    return subprocess.run(look, capture_output=True, check=False).returncode == 0

@@ -1,7 +1,7 @@
 """Round trips through a localizer and through an echo node; prints JSON; run by nodes.py.
 
 Both nodes are processes of their own and get the same message in turns; this process sends and
-waits for the pose.  On ROS 2 where it is importable, otherwise on the standalone client.
+waits for the pose.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from benchmark.speed.scenes import LANDMARKS, localization
-from fisheye_svp_ros import standalone
 from fisheye_svp_ros.commands.processes import domain
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -179,8 +178,6 @@ def main(count: int) -> None:
     """Print the medians, s, and the throughput of both nodes."""
     os.environ['ROS_DOMAIN_ID'] = domain()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
-    genuine = standalone.is_genuine()
-    standalone.install()
     with nodes() as names:
         probe = Probe(names)
         for name in names:
@@ -188,7 +185,6 @@ def main(count: int) -> None:
         round_trips(probe, names, max(count // 10, 1))
         seconds = round_trips(probe, names, count)
         print(json.dumps({
-            'genuine': genuine,
             'median': dict(zip(names, map(median, seconds.values()), strict=True)),
             'throughput': {name: throughput(probe, name) for name in names},
         }))

@@ -48,7 +48,7 @@ def record_sweep(
     """Run the node graph through a sweep file into a new recording.
 
     advance: told how many more scenarios the camera has reached.
-    Raises StandaloneError where a process does not end well.
+    Raises GraphError where a process does not end well.
     """
     reached, solvers = 0, tuple(plan.solvers)
 

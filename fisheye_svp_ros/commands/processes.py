@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from fisheye_svp_ros.errors import StandaloneError
+from fisheye_svp_ros.errors import GraphError
 
 _POLL = 0.05  # s
 _PARENT_DEATH_SIGNAL = 1  # PR_SET_PDEATHSIG of <sys/prctl.h>
@@ -59,7 +59,7 @@ class Processes:
     ) -> None:
         """Wait until some have ended well; `look` is called now and then meanwhile.
 
-        Raises StandaloneError where one does not end in time.
+        Raises GraphError where one does not end in time.
         """
         end = time.monotonic() + patience
         waiting = set(names)
@@ -69,17 +69,17 @@ class Processes:
                 if status is None:
                     continue
                 if status or name not in waiting:
-                    raise StandaloneError(f'{name} ended with status {status}: {self._last(name)}')
+                    raise GraphError(f'{name} ended with status {status}: {self._last(name)}')
                 waiting.discard(name)
                 del self._running[name]
             if time.monotonic() > end:
-                raise StandaloneError(f'{", ".join(sorted(waiting))} took more than '
+                raise GraphError(f'{", ".join(sorted(waiting))} took more than '
                                       f'{patience:g} s: {self._last(min(waiting))}')
             look()
             time.sleep(_POLL)
 
     def stop(self, name: str) -> None:
-        """End one with SIGINT; raise StandaloneError unless it ends well."""
+        """End one with SIGINT; raise GraphError unless it ends well."""
         self._running[name].send_signal(signal.SIGINT)
         self.wait([name], _GRACE * 6)
 
@@ -116,4 +116,4 @@ def domain() -> str:
             except OSError:
                 continue
         return str(number)
-    raise StandaloneError('all ROS domains from 1 to 101 are taken; set ROS_DOMAIN_ID')
+    raise GraphError('all ROS domains from 1 to 101 are taken; set ROS_DOMAIN_ID')

@@ -38,6 +38,7 @@ def run(args: argparse.Namespace) -> None:
 def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.lock_step import record_sweep
     from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.ros import require_rclpy
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
@@ -48,6 +49,7 @@ def _sweep(name: str, bag: Path) -> None:
     plan = read_sweep(path)
     if bag.exists():
         raise BagError(f'{bag}: it exists; a recording needs a new folder')
+    require_rclpy()
     logs = bag.with_name(f'{bag.name}_logs')
     with progress('sweeping', len(plan.sweep)) as advance:
         record_sweep(path, plan, bag, logs, advance)
@@ -57,12 +59,12 @@ def _sweep(name: str, bag: Path) -> None:
 
 def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.commands.run import supply_rclpy
+    from fisheye_svp_ros.commands.ros import require_rclpy
     from fisheye_svp_ros.io.bags import BagWriter
     from fisheye_svp_ros.nodes.executables import ending_quietly
 
     with ending_quietly():
-        supply_rclpy()
+        require_rclpy()
         import rclpy
 
         from fisheye_svp_ros.nodes.recorder import Recorder

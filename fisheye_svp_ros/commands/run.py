@@ -1,4 +1,4 @@
-"""`fisheye-svp run`: one node, on ROS 2 or, where that is not installed, standalone."""
+"""`fisheye-svp run`: one node, as `ros2 run` starts it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.errors import ParameterError, StandaloneError
+from fisheye_svp_ros.commands.ros import require_rclpy
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import NODES, executables
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Spin the node until it ends; exit with its status.  With --help, tell its parameters."""
     with executables.ending_quietly():
-        supply_rclpy()
+        require_rclpy()
     if {'-h', '--help'} & set(args.arguments):
         _print_parameters(args.node)
         return
@@ -51,16 +52,3 @@ def _print_parameters(node: str) -> None:
         [(row.name, json.dumps(row.default), meaning(row)) for row in table],
         words=('default', 'meaning'),
     )
-
-
-def supply_rclpy() -> None:
-    """Make rclpy importable; raise StandaloneError where neither ROS 2 nor Cyclone DDS is."""
-    from fisheye_svp_ros import standalone
-
-    try:
-        standalone.install()
-    except ModuleNotFoundError as cause:
-        raise StandaloneError(
-            f'neither ROS 2 nor {cause.name} is installed; source ROS 2, or install the extra '
-            '`standalone` of this package'
-        ) from cause

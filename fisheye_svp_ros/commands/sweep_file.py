@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
+from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
 from fisheye_svp_ros.io.parameters import SWEEP, rows
-from fisheye_svp_ros.standalone.arguments import Arguments, parse
 from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, plan_sweep
 
 
@@ -19,10 +19,10 @@ def read_sweep(path: Path) -> Plan:
     Raises ParameterError, naming the file, for whatever cannot be used.
     """
     try:
-        arguments = parse(['--ros-args', '--params-file', str(path)])
-        for pattern, values in arguments.parameters.items():
+        given = read_parameter_file(path)
+        for pattern, values in given.items():
             _check_names(pattern, values)
-        return plan_sweep({node: arguments.overrides(f'/{node}') for node in TABLES})
+        return plan_sweep({node: parameters_of(f'/{node}', given) for node in TABLES})
     except FisheyeSvpError as error:
         text = ' '.join(str(error).split())
         raise ParameterError(text if str(path) in text else f'{path}: {text}') from error
@@ -38,8 +38,7 @@ def lens_folder(plan: Plan) -> str:
 
 def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
     """Refuse what means nothing to any node; the nodes themselves would only warn."""
-    only = Arguments(parameters={pattern: dict(values)})
-    nodes = [node for node in TABLES if only.overrides(f'/{node}')]
+    nodes = [node for node in TABLES if parameters_of(f'/{node}', {pattern: values})]
     if values and not nodes:
         raise ParameterError(f'{pattern} is no node of a sweep; those are {", ".join(TABLES)}')
     known = {row.name for node in nodes for row in rows(TABLES[node])}

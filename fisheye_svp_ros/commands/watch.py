@@ -21,9 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Follow every result topic until interrupted."""
-    from fisheye_svp_ros.commands.run import supply_rclpy
+    from fisheye_svp_ros.commands.ros import require_rclpy
 
-    supply_rclpy()
+    require_rclpy()
     import rclpy
     from rich.live import Live
 

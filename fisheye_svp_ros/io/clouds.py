@@ -1,6 +1,6 @@
 """sensor_msgs/PointCloud2 as structured arrays; knows the layout, not ROS.
 
-Messages come as rclpy, the standalone client or a bag reader made them: only attributes count.
+Messages come as rclpy or a bag reader made them: only attributes count.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Messages to arrays: the one place that reads the fields of a ROS message.
 
-Messages come as rclpy, the standalone client or a bag reader made them: only attributes count.
+Messages come as rclpy or a bag reader made them: only attributes count.
 Stamps are whole nanoseconds.  Everything here raises ObservationError, in one line that names the
 topic and the field, for what cannot be used.
 """

@@ -11,7 +11,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from fisheye_svp_ros.errors import ParameterError, StandaloneError
+from fisheye_svp_ros.errors import GraphError, ParameterError
 
 PACKAGE = 'fisheye_svp_ros'
 STYLES = ('parallel', 'vergent', 'divergent')
@@ -98,5 +98,5 @@ def node(
 def fail(event: Any, context: Any) -> None:
     """End a launch that cannot do its work without a process, and say which one it was."""
     if event.returncode and not context.is_shutdown:
-        raise StandaloneError(f'{event.process_name} ended with status {event.returncode}; its '
+        raise GraphError(f'{event.process_name} ended with status {event.returncode}; its '
                               'last lines above say why')

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from tf2_msgs.msg import TFMessage
+from typing import Any
 
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED, RELIABLE, BaseNode
 from fisheye_svp_ros.pose import Pose
@@ -13,6 +14,7 @@ class Transforms:
     """What one node tells tf2, if it is to; static: what holds until it is told anew.
 
     A frame has one parent (REP 105): two nodes must not tell of the same child.
+    Raises ParameterError where it is to and tf2_msgs is not installed.
     """
 
     def __init__(self, node: BaseNode, wanted: bool, static: bool = False) -> None:
@@ -20,7 +22,8 @@ class Transforms:
         self._publisher = None
         if wanted:
             topic, qos = ('/tf_static', LATCHED) if static else ('/tf', RELIABLE)
-            self._publisher = node.announce(TFMessage, topic, qos)
+            self._kind = _message_class()
+            self._publisher = node.announce(self._kind, topic, qos)
 
     def publish(self, pose: Pose, stamp: int, frame: str, child: str) -> None:
         """Publish the pose of a frame in its parent; warn where frame ids cannot be used."""
@@ -32,4 +35,15 @@ class Transforms:
                 throttle_duration_sec=10.0)
             return
         transform = messages.transform_message(pose, stamp, frame, child)
-        self._publisher.publish(TFMessage(transforms=[transform]))
+        self._publisher.publish(self._kind(transforms=[transform]))
+
+
+def _message_class() -> Any:
+    """Return TFMessage, which is in a package of its own and not in every installation."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError as cause:
+        raise ParameterError(
+            'publish_tf: tf2_msgs is not installed; source a ROS 2 that has it (apt install '
+            'ros-jazzy-tf2-msgs; it has no wheel), or leave publish_tf at false') from cause
+    return TFMessage

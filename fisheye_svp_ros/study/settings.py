@@ -76,8 +76,7 @@ class SolverSettings(Settings):
     )
 
     lifecycle: bool = parameter(
-        False, 'Be a managed node, of ROS 2 alone: `configure` loads the lens, `activate` listens',
-        fixed=True
+        False, 'Be a managed node: `configure` loads the lens, `activate` listens', fixed=True
     )
 
     @property

@@ -1,17 +1,13 @@
-"""Sets that come faster than they are solved, between processes, with ROS 2 and without."""
+"""Sets that come faster than they are solved, between processes."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
-import pytest
-from helpers.nodes import ROOT
+from helpers.nodes import ROOT, need_ros
 
-from fisheye_svp_ros import standalone
-
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
+need_ros()
 
 
 def test_at_any_rate_every_set_taken_has_one_result_or_is_counted(ros_domain: int) -> None:

@@ -15,9 +15,9 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
-from helpers.nodes import ROOT
+from helpers.nodes import ROOT, need_ros
 
-from fisheye_svp_ros import cli, standalone
+from fisheye_svp_ros import cli
 
 PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
          'whats_wrong.md', 'photographs.md', 'water.md', 'next_photographs.md', 'nodes.md',
@@ -39,8 +39,8 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
         with socket.socket() as probe:
             if probe.connect_ex(('127.0.0.1', 8786)) == 0:
                 pytest.skip('somebody else has a Dask scheduler on port 8786')
-    if 'fisheye-svp record' in block and not standalone.is_genuine():
-        pytest.importorskip('cyclonedds')
+    if 'fisheye-svp record' in block:
+        need_ros()
     tools = tmp_path / 'bin'
     tools.mkdir()
     for name, module in (('fisheye-svp', 'fisheye_svp_ros.cli'), ('dask', 'dask')):

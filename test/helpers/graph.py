@@ -1,4 +1,4 @@
-"""Nodes and a probe in the process of the test, spun by one executor, on ROS 2 or standalone."""
+"""Nodes and a probe in the process of the test, spun by one executor."""
 
 from __future__ import annotations
 
@@ -6,14 +6,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import pytest
+from helpers.nodes import TIMEOUT, need_ros
 
-from fisheye_svp_ros import standalone
-from helpers.nodes import TIMEOUT
-
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
-standalone.install()
+need_ros()
 
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402

@@ -10,15 +10,22 @@ import threading
 import time
 from collections.abc import Callable
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-# Asked before any test installs the standalone client, which answers to the name of rclpy.
-GENUINE = find_spec('rclpy') is not None
+import pytest
+
+from fisheye_svp_ros.commands.ros import missing_rclpy
+
 ROOT = Path(__file__).resolve().parents[2]
 TIMEOUT = 60.0  # s; only a hang takes this long, however busy the machine is
 SHARED = ROOT.parent / 'shared' / 'data'
+
+
+def need_ros() -> None:
+    """Skip a test, or a module of tests, where there is no rclpy to run nodes on."""
+    if reason := missing_rclpy():
+        pytest.skip(f'ROS 2 is not here: {reason}', allow_module_level=True)
 
 
 def hears_sigint() -> None:
@@ -72,56 +79,8 @@ class NodeProcess:
         return status
 
 
-def services_of_cyclone() -> bool:
-    """Say whether services of the ROS 2 here are on the wire as the standalone client has them."""
-    from rclpy import get_rmw_implementation_identifier
-
-    return bool(get_rmw_implementation_identifier() == 'rmw_cyclonedds_cpp')
-
-
 class Caller:
-    """A service client for tests, on the wire of the standalone client."""
-
-    def __init__(self, domain: int) -> None:
-        from fisheye_svp_ros.standalone import dds
-
-        self._dds = dds
-        self._participant = dds.Participant(domain)
-        self._sequence = 0
-        self._endpoints: dict[str, tuple[Any, Any, Any]] = {}
-
-    def _client(self, typename: str, service: str) -> tuple[Any, Any, Any]:
-        """Return the request's type, a writer and a reader; a service has one of each."""
-        from fisheye_svp_ros.standalone.messages import service_class
-        from fisheye_svp_ros.standalone.qos import QoSProfile
-
-        if service not in self._endpoints:
-            dds, qos, types = self._dds, QoSProfile(depth=10), service_class(typename)
-            self._endpoints[service] = (
-                types.Request,
-                dds.Writer(self._participant, f'rq{service}Request', types.Request.TYPENAME, qos,
-                           'clientid=1.2.3;'),
-                dds.Reader(self._participant, f'rr{service}Reply', types.Response, qos,
-                           'clientid=1.2.3;'))
-        return self._endpoints[service]
-
-    def call(self, typename: str, service: str, **request: Any) -> Any:
-        """Call a service and return its response."""
-        request_type, writer, reader = self._client(typename, service)
-        until(lambda: bool(
-            writer.entity.get_matched_subscriptions() and reader.entity.get_matched_publications()
-        ))
-        self._sequence += 1
-        header = self._dds.Header(writer.entity.instance_handle % 2**64, self._sequence)
-        writer.write_call(header, request_type(**request))
-        while taken := until(reader.take_call):
-            if taken[0][:2] == header[:2]:
-                return taken[1]
-        raise AssertionError('no reply')
-
-
-class GenuineCaller:
-    """A service client for tests, on the RMW of an installed ROS 2, in a context of its own."""
+    """A service client for tests, in a context of its own."""
 
     def __init__(self, domain: int) -> None:
         from rclpy.context import Context

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError, StandaloneError
+from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_json, parse_yaml, read_yaml
 from fisheye_svp_ros.io.files import read_bytes
-from fisheye_svp_ros.standalone.arguments import parse
+from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
 
 BOMB = 'a: &a [1, 1]\n' + ''.join(
     f'{n}: &{n} [*{m}, *{m}, *{m}, *{m}]\n' for m, n in zip('abcdefgh', 'bcdefghi', strict=True))
@@ -89,17 +89,40 @@ def test_hostile_json(text: str, said: str) -> None:
 def test_hostile_parameter_files(text: str, said: str, tmp_path: Path) -> None:
     path = tmp_path / 'a.yaml'
     path.write_text(text)
-    with pytest.raises(StandaloneError, match=said) as error:
-        parse(['--ros-args', '--params-file', str(path)])
+    with pytest.raises(ParameterError, match=said) as error:
+        read_parameter_file(path)
     assert str(path) in str(error.value) and '\n' not in str(error.value)
 
 
-def test_a_pattern_on_the_command_line() -> None:
-    with pytest.raises(StandaloneError, match='names no node'):
-        parse(['--ros-args', '-p', '/(*:a:=1'])
-    given = parse(['--ros-args', '-p', '/**/localizer:a:=1', '-p', '/*:b:=2'])
-    assert given.overrides('/x/y/localizer') == {'a': 1}
-    assert given.overrides('/localizer') == {'a': 1, 'b': 2}
+@pytest.mark.parametrize('text', ['- 1', '/**: 3', 'a: {ros__parameters: [1]}', '', 'a: [', ':',
+                                  'a: {ros__parameters: {x: [1, a]}}',
+                                  'a: {ros__parameters: {x: }}'])
+def test_unusable_parameter_files_are_named(tmp_path: Path, text: str) -> None:
+    file = tmp_path / 'bad.yaml'
+    file.write_text(text)
+    with pytest.raises(ParameterError, match=r'bad\.yaml'):
+        read_parameter_file(file)
+
+
+@pytest.mark.parametrize(('text', 'value'), [
+    ('1', 1), ('-7', -7), ('0x1F', 31), ('010', 8), ('08', 8.0), ('1e-3', 0.001), ('1.', 1.0),
+    ('.inf', math.inf), ('-.inf', -math.inf), ('on', True), ('N', False), ('"1"', '1'),
+    ("'yes'", 'yes'), ('text', 'text'), ('[1, 2]', [1, 2]), ('[a, "1"]', ['a', '1']),
+    ('1_000', '1_000'), ('99999999999999999999', 1e20), ('[true]', [True]),
+])
+def test_values_have_the_type_that_rcl_gives_them(
+    text: str, value: object, tmp_path: Path
+) -> None:
+    file = tmp_path / 'a.yaml'
+    file.write_text(f'/**: {{ros__parameters: {{x: {text}}}}}\n')
+    read = parameters_of('/node', read_parameter_file(file))['x']
+    assert read == value and type(read) is type(value)
+
+
+def test_patterns_of_node_names() -> None:
+    given = {'/**/localizer': {'a': 1}, '/*': {'b': 2}}
+    assert parameters_of('/x/y/localizer', given) == {'a': 1}
+    assert parameters_of('/localizer', given) == {'a': 1, 'b': 2}
 
 
 def test_files_have_bounds(tmp_path: Path) -> None:

@@ -13,15 +13,10 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT, NodeProcess
 
-from fisheye_svp_ros import standalone
-
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
-standalone.install()
-
-from fisheye_svp_ros.nodes import NODES, base, executables  # noqa: E402
+from fisheye_svp_ros.nodes import NODES, base, executables
 
 _CODE = """
 import sys

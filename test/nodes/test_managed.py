@@ -9,9 +9,8 @@ import pytest
 from helpers.graph import Graph, set_parameter
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
+from rclpy.lifecycle import TransitionCallbackReturn  # isort: skip
 
-from fisheye_svp_ros import standalone
-from fisheye_svp_ros.errors import StandaloneError
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.model_critic import ModelCritic
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
@@ -19,7 +18,6 @@ from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 
 SOLVERS = (Localizer, StereoCalibrator, StereoDepth, ModelCritic)
-genuine = pytest.mark.skipif(not standalone.is_genuine(), reason='ROS 2 is not installed here')
 
 
 @pytest.fixture
@@ -29,17 +27,8 @@ def graph(ros_domain: int) -> Iterator[Graph]:
     one.close()
 
 
-@pytest.mark.skipif(standalone.is_genuine(), reason='of the standalone client')
-def test_standalone_says_what_it_lacks(graph: Graph) -> None:
-    with pytest.raises(StandaloneError, match='leave the parameter lifecycle at false'):
-        graph.start(Localizer)
-
-
-@genuine
 @pytest.mark.parametrize('kind', SOLVERS)
 def test_only_an_active_node_listens(graph: Graph, kind: type) -> None:
-    from rclpy.lifecycle import TransitionCallbackReturn
-
     node, success = graph.start(kind), TransitionCallbackReturn.SUCCESS
     topic = f'/{node.cameras[0]}image_points'
     assert node.trigger_configure() == success
@@ -52,7 +41,6 @@ def test_only_an_active_node_listens(graph: Graph, kind: type) -> None:
     assert node.trigger_cleanup() == success and node.trigger_shutdown() == success
 
 
-@genuine
 def test_results_come_while_it_is_active(graph: Graph) -> None:
     results = graph.hear(DiagnosticArray, 'localizer/result')
     node = graph.start(Localizer)
@@ -69,12 +57,9 @@ def test_results_come_while_it_is_active(graph: Graph) -> None:
     assert len(results) == count
 
 
-@genuine
 def test_a_lens_that_cannot_be_loaded_leaves_it_unconfigured(
     ros_domain: int, tmp_path: Path
 ) -> None:
-    from rclpy.lifecycle import TransitionCallbackReturn
-
     graph = Graph('-p', 'lifecycle:=true', '-p', f'lens:={tmp_path / "nosuch.yaml"}')
     node = graph.start(Localizer)
     assert node.trigger_configure() == TransitionCallbackReturn.FAILURE
@@ -83,7 +68,6 @@ def test_a_lens_that_cannot_be_loaded_leaves_it_unconfigured(
     graph.close()
 
 
-@genuine
 def test_what_is_said_of_topics_is_understood_once_they_are_there(
     ros_domain: int, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,25 +8,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import graph  # noqa: F401 - skips where there is no rclpy
 
-from fisheye_svp_ros import standalone
+from sensor_msgs.msg import PointCloud2, PointField  # isort: skip
 
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
-standalone.install()
-
-from sensor_msgs.msg import PointCloud2, PointField  # noqa: E402
-
-from fisheye_svp_ros.errors import ObservationError  # noqa: E402
-from fisheye_svp_ros.io import decoding  # noqa: E402
-from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack  # noqa: E402
-from fisheye_svp_ros.io.decoding import stamp_of  # noqa: E402
-from fisheye_svp_ros.io.landmark_files import environment  # noqa: E402
-from fisheye_svp_ros.io.lens_files import load_lens  # noqa: E402
-from fisheye_svp_ros.io.share import lens_path  # noqa: E402
-from fisheye_svp_ros.nodes import messages  # noqa: E402
-from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent  # noqa: E402
-from fisheye_svp_ros.pose import Pose, rotation_from_vector  # noqa: E402
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io import decoding
+from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack
+from fisheye_svp_ros.io.decoding import stamp_of
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
 
 STAMP = 1_700_000_000_123_456_789
 POSE = Pose(rotation_from_vector(np.array([0.3, -1.2, 2.0])), np.array([0.1, -0.2, 1e-17]))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.graph import Graph, set_parameter
-from helpers.nodes import TIMEOUT, Caller, GenuineCaller, until
+from helpers.nodes import TIMEOUT, Caller, until
 from helpers.targets import poses_around
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
@@ -200,14 +200,14 @@ def test_two_runs_are_drawn_into_one_picture(tmp_path: Path) -> None:
 
 
 def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
-    scene: Path, tmp_path: Path, ros_domain: int, node_caller: Caller | GenuineCaller
+    scene: Path, tmp_path: Path, ros_domain: int, caller: Caller
 ) -> None:
     bag, errors, extended = (tmp_path / name for name in ('bag', 'errors', 'extended.yaml'))
     replay = ['run', 'measured_camera', '--ros-args', *values(
         observations=bag, repeat='false', rate=100.0)]
 
     def ask() -> Any:
-        return node_caller.call('std_srvs/srv/Trigger', '/model_critic/write_extended_lens')
+        return caller.call('std_srvs/srv/Trigger', '/model_critic/write_extended_lens')
 
     with Processes(tmp_path / 'logs') as processes:
         processes.start('recorder', ['record', '-o', str(bag)])

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import fnmatch
-import os
-import socket
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ import pytest
 from helpers.graph import Graph
 from helpers.nodes import ROOT
 
-from fisheye_svp_ros import standalone
 from fisheye_svp_ros.nodes import NODES
 
 OBSERVATIONS = 'frame,landmark,u,v,x,y,z,camera\n' + ''.join(
@@ -32,7 +30,8 @@ def graph(ros_domain: int, tmp_path: Path) -> Iterator[Graph]:
     path.write_text(OBSERVATIONS)
     solvers = [word for name in SOLVERS for word in ('-p', f'{name}:lens:=camera_info')]
     one = Graph('-p', f'observations:={path}', '-p', 'style:=parallel',
-                '-p', 'lock_step:=localizer/result', '-p', 'publish_tf:=true', *solvers,
+                '-p', 'lock_step:=localizer/result',
+                '-p', f'publish_tf:={find_spec("tf2_msgs") is not None}', *solvers,
                 '-p', 'guide:=e0', '-p', f'guide_output:={tmp_path / "guided"}',
                 '-p', 'detector:lens:=camera_info')
     yield one
@@ -62,51 +61,13 @@ def test_a_policy_allows_all_that_a_node_does_and_not_more(name: str, graph: Gra
     node: Any = graph.start(getattr(module, kind))
     graph.idle(0.3)
     allowed = policy(name)
-    if not standalone.is_genuine():
-        done = {'publish': {p.topic_name for p in node._publishers},
-                'subscribe': {s.topic_name for s in node.subscriptions},
-                'reply': {s.service_name for s in node.services}}
-    else:
-        space = node.get_name(), node.get_namespace()
-        done = {
-            'publish': {n for n, _ in node.get_publisher_names_and_types_by_node(*space)},
-            'subscribe': {n for n, _ in node.get_subscriber_names_and_types_by_node(*space)},
-            'reply': {n for n, _ in node.get_service_names_and_types_by_node(*space)},
-        }
+    space = node.get_name(), node.get_namespace()
+    done = {
+        'publish': {n for n, _ in node.get_publisher_names_and_types_by_node(*space)},
+        'subscribe': {n for n, _ in node.get_subscriber_names_and_types_by_node(*space)},
+        'reply': {n for n, _ in node.get_service_names_and_types_by_node(*space)},
+    }
     for what, names in done.items():
         for one in names:
             assert any(fnmatch.fnmatchcase(one, p) for p in allowed[what]), (what, one)
     assert '/*' not in allowed['publish'] | allowed['subscribe'] | allowed['reply']
-
-
-@pytest.mark.skipif(standalone.is_genuine(), reason='SROS2 does it on an installed ROS 2')
-def test_security_that_cannot_be_had_is_refused(
-    ros_domain: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv('ROS_SECURITY_ENABLE', 'true')
-    with pytest.raises(Exception, match='DDS security needs an installation of ROS 2'):
-        Graph()
-
-
-@pytest.mark.skipif(not hasattr(socket, 'SO_BINDTODEVICE') or standalone.is_genuine(),
-                    reason='of the standalone client, on Linux')
-def test_on_localhost_sockets_take_in_nothing_from_elsewhere(ros_domain: int) -> None:
-    def devices() -> dict[str, bytes]:
-        found = {}
-        for entry in os.listdir('/proc/self/fd'):  # noqa: PTH208 - numbers are wanted
-            try:
-                name = os.readlink(f'/proc/self/fd/{entry}')  # noqa: PTH115
-                with socket.socket(fileno=os.dup(int(entry))) as one:
-                    if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM:
-                        found[name] = one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16)
-            except OSError:
-                continue
-        return found
-
-    before = devices()
-    graph = Graph()
-    try:
-        new = {name: device for name, device in devices().items() if name not in before}
-        assert len(new) >= 2 and set(new.values()) == {b'lo\0'}
-    finally:
-        graph.close()

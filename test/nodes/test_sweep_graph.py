@@ -8,13 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT
-
-from fisheye_svp_ros import standalone
-
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
-pytest.importorskip('rosbags')
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands import record

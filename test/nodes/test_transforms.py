@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -11,9 +12,9 @@ from helpers.graph import LATCHED, Graph
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
-from tf2_msgs.msg import TFMessage  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.clouds import LANDMARKS, unpack
 from fisheye_svp_ros.io.decoding import columns, read_pose, read_transform, stamp_of
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -32,9 +33,28 @@ def edges(heard: list[Any]) -> dict[tuple[str, str], list[Any]]:
     return found
 
 
-def test_the_camera_as_estimated_and_as_true(graph: Callable[..., Graph]) -> None:
+@pytest.fixture
+def tf_message() -> Any:
+    """Return the class of what is on /tf."""
+    return pytest.importorskip('tf2_msgs.msg', reason='tf2_msgs is not installed').TFMessage
+
+
+@pytest.mark.parametrize('kind', [Localizer, StereoCalibrator, SyntheticCamera])
+def test_without_tf2_it_is_refused_at_the_start(
+    kind: type, graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, 'tf2_msgs', None)
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
+    g = graph('publish_tf:=true')
+    with pytest.raises(ParameterError, match=r'tf2_msgs is not installed; .* publish_tf at false'):
+        g.start(kind)
+
+
+def test_the_camera_as_estimated_and_as_true(
+    graph: Callable[..., Graph], tf_message: Any
+) -> None:
     g = graph('publish_tf:=true', 'svp:=false', 'rate:=50.0', 'world_frame:=map')
-    heard = g.hear(TFMessage, '/tf')
+    heard = g.hear(tf_message, '/tf')
     estimated = g.hear(PoseWithCovarianceStamped, 'localizer/pose')
     residuals = g.hear(PointCloud2, 'localizer/residuals')
     true = g.hear(PoseStamped, 'true_pose')
@@ -55,10 +75,10 @@ def test_the_camera_as_estimated_and_as_true(graph: Callable[..., Graph]) -> Non
     assert markers[0].markers[0].header.frame_id == 'map'
 
 
-def test_the_rig_and_its_points_resolve(graph: Callable[..., Graph]) -> None:
+def test_the_rig_and_its_points_resolve(graph: Callable[..., Graph], tf_message: Any) -> None:
     g = graph('publish_tf:=true', 'svp:=false', 'rate:=20.0', 'style:=vergent', 'radius:=0.5',
               'poses_file:=calibration')
-    heard, static = g.hear(TFMessage, '/tf'), g.hear(TFMessage, '/tf_static', LATCHED)
+    heard, static = g.hear(tf_message, '/tf'), g.hear(tf_message, '/tf_static', LATCHED)
     points = g.hear(PointCloud2, 'stereo_depth/points')
     landmarks = g.hear(PointCloud2, 'landmarks', LATCHED)
     for kind in (StereoCalibrator, StereoDepth, SyntheticCamera):
@@ -86,7 +106,6 @@ def test_the_rig_and_its_points_resolve(graph: Callable[..., Graph]) -> None:
 
 def test_nobody_tells_tf2_unasked(graph: Callable[..., Graph]) -> None:
     g = graph('svp:=false', 'rate:=50.0', 'localizer:camera_frame:=shifted')
-    g.hear(TFMessage, '/tf')
     residuals = g.hear(PointCloud2, 'localizer/residuals')
     g.start(Localizer)
     g.start(SyntheticCamera)
@@ -96,10 +115,10 @@ def test_nobody_tells_tf2_unasked(graph: Callable[..., Graph]) -> None:
 
 
 def test_a_frame_without_a_name_is_no_transform(
-    graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
+    graph: Callable[..., Graph], tf_message: Any, capfd: pytest.CaptureFixture[str]
 ) -> None:
     g = graph('publish_tf:=true', 'svp:=false', 'rate:=50.0', "world_frame:=''")
-    heard, poses = g.hear(TFMessage, '/tf'), g.hear(PoseWithCovarianceStamped, 'localizer/pose')
+    heard, poses = g.hear(tf_message, '/tf'), g.hear(PoseWithCovarianceStamped, 'localizer/pose')
     g.start(Localizer)
     g.start(SyntheticCamera)
     g.until(lambda: len(poses) > 2)

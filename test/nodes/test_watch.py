@@ -13,15 +13,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT, TIMEOUT, hears_sigint
 from rich.console import Console
 
-from fisheye_svp_ros import standalone
 from fisheye_svp_ros.commands import watch
-
-if not standalone.is_genuine():
-    pytest.importorskip('cyclonedds')
-standalone.install()
 
 
 @pytest.mark.parametrize(('width', 'shown'), [

@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers import graph  # noqa: F401 - skips where there is neither ROS 2 nor Cyclone DDS
+from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT
 
 from fisheye_svp_ros.commands.processes import Processes
-from fisheye_svp_ros.errors import BagError, ObservationError, StandaloneError
+from fisheye_svp_ros.errors import BagError, GraphError, ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
@@ -112,7 +112,7 @@ def test_a_missing_scenario_is_named(demo: Any) -> None:
 
 def test_a_process_that_fails_is_named_and_none_is_left(tmp_path: Path) -> None:
     with (
-        pytest.raises(StandaloneError, match=r"bad ended with status 2: .*'nothere' is neither"),
+        pytest.raises(GraphError, match=r"bad ended with status 2: .*'nothere' is neither"),
         Processes(tmp_path / 'logs') as processes,
     ):
         processes.start('good', ['run', 'localizer'])
