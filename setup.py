@@ -51,6 +51,7 @@ setup(
         'opencv-python-headless>=4.6',
         'rosbags>=0.11.9',
         'mcap>=1.1',
+        'threadpoolctl>=3.2',
     ],
     extras_require={
         # Genuine ROS 2 Jazzy, where there are wheels of it; elsewhere an installation is sourced.

@@ -26,7 +26,7 @@ KEYS = {
     'lz4': '', 'zstandard': '',
 }
 # Extras, which the package does without where they are not installed; and what else is no package
-OPTIONAL = {'apriltag_msgs', 'distributed', 'numba', 'pyarrow'}
+OPTIONAL = {'apriltag_msgs', 'distributed', 'numba', 'pyarrow', 'threadpoolctl'}
 
 
 def findings() -> list[str]:

@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import NoReturn
 
 from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.threads import set_thread_count
 
 COMMANDS = {
     'budget': 'at which range and angle the SVP error passes what the application allows',
@@ -38,8 +39,7 @@ COMMANDS = {
     'watch': 'the results of running nodes, live, in the terminal',
 }
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
-# Threads of BLAS wait for each other at small matrices, and some BLAS gives other last digits on
-# more of them.  It reads their number as it is loaded; workers inherit it.
+# Others project many points at once, for which the compiled engine takes every core.
 _ON_ONE_THREAD = ('calibrate', 'diagnose', 'sweep')
 _SIGNALLED = ('record', 'run', 'watch')  # these end themselves on SIGTERM
 _BAD_INPUT = 2
@@ -96,7 +96,7 @@ def _run(arguments: Sequence[str]) -> None:
         commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')
     named = next((word for word in arguments if not word.startswith('-')), '')
     if named in _ON_ONE_THREAD:
-        os.environ.setdefault('OMP_NUM_THREADS', '1')
+        set_thread_count()
     if named in COMMANDS:
         module = import_module(f'fisheye_svp_ros.commands.{named}')
         module.add_arguments(commands.choices[named])

@@ -6,7 +6,7 @@ an `Observations` table or a file that `read_observations` reads.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,12 +35,19 @@ from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
 from fisheye_svp_ros.study import budget as budgets
 from fisheye_svp_ros.study import sweep as sweeps
+from fisheye_svp_ros.threads import single_threaded
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.optics.camera import Image, Rays
 
 AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
+# Called with a stage of long work and the share (0 to 1) that is done.
+Progress = Callable[[str, float], None]
+
+
+def _silent(stage: str, done: float) -> None:
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
@@ -239,6 +246,7 @@ def _last_of(size: int, values: Array, name: str) -> Array:
     return numbers
 
 
+@single_threaded
 def localize(
     observations: AnyObservations, lens: AnyLens, *, model_error: bool = False
 ) -> Localized:
@@ -264,25 +272,30 @@ def localize(
     )
 
 
+@single_threaded
 def calibrate(
     observations: AnyObservations, model: str, image_size: tuple[int, int],
-    free: Sequence[str] | None = None, name: str = 'lens',
+    free: Sequence[str] | None = None, name: str = 'lens', *, progress: Progress = _silent,
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
     Gross errors are set aside, and standard errors are honest, as those of the command.
+    progress: called with each stage and the share that is done.
     """
     from fisheye_svp_ros.diagnosis import calibration
 
+    progress('fitting the lens', 0.0)
     found, kept, _ = calibration.calibrated_without_gross_errors(
         _table(observations),
         lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
     adjusted = found.adjusted
+    progress('estimating standard errors', 0.3)
     trusted = calibration.trust(kept, adjusted.lens, adjusted.names)
     return Calibrated(calibration.with_stderr(adjusted.lens, trusted), tuple(adjusted.names),
                       trusted.covariance, found.sigma, found.left_out, bool(adjusted.converged))
 
 
+@single_threaded
 def calibrate_stereo(
     observations: AnyObservations, left: AnyLens, right: AnyLens
 ) -> CalibratedRig:
@@ -302,6 +315,7 @@ def calibrate_stereo(
     )
 
 
+@single_threaded
 def stereo_depth(
     observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose, *,
     model_error: bool = False,
@@ -339,6 +353,7 @@ def simulate_scenario(**scenario: Any) -> Simulated:
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
 
+@single_threaded
 def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swept:
     """Solve the Cartesian product of lists of scenario parameters, as `fisheye-svp sweep` does.
 
@@ -354,14 +369,16 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
 
 
+@single_threaded
 def diagnose(
     observations: AnyObservations, lens: AnyLens, *, free_intrinsics: bool | None = None,
-    held_out: AnyObservations | None = None,
+    held_out: AnyObservations | None = None, progress: Progress = _silent,
 ) -> Diagnosed:
     """Find what a lens's simulation gets wrong about observations, and extend it.
 
     free_intrinsics: whether they are to be fitted, by default where a fit made the lens;
-    held_out: other frames of the same camera and target to measure the gain on.
+    held_out: other frames of the same camera and target to measure the gain on;
+    progress: called with each stage and the share that is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     from fisheye_svp_ros.diagnosis.diagnosis import diagnose as find_causes
@@ -370,10 +387,12 @@ def diagnose(
     known = load_lens(lens)
     table, _ = posable(_table(observations), known)
     test = None if held_out is None else posable(_table(held_out), known)[0]
-    found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test)
+    found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
+                        progress=progress)
     return Diagnosed(found.verdict, found.to_dict(), found.lens)
 
 
+@single_threaded
 def budget(
     lens: AnyLens, *, noise_px: float = 0.3, style: str = 'parallel', baseline: float = BASELINE
 ) -> Budgeted:

@@ -19,6 +19,7 @@ ROSDEP = {
     'matplotlib': 'python3-matplotlib', 'rich': 'python3-rich', 'Jinja2': 'python3-jinja2',
     'opencv-python-headless': 'python3-opencv', 'rosbags': 'python3-rosbags-pip',
     'setuptools': 'python3-setuptools', 'pyarrow': None, 'mcap': None,
+    'threadpoolctl': None,
     'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
     'hypothesis': 'python3-hypothesis', 'psutil': 'python3-psutil', 'mpmath': None,
 }

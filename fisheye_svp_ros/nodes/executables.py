@@ -14,13 +14,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.nodes import NODES
+from fisheye_svp_ros.threads import set_thread_count
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.io.parameters import Row
     from fisheye_svp_ros.nodes.base import BaseNode
 
-# Matrices are small for BLAS, and other nodes want the other cores.
-os.environ.setdefault('OMP_NUM_THREADS', '1')
+set_thread_count()  # other nodes use the other cores
 
 
 @contextmanager

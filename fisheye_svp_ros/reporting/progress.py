@@ -1,14 +1,17 @@
-"""Progress of long work, on standard error and only where that is a terminal."""
+"""Progress of long work on standard error: a bar on a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 
 from rich.console import Console
 from rich.progress import Progress
+
+_INTERVAL = 5.0  # seconds between lines where there is no terminal
 
 
 @contextmanager
@@ -31,7 +34,26 @@ def stages(description: str) -> Iterator[Callable[[str, float], None]]:
 @contextmanager
 def _bar(description: str, total: int | None) -> Iterator[Callable[..., None]]:
     if not sys.stderr.isatty():
-        yield lambda **_: None
+        yield _Lines(description, total).update
         return
     with Progress(console=Console(stderr=True), transient=True) as bar:
         yield partial(bar.update, bar.add_task(description, total=total))
+
+
+class _Lines:
+    """Progress as plain lines: none for work that is done within the interval."""
+
+    def __init__(self, description: str, total: int | None) -> None:
+        self._description, self._total = description, total
+        self._done, self._next = 0.0, time.monotonic() + _INTERVAL
+
+    def update(
+        self, advance: float = 0.0, completed: float | None = None, description: str | None = None
+    ) -> None:
+        """Take over what `rich.progress.Progress.update` is told; print a line when it is due."""
+        self._done = self._done + advance if completed is None else completed
+        self._description = description or self._description
+        if time.monotonic() >= self._next:
+            share = f' ({self._done / self._total:.0%})' if self._total else ''
+            print(f'{self._description}{share}', file=sys.stderr, flush=True)
+            self._next = time.monotonic() + _INTERVAL

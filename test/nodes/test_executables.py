@@ -106,7 +106,8 @@ def test_hardly_anything_is_loaded_before_signals_end_a_node_quietly() -> None:
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True,
                           env=os.environ | {'PYTHONPATH': str(ROOT)})
     assert done.stdout.split() == [
-        'fisheye_svp_ros', 'fisheye_svp_ros.nodes', 'fisheye_svp_ros.nodes.executables']
+        'fisheye_svp_ros', 'fisheye_svp_ros.nodes', 'fisheye_svp_ros.nodes.executables',
+        'fisheye_svp_ros.threads']
 
 
 @pytest.mark.parametrize(('given', 'taken'), [({}, '1'), ({'OMP_NUM_THREADS': '3'}, '3')])

@@ -1,0 +1,42 @@
+"""How many threads linear algebra uses: one, unless the environment says otherwise.
+
+The matrices here are small.  Threads of BLAS that wait for each other at every product cost
+several times what they bring, and some BLAS returns other last digits on more of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import wraps
+from importlib.util import find_spec
+from typing import ParamSpec, TypeVar
+
+VARIABLES = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS')
+
+_P = ParamSpec('_P')
+_R = TypeVar('_R')
+
+
+def set_thread_count() -> None:
+    """Ask for one thread in this process and its workers; call it before NumPy is imported."""
+    os.environ.setdefault(VARIABLES[0], '1')
+
+
+def single_threaded(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """Return the function with BLAS on one thread while it runs, in a process of somebody else's.
+
+    A number that the environment sets stays as it is, and so does BLAS after the call.  Without
+    threadpoolctl, which Ubuntu's ROS 2 does not bring, nothing is limited.
+    """
+
+    @wraps(function)
+    def limited(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        if any(os.environ.get(name) for name in VARIABLES) or not find_spec('threadpoolctl'):
+            return function(*args, **kwargs)
+        from threadpoolctl import threadpool_limits
+
+        with threadpool_limits(1, user_api='blas'):
+            return function(*args, **kwargs)
+
+    return limited

@@ -1,0 +1,59 @@
+"""BLAS takes one thread while the library works, unless the environment says otherwise."""
+
+from __future__ import annotations
+
+import pytest
+
+from fisheye_svp_ros.threads import VARIABLES, set_thread_count, single_threaded
+
+threadpoolctl = pytest.importorskip('threadpoolctl', reason='comes with pip, not with ROS 2')
+
+
+@single_threaded
+def _threads() -> set[int]:
+    """Return the numbers of threads that BLAS libraries take."""
+    return {pool['num_threads'] for pool in threadpoolctl.threadpool_info()
+            if pool['user_api'] == 'blas'}
+
+
+@pytest.fixture
+def no_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have the environment say nothing about threads."""
+    for name in VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.mark.usefixtures('no_number')
+def test_one_thread_inside_and_as_many_as_before_afterwards() -> None:
+    with threadpoolctl.threadpool_limits(2, user_api='blas'):
+        before = _threads.__wrapped__()
+        assert _threads() == {1}
+        assert _threads.__wrapped__() == before
+
+
+@pytest.mark.usefixtures('no_number')
+def test_a_number_in_the_environment_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv('OPENBLAS_NUM_THREADS', '2')
+    with threadpoolctl.threadpool_limits(2, user_api='blas'):
+        assert _threads() == _threads.__wrapped__()
+
+
+@pytest.mark.usefixtures('no_number')
+def test_processes_of_the_package_ask_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+
+    monkeypatch.setenv(VARIABLES[0], '')
+    monkeypatch.delenv(VARIABLES[0])
+    set_thread_count()
+    assert os.environ[VARIABLES[0]] == '1'
+    monkeypatch.setenv(VARIABLES[0], '3')
+    set_thread_count()
+    assert os.environ[VARIABLES[0]] == '3'
+
+
+def test_the_library_is_single_threaded() -> None:
+    from fisheye_svp_ros import library
+
+    for name in ('localize', 'calibrate', 'calibrate_stereo', 'stereo_depth', 'sweep', 'diagnose',
+                 'budget'):
+        assert hasattr(getattr(library, name), '__wrapped__'), name
