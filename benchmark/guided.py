@@ -26,23 +26,23 @@ from numpy.typing import NDArray
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import Points, find_points
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.guide import (
-    ENOUGH,
-    Guide,
-    Seen,
-    Stand,
-    consider,
-    observations_of,
-    start_session,
-)
-from fisheye_svp_ros.diagnosis.next_photographs import Board
-from fisheye_svp_ros.diagnosis.plan import nominal_lens
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import replacing, write_text
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning.guide import (
+    MIN_SCORE,
+    DetectedBoard,
+    Guide,
+    SessionState,
+    evaluate_session,
+    observations_of,
+    start_session,
+)
+from fisheye_svp_ros.planning.optimal_design import FlatBoard
+from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector, vector_from_rotation
 from fisheye_svp_ros.reporting.guide_picture import draw_guide
 from fisheye_svp_ros.reporting.progress import progress
@@ -71,7 +71,7 @@ class Hand:
     wanted: Pose | None = None
     way: int = 0
 
-    def move(self, guide: Guide, seen: Seen | None) -> bool:
+    def move(self, guide: Guide, seen: DetectedBoard | None) -> bool:
         """Move as the guide's picture says; return whether anything has moved."""
         stand, outline = guide.stand, guide.outline
         if stand is None or outline is None:
@@ -85,7 +85,7 @@ class Hand:
             self.way -= 1
         elif seen is None:
             return False
-        elif guide.score < ENOUGH:
+        elif guide.score < MIN_SCORE:
             here, there = (self._by_eye(uv, seen.ids) for uv in (seen.uv, outline[seen.ids]))
             change = there.compose(here.inverse())
             size = np.linalg.norm(there.position - here.position)
@@ -134,21 +134,21 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
                   np.stack([turn.source for turn in pattern.symmetries]))
     hand = Hand(nominal_lens(SIZE, field_of_view), pattern.points, rng)
     printed, moved = Print(9, 6, 0.025), True
-    seen: Seen | None = None
-    board = Board(np.arange(54), printed.corners, np.zeros(54, dtype=np.int64), np.eye(3))
+    seen: DetectedBoard | None = None
+    board = FlatBoard(np.arange(54), printed.corners, np.zeros(54, dtype=np.int64), np.eye(3))
     rim = board.rim
     images, pixels, near = 0, None, None
-    stands: list[Stand] = []
+    stands: list[SessionState] = []
     refused = 0
     for i in range(LONGEST):
         if guide.thinking:
             refused = len(guide.session.room.taken)
-            stand = consider(guide.session)
+            stand = evaluate_session(guide.session)
             if isinstance(stand, Exception):
                 raise stand
             guide.adopt(stand)
             stands.append(stand)
-        if guide.done:
+        if guide.finished:
             break
         if moved and not np.isfinite(project(lens, hand.camera.into_body(rim)).uv).all():
             seen, moved = None, False  # a board that leaves the field is not found
@@ -157,11 +157,13 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
             images += 1
             found = find_points(pixels, pattern, 'quick', near)
             near = found.uv if isinstance(found, Points) else None
-            seen = Seen(0.0, found.ids, found.uv, found.sigma) if near is not None else None
+            seen = None
+            if near is not None:
+                seen = DetectedBoard(0.0, found.ids, found.uv, found.sigma)
         t = i * STEP
         seen = seen and seen._replace(t=t)
         guide.look(t, seen)
-        first = not guide.session.taken and 0.4 < guide.score < ENOUGH
+        first = not guide.session.taken and 0.4 < guide.score < MIN_SCORE
         if picture and pixels is not None and first:
             with replacing(picture) as path:
                 cv2.imwrite(str(path), draw_guide(pixels, guide, seen),

@@ -1,7 +1,7 @@
 """How many photographs it takes: `python -m benchmark.next_photographs --cameras 100`.
 
 For simulated cameras (Kannala-Brandt free, a viewpoint shift unknown, 0.1 px) photographs of a
-board are chosen (`diagnosis.next_photographs`), taken at random from the same candidates, or
+board are chosen (`planning.optimal_design`), taken at random from the same candidates, or
 chosen for the intrinsics alone: where they expect the least error over the image, which is the
 criterion of the Calibration Wizard (Peng and Sturm, ICCV 2019).  Counted is how many it takes for
 a standard error of e0, and to be 95 % sure that a shift of 2 mm is not a lens curve or a bent
@@ -26,15 +26,6 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.next_photographs import (
-    Board,
-    Design,
-    Question,
-    Room,
-    candidate_shots,
-    information,
-    look_alikes,
-)
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -43,6 +34,15 @@ from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import lens_columns, project_with_jacobian
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning.optimal_design import (
+    Criterion,
+    Design,
+    FlatBoard,
+    ViewLimits,
+    candidate_shots,
+    confounded_effects,
+    information,
+)
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import Observations, make_observations
@@ -126,8 +126,8 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearised]:
     lens = Lens('lens', 1280, 960, f, f, 640 + rng.normal(scale=9), 480 + rng.normal(scale=9),
                 curve, half)
     points = Print(9, 6, rng.uniform(0.02, 0.04)).corners
-    board = Board(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
-    room = Room(float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.8, 1.5)))
+    board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
+    room = ViewLimits(float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.8, 1.5)))
     shots = candidate_shots(State(identity(1), identity(1), lens, ()), board, room, rng)
     blank = make_observations(
         np.zeros(len(points), int), board.landmark, 0 * points[:, :2], points)
@@ -135,24 +135,24 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearised]:
     data = Data(blank, blank_views(board.landmark, points, count), np.arange(count),
                 np.zeros(count, int))
     linear = Linearised(data, State(shots.camera, identity(1), lens, ()), intrinsic_names(lens))
-    alike = look_alikes(linear, ('radial_profile', 'target_shape'))
+    alike = confounded_effects(linear, ('radial_profile', 'target_shape'))
     return Design(linear, [EFFECT, *alike], board, shots, NOISE, known=False), linear
 
 
-def without(design: Design, question: Question) -> Question:
+def without(design: Design, question: Criterion) -> Criterion:
     """Return the question with look-alikes left out of it: they are taken as absent."""
     own = [i for i, name in enumerate(design.names)
            if '.' not in name or name.startswith('viewpoint_shift')]
     return replace(question, nuisance=np.setdiff1d(own, question.interest))
 
 
-def plain(design: Design, question: Question) -> Callable[[Index], float]:
+def plain(design: Design, question: Criterion) -> Callable[[Index], float]:
     """Return the standard error of a number from some photographs, look-alikes absent."""
     own = without(design, question)
     return lambda taken: own.answer(design.known + design.added[taken].sum(axis=0))
 
 
-def fewest(design: Design, question: Question, settles: Callable[[float], bool]) -> float:
+def fewest(design: Design, question: Criterion, settles: Callable[[float], bool]) -> float:
     """Return how many photographs settle a question, those of each number chosen together."""
     return next((float(n) for n in range(1, 21)
                  if settles(design.choose(question, n)[1][-1])), np.inf)
@@ -163,7 +163,7 @@ def needed(error: Callable[[Index], float], order: Index, goal: float) -> float:
     return next((float(n) for n in range(1, len(order) + 1) if error(order[:n]) <= goal), np.inf)
 
 
-def sure(question: Question, design: Design, order: Index) -> float:
+def sure(question: Criterion, design: Design, order: Index) -> float:
     """Return how many photographs make the name sure."""
     return next((float(n) for n in range(1, len(order) + 1) if question.answer(
         design.known + design.added[order[:n]].sum(axis=0)) >= SURE), np.inf)
@@ -219,7 +219,7 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     state = fit(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
     linear = Linearised(data, state, free)
     square = float((linear.residual**2).sum()) / int(linear.used.sum())
-    design = Taken(linear, look_alikes(linear, ('radial_profile', 'target_shape')), square)
+    design = Taken(linear, confounded_effects(linear, ('radial_profile', 'target_shape')), square)
     e0 = without(design, design.question('e0'))
     name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
     count = len(design.added)

@@ -12,7 +12,7 @@ import numpy as np
 from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes, measured
-from fisheye_svp_ros.commands.plan import room_of
+from fisheye_svp_ros.commands.plan import view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together, write_json
@@ -25,8 +25,8 @@ from fisheye_svp_ros.scene.observations import Observations
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
     from fisheye_svp_ros.diagnosis.known_truth import Compared
-    from fisheye_svp_ros.diagnosis.next_question import Next
     from fisheye_svp_ros.diagnosis.points import PointResiduals
+    from fisheye_svp_ros.planning.plan import NextViews
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -119,11 +119,11 @@ def run(args: argparse.Namespace) -> None:
 
 def _wanted(
     args: argparse.Namespace, diagnosis: Diagnosis
-) -> tuple[Next | None, FisheyeSvpError | None]:
+) -> tuple[NextViews | None, FisheyeSvpError | None]:
     """Return the photographs to take next, or why there are none: what was found comes first."""
-    from fisheye_svp_ros.diagnosis.next_question import next_photographs
+    from fisheye_svp_ros.planning.plan import next_photographs
 
-    room = None if args.room is None else room_of(args.room)
+    room = None if args.room is None else view_limits(args.room)
     try:
         return next_photographs(diagnosis.after, diagnosis.causes, diagnosis.noise_px, args.count,
                                 args.number, room), None
@@ -154,7 +154,8 @@ def _read(
 
 
 def _print(
-    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None, wanted: Next | None
+    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None,
+    wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.reporting import diagnosis_text as text
     from fisheye_svp_ros.reporting import external_text, shot_list
@@ -189,7 +190,7 @@ def _print(
 
 def _write(
     args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool,
-    wanted: Next | None,
+    wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.diagnosis.points import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report

@@ -22,8 +22,8 @@ from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.next_photographs import Room
-    from fisheye_svp_ros.diagnosis.next_question import Next
+    from fisheye_svp_ros.planning.optimal_design import ViewLimits
+    from fisheye_svp_ros.planning.plan import NextViews
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,14 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Choose, print, draw."""
-    from fisheye_svp_ros.diagnosis.plan import plan
+    from fisheye_svp_ros.planning.plan import plan
     from fisheye_svp_ros.reporting import shot_list
     from fisheye_svp_ros.reporting.tables import UNITS, print_table
 
     if args.count < 1 or not args.noise > 0:
         raise ParameterError('--count and --noise must be above 0')
     lens, pattern = _lens(args), parse_pattern(args.board)
-    planned = plan(lens, pattern.points, room_of(args.room), args.count, args.number, args.noise)
+    planned = plan(lens, pattern.points, view_limits(args.room), args.count, args.number,
+                   args.noise)
     wanted = planned.wanted
     if args.output:
         with together():
@@ -78,18 +79,18 @@ def run(args: argparse.Namespace) -> None:
         print(f'{args.output}: plan.pdf, plan.json, poses.csv')
 
 
-def room_of(given: Sequence[float]) -> Room:
+def view_limits(given: Sequence[float]) -> ViewLimits:
     """Return the room of --room.  Raises ParameterError for an impossible one."""
-    from fisheye_svp_ros.diagnosis.next_photographs import Room
+    from fisheye_svp_ros.planning.optimal_design import ViewLimits
 
     near, far = given
     if not 0 < near < far < float('inf'):
         raise ParameterError(f'--room {near:g} {far:g}: two distances above 0 are needed, m, the '
                              'nearer first')
-    return Room(near, far)
+    return ViewLimits(near, far)
 
 
-def _note_guessed(lens: Lens, wanted: Next) -> None:
+def _note_guessed(lens: Lens, wanted: NextViews) -> None:
     """Name the views that need more of a lens than it was calibrated for."""
     if lens.reached is None:
         return
@@ -104,7 +105,7 @@ def _note_guessed(lens: Lens, wanted: Next) -> None:
 
 
 def _lens(args: argparse.Namespace) -> Lens:
-    from fisheye_svp_ros.diagnosis.plan import nominal_lens
+    from fisheye_svp_ros.planning.plan import nominal_lens
 
     if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
         raise ParameterError('which lens is it? Give --lens LENS, or --fov and --image-size')

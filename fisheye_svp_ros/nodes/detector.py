@@ -18,7 +18,6 @@ from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late
-from fisheye_svp_ros.diagnosis.guide import NUMBERS
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
@@ -28,6 +27,7 @@ from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, SENSOR_INPUT, Bas
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.inputs import Unread
+from fisheye_svp_ros.planning.guide import NUMBERS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 

@@ -19,15 +19,6 @@ from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.points import Points
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late
-from fisheye_svp_ros.diagnosis.guide import (
-    Guide,
-    Seen,
-    Stand,
-    consider,
-    observations_of,
-    start_session,
-)
-from fisheye_svp_ros.diagnosis.plan import nominal_lens
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, OutputError, ParameterError
 from fisheye_svp_ros.io.files import replacing
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -38,6 +29,15 @@ from fisheye_svp_ros.nodes.base import LATCHED, BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning.guide import (
+    DetectedBoard,
+    Guide,
+    SessionState,
+    evaluate_session,
+    observations_of,
+    start_session,
+)
+from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.reporting.guide_picture import draw_guide, guide_words
 
 _LONGEST = 60.0  # s, to choose the next photograph
@@ -106,7 +106,7 @@ class Guiding:
         assert self._guide is not None
         guide, seen = self._guide, None
         if isinstance(found, Points):
-            seen = Seen(stamp / _NS, found.ids, found.uv, found.sigma)
+            seen = DetectedBoard(stamp / _NS, found.ids, found.uv, found.sigma)
         self._frame = frame
         if guide.look(stamp / _NS, seen):
             self._save(pixels)
@@ -124,7 +124,7 @@ class Guiding:
         result = calls.result()
         if result is not None and self._considering:
             self._considering = False
-            if isinstance(result, Stand):
+            if isinstance(result, SessionState):
                 self._adopt(guide, result)
             else:
                 self._fail(guide, result)
@@ -146,9 +146,10 @@ class Guiding:
                                 (settings.near, settings.far), settings.guide, settings.goal)
         orders = np.stack([turn.source for turn in self._pattern.symmetries])
         self._guide = Guide(session, orders)
-        self._calls = BoundedCalls(consider, None)  # which loads all and fails: a warm process
+        # Which loads all and fails: a warm process
+        self._calls = BoundedCalls(evaluate_session, None)
 
-    def _adopt(self, guide: Guide, stand: Stand) -> None:
+    def _adopt(self, guide: Guide, stand: SessionState) -> None:
         guide.adopt(stand)
         self._trouble = ''
         self._tell('photographs', len(guide.session.taken))

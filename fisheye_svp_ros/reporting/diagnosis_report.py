@@ -11,12 +11,12 @@ from fisheye_svp_ros.diagnosis.budget import stage_shares
 from fisheye_svp_ros.diagnosis.choice import NAMED, TraceStep
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
-from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.diagnosis.target_map import BoardMap, board_maps
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
@@ -63,7 +63,7 @@ class Inputs(NamedTuple):
 
 def write_report(
     diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Compared], inputs: Inputs,
-    wanted: Next | None = None,
+    wanted: NextViews | None = None,
 ) -> list[Path]:
     """Write report.html and its pictures into a folder; return the files.
 
@@ -102,7 +102,7 @@ def _extended(diagnosis: Diagnosis, folder: Path) -> dict[str, str]:
     return {'options': ' '.join(options), 'first': str(next(iter(files.values())))}
 
 
-def _next(wanted: Next | None) -> dict[str, Any]:
+def _next(wanted: NextViews | None) -> dict[str, Any]:
     if wanted is None:
         return {}
     return {'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,

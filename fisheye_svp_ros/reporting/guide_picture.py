@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.detect.photographs import Pixels
-from fisheye_svp_ros.diagnosis.guide import ENOUGH, Guide, Seen
 from fisheye_svp_ros.optics.lens import INTRINSICS
+from fisheye_svp_ros.planning.guide import MIN_SCORE, DetectedBoard, Guide
 from fisheye_svp_ros.reporting.shot_list import instruction
 
 _WANTED, _SEEN, _READY, _TEXT = (40, 123, 224), (230, 160, 60), (80, 200, 80), (245, 245, 245)
@@ -33,11 +33,11 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
         if stand.alike:
             names += f', or {" or ".join(stand.alike)}: photographs cannot tell'
         return 'settled', f'diagnosis: {names}', taken
-    if guide.done:
+    if guide.finished:
         return 'not settled', 'so many photographs do not settle it', taken
     if guide.thinking:
         return 'one moment', 'choosing the next photograph', taken
-    ready = guide.score >= ENOUGH
+    ready = guide.score >= MIN_SCORE
     return 'hold still' if ready else 'bring the board to the outline', where, taken
 
 
@@ -54,7 +54,7 @@ def _known(guide: Guide) -> str:
     return f'{session.number} {value}, wanted +- {factor * session.goal:.2g}'
 
 
-def draw_guide(pixels: Pixels, guide: Guide, seen: Seen | None) -> NDArray[np.uint8]:
+def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:
     """Return the picture (H, W, 3), blue, green, red, of an image with the guide over it."""
     zoom = min(1.0, _LARGEST / max(pixels.shape))
     scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
@@ -63,7 +63,7 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: Seen | None) -> NDArray[np.ui
     picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     outline = guide.outline
     if outline is not None:
-        colour = _READY if guide.score >= ENOUGH else _WANTED
+        colour = _READY if guide.score >= MIN_SCORE else _WANTED
         wanted = _places(outline[np.isfinite(outline).all(axis=1)], zoom)
         hull = cv2.convexHull(wanted)
         filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FIXED)
@@ -104,11 +104,11 @@ def _words(picture: NDArray[np.uint8], guide: Guide) -> None:
         _write(picture, text, round(base * line), size)
     _write(picture, known, height - round(0.4 * line), size)
     left, right, top = round(0.6 * width), round(0.98 * width), round(0.3 * line)
-    ready = guide.score >= ENOUGH
+    ready = guide.score >= MIN_SCORE
     cv2.rectangle(picture, (left, top), (left + round(guide.score * (right - left)), line),
                   _READY if ready else _WANTED, -1)
     cv2.rectangle(picture, (left, top), (right, line), _TEXT, 1)
-    mark = left + round(ENOUGH * (right - left))
+    mark = left + round(MIN_SCORE * (right - left))
     cv2.line(picture, (mark, top), (mark, line), _TEXT, 2)
 
 

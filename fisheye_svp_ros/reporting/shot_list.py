@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from fisheye_svp_ros.diagnosis.guide import HOPE
-from fisheye_svp_ros.diagnosis.next_photographs import Shots
-from fisheye_svp_ros.diagnosis.next_question import Next
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning.guide import MIN_PROBABILITY
+from fisheye_svp_ros.planning.optimal_design import Shots
+from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 from fisheye_svp_ros.simulate.simulation import blank_views
 
@@ -24,7 +24,7 @@ _COLUMNS, _PANEL = 3, 3.4  # inches
 _HUMAN = {'m': (1e3, 'mm'), 'rad': (180 / np.pi, 'deg')}
 
 
-def rows(wanted: Next) -> list[tuple[str, ...]]:
+def rows(wanted: NextViews) -> list[tuple[str, ...]]:
     """Return the shot list's rows, under HEADER."""
     return [(str(i + 1), *instruction(wanted.shots, i), then(wanted, i + 1))
             for i in range(len(wanted.shots.distance))]
@@ -43,7 +43,7 @@ def instruction(shots: Shots, i: int) -> tuple[str, str, str, str]:
     return f'{shots.distance[i]:.2f} m', where, tilt, f'{np.degrees(shots.roll[i]):.0f} deg'
 
 
-def then(wanted: Next, taken: int) -> str:
+def then(wanted: NextViews, taken: int) -> str:
     """Return what will be known once so many of the photographs are taken."""
     value = wanted.answers[taken]
     if wanted.others:
@@ -54,10 +54,10 @@ def then(wanted: Next, taken: int) -> str:
     return f'± {factor * value:.2g} {"" if unit == "1" else unit}'.rstrip()
 
 
-def purpose(wanted: Next) -> str:
+def purpose(wanted: NextViews) -> str:
     """Return what the photographs are for, and where matters stand."""
     if wanted.others:
-        known = '' if wanted.answers[-1] > HOPE else (
+        known = '' if wanted.answers[-1] > MIN_PROBABILITY else (
             '; photographs hardly tell: what you know is not there can be left out, '
             + ' '.join(f'--without {name}' for name in wanted.others))
         return (f'to tell {wanted.asked} from {" and ".join(wanted.others)}; now '
@@ -69,7 +69,7 @@ def purpose(wanted: Next) -> str:
     return f'for {what}; errors in % of those {beside}'
 
 
-def draw_shots(path: Path, model: ForwardModel, wanted: Next) -> None:
+def draw_shots(path: Path, model: ForwardModel, wanted: NextViews) -> None:
     """Draw each wanted view through the present lens: PNG, or PDF to be printed."""
     board, shots = wanted.board, wanted.shots
     count, first = len(shots.distance), int(np.argmin(board.landmark))

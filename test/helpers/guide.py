@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.guide import Seen, Session, Stand, start_session
-from fisheye_svp_ros.diagnosis.plan import nominal_lens
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning.guide import DetectedBoard, Session, SessionState, start_session
+from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.simulate.render import Print
 
@@ -23,14 +23,14 @@ def session() -> Session:
     return start_session(SHEET, POINTS, (0.15, 0.6), 'e0', 3e-4)
 
 
-def seen_from(lens: Lens, camera: Pose, rng: np.random.Generator) -> Seen:
+def seen_from(lens: Lens, camera: Pose, rng: np.random.Generator) -> DetectedBoard:
     """Return the board as a camera sees it from a pose in the board's frame."""
     uv = project(lens, camera.into_body(POINTS)).uv
     ids = np.arange(len(POINTS))
-    return Seen(0.0, ids, uv + 0.03 * rng.normal(size=uv.shape), np.full(len(ids), 0.03))
+    return DetectedBoard(0.0, ids, uv + 0.03 * rng.normal(size=uv.shape), np.full(len(ids), 0.03))
 
 
-def present(lens: Lens, stand: Stand, rng: np.random.Generator) -> Seen:
+def present(lens: Lens, stand: SessionState, rng: np.random.Generator) -> DetectedBoard:
     """Return the wanted view as somebody presents it, a few degrees and millimetres off."""
     for i in range(len(stand.outline)):
         board = stand.wanted.shots.camera.take(i).inverse()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.guide import POINTS, session
 
-from fisheye_svp_ros.diagnosis.guide import Guide, Seen, consider
+from fisheye_svp_ros.planning.guide import DetectedBoard, Guide, evaluate_session
 from fisheye_svp_ros.reporting.guide_picture import draw_guide, guide_words
 
 GREEN, ORANGE = np.array([80, 200, 80]), np.array([40, 123, 224])
@@ -24,9 +24,9 @@ def test_orange_until_the_board_is_there_then_green(guide):
     assert guide_words(guide)[0] == 'one moment'
     blank = draw_guide(pixels, guide, None)
     assert not of_colour(blank, ORANGE) and blank.shape == (800, 848, 3)
-    guide.adopt(consider(guide.session))
+    guide.adopt(evaluate_session(guide.session))
     assert 'off the axis' in guide_words(guide)[1] and guide_words(guide)[2] == '0 photographs'
-    there = Seen(0.0, np.arange(len(POINTS)), guide.outline, np.ones(len(POINTS)))
+    there = DetectedBoard(0.0, np.arange(len(POINTS)), guide.outline, np.ones(len(POINTS)))
     away = there._replace(uv=there.uv - 200)  # partly out of the picture
     cases = (away, ORANGE, GREEN, 'bring'), (there, GREEN, ORANGE, 'hold')
     for seen, colour, other, todo in cases:
@@ -37,7 +37,7 @@ def test_orange_until_the_board_is_there_then_green(guide):
 
 
 def test_what_is_settled_and_what_photographs_cannot_tell(guide):
-    stand = consider(guide.session)._replace(
+    stand = evaluate_session(guide.session)._replace(
         value=-0.003, stderr=0.0001, named=('viewpoint_shift',), alike=('flat_port',),
         settled=True)
     guide.adopt(stand)

@@ -39,17 +39,17 @@ _EDGE, _SPACING = 8.0, 9.0  # px from the edge of the image and between points, 
 _NEIGHBOURS = 4
 _SLANT = np.cos(np.radians(70.0))  # of a board to the ray, beyond which corners are not found
 _EXCHANGES = 4  # rounds
-_FLAT = 0.02  # thickness of a board over its length
+_MAX_THICKNESS = 0.02  # thickness of a board over its length
 # What a person can set: steps of angles, rad, and distances between near and far
 _STEP, _QUARTER, _TILTS = np.radians(5.0), np.radians(45.0), np.radians([0, 15, 30, 45, 60])
 _DISTANCES = 9
-_NEAR = 0.25  # of the distance
-_BEYOND = np.radians(10.0)  # what has been seen, where the image of a lens may have ended
+_EXCLUSION_RADIUS = 0.25  # of the distance
+_ANGLE_MARGIN = np.radians(10.0)  # what has been seen, where the image of a lens may have ended
 # Prior standard deviations of intrinsics that nothing is known of, over the focal length
-_WIDE = {'fx': 0.1, 'fy': 0.1, 'cx': 0.1, 'cy': 0.1}
+_PRIOR_SIGMAS = {'fx': 0.1, 'fy': 0.1, 'cx': 0.1, 'cy': 0.1}
 
 
-class Room(NamedTuple):
+class ViewLimits(NamedTuple):
     """Where the board can be: nearest and furthest, m, at which it is sharp; largest tilt, rad.
 
     field: furthest from the axis, rad; taken (P, 3): places of its middle before the camera, m,
@@ -85,7 +85,7 @@ class Shots(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Board:
+class FlatBoard:
     """A flat board: landmark numbers (N,), points (N, 3), m, board numbers (N,), facing (3, 3).
 
     The last is the turn that shows it squarely to a camera before it.
@@ -111,7 +111,7 @@ class Board:
         return np.array([np.argmin(x + y), np.argmax(x + y), np.argmin(x - y), np.argmax(x - y)])
 
     @classmethod
-    def seen_in(cls, observations: Observations, pose: Pose) -> Board:
+    def from_observations(cls, observations: Observations, pose: Pose) -> FlatBoard:
         """Return the board of a table, its front the side that cameras (S,) saw.
 
         Raises GeometryError for a target that is not flat.
@@ -120,7 +120,7 @@ class Board:
         points = observations.xyz[first]
         middle = points.mean(axis=0)
         _, extent, axes = np.linalg.svd(points - middle, full_matrices=False)
-        if extent[2] > _FLAT * extent[0]:
+        if extent[2] > _MAX_THICKNESS * extent[0]:
             raise GeometryError(
                 f'{observations.source}: the target is not one flat board; the next photographs '
                 'can be planned for a flat one only'
@@ -135,7 +135,7 @@ class Board:
 
 
 @dataclass(frozen=True)
-class Question:
+class Criterion:
     """What is in doubt: columns of the information.
 
     interest (P,): the numbers; value (P,): of a cause that may be mistaken, None where their
@@ -151,12 +151,12 @@ class Question:
     def merit(self, information: Array) -> Array:
         """Return how well each information (B, K, K) answers; more is better."""
         if self.value is None:
-            remaining = _reduced(information, self.interest, self.nuisance)
+            remaining = _marginal_information(information, self.interest, self.nuisance)
             return np.asarray(np.linalg.slogdet(remaining)[1]) / len(self.interest)
         merits = []
         for other in self.others or (self.nuisance[:0],):
             unknown = np.concatenate([self.nuisance, other])
-            remaining = _reduced(information, self.interest, unknown)
+            remaining = _marginal_information(information, self.interest, unknown)
             merits.append(np.einsum('i,bij,j->b', self.value, remaining, self.value))
         return np.asarray(np.min(merits, axis=0))
 
@@ -180,7 +180,7 @@ class Design:
     """
 
     def __init__(
-        self, linear: Linearised, effects: Sequence[Effect], board: Board, shots: Shots,
+        self, linear: Linearised, effects: Sequence[Effect], board: FlatBoard, shots: Shots,
         noise: float, known: bool = True,
     ) -> None:
         """Take a fit, and effects that are not in it but may be there; noise: of u and v, px.
@@ -196,7 +196,8 @@ class Design:
         self.units = (*(_unit(name) for name in free), *(p.unit for _, p, _ in parameters))
         self.values = np.array([lens.parameters[name] for name in free]
                                + [value for _, _, value in parameters])
-        wide = [lens.focal * _WIDE[name] if name in _WIDE else 1.0 for name in free]
+        wide = [lens.focal * _PRIOR_SIGMAS[name] if name in _PRIOR_SIGMAS else 1.0
+                for name in free]
         wide += [p.large for _, p, _ in parameters]
         self.shots, self.board, self.known_views = shots, board, known
         self.known: Array = np.diag(1 / np.square(wide))
@@ -222,14 +223,14 @@ class Design:
         raise ParameterError(f'{name!r} is no number of this lens and its causes; there are '
                              + ', '.join(self.names))
 
-    def question(self, name: str, others: Sequence[str] = ()) -> Question:
+    def question(self, name: str, others: Sequence[str] = ()) -> Criterion:
         """Ask for the error of a number, or whether an effect is not one of some others."""
         interest = self.columns(name)
         groups = tuple(self.columns(other) for other in others)
         rest = np.setdiff1d(np.arange(len(self.names)), np.concatenate([interest, *groups]))
-        return Question(interest, rest, self.values[interest] if others else None, groups)
+        return Criterion(interest, rest, self.values[interest] if others else None, groups)
 
-    def choose(self, question: Question, count: int) -> tuple[Index, list[float]]:
+    def choose(self, question: Criterion, count: int) -> tuple[Index, list[float]]:
         """Return places of chosen shots, best first, and the answer with each one more."""
         chosen: list[int] = []
         for _ in range(count):
@@ -250,7 +251,7 @@ class Design:
             question.answer(self._with(ordered[:i])) for i in range(count + 1)
         ]
 
-    def _best(self, question: Question, taken: Sequence[int]) -> int:
+    def _best(self, question: Criterion, taken: Sequence[int]) -> int:
         merit = question.merit(self._with(taken) + self.added)
         merit[list(taken)] = -np.inf
         return int(np.argmax(merit))
@@ -259,7 +260,7 @@ class Design:
         return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
 
 
-def look_alikes(linear: Linearised, names: Sequence[str]) -> list[Effect]:
+def confounded_effects(linear: Linearised, names: Sequence[str]) -> list[Effect]:
     """Return the richest forms of effects of lens or target that are not in a fit."""
     there = {effect.name for effect, _ in linear.state.terms}
     found = []
@@ -274,7 +275,7 @@ def look_alikes(linear: Linearised, names: Sequence[str]) -> list[Effect]:
     return found
 
 
-def furthest(lens: Lens, reached: float) -> float:
+def max_view_angle(lens: Lens, reached: float) -> float:
     """Return out to which angle a lens may well see that did so up to `reached`, rad.
 
     The image of most fills it to the nearest edge, and of many ends there.
@@ -282,10 +283,12 @@ def furthest(lens: Lens, reached: float) -> float:
     u = min(lens.cx, lens.width - lens.cx) / lens.fx
     v = min(lens.cy, lens.height - lens.cy) / lens.fy
     edge = lens.image_height.angle(np.asarray(max(min(u, v), 0.0)))
-    return max(reached + float(_BEYOND), min(float(edge), lens.max_incidence))
+    return max(reached + float(_ANGLE_MARGIN), min(float(edge), lens.max_incidence))
 
 
-def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Generator) -> Shots:
+def candidate_shots(
+    state: State, board: FlatBoard, room: ViewLimits, rng: np.random.Generator
+) -> Shots:
     """Return up to CANDIDATES views that can be taken: the board whole, sharp, detectable.
 
     Raises GeometryError where there is none.
@@ -310,7 +313,8 @@ def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Gener
     middle = distance[:, None] * sight
     place = middle - turn @ board.points.mean(axis=0)
     shots = Shots(Pose(turn, place).inverse(), distance, angle, azimuth, tilt, axis, roll)
-    away = np.linalg.norm(middle[:, None] - room.taken, axis=-1) > _NEAR * distance[:, None]
+    away = (np.linalg.norm(middle[:, None] - room.taken, axis=-1)
+            > _EXCLUSION_RADIUS * distance[:, None])
     allowed = away.all(axis=1) & _detectable(state, board, shots, room.field)
     possible = np.flatnonzero(allowed)[:CANDIDATES]
     if not possible.size:
@@ -321,7 +325,7 @@ def candidate_shots(state: State, board: Board, room: Room, rng: np.random.Gener
     return shots.take(possible)
 
 
-def _detectable(state: State, board: Board, shots: Shots, field: float) -> Mask:
+def _detectable(state: State, board: FlatBoard, shots: Shots, field: float) -> Mask:
     """Whether boards are in image and field as a whole, their points far enough apart (P,)."""
     model, found = ForwardModel(state.lens, state.terms), np.ones(len(shots.distance), dtype=bool)
     size, rim = np.array([state.lens.width, state.lens.height]), board.rim
@@ -338,11 +342,11 @@ def _detectable(state: State, board: Board, shots: Shots, field: float) -> Mask:
             inside = ((edge.uv > _EDGE) & (edge.uv < size - _EDGE)).all(axis=-1)
         found[left] = (edge.valid & seen & inside).all(axis=1)
     left = np.flatnonzero(found)
-    found[left] = _told_apart(model, board, shots.camera.take(left))
+    found[left] = _resolvable(model, board, shots.camera.take(left))
     return found
 
 
-def _told_apart(model: ForwardModel, board: Board, camera: Pose) -> Mask:
+def _resolvable(model: ForwardModel, board: FlatBoard, camera: Pose) -> Mask:
     """Whether the points of boards are far enough apart in the image, and not too slanted (P,)."""
     views = blank_views(board.landmark, board.points, len(camera.position), board=board.board)
     image, local = model.predict(camera, views), camera.into_body(views.points)
@@ -371,7 +375,7 @@ def information(linear: Linearised, effects: Sequence[Effect]) -> Array:
     return np.asarray(np.swapaxes(clean, -1, -2) @ clean)
 
 
-def _reduced(information: Array, interest: Index, unknown: Index) -> Array:
+def _marginal_information(information: Array, interest: Index, unknown: Index) -> Array:
     """Return the information (B, P, P) of some columns with others unknown."""
     own = information[:, interest[:, None], interest]
     if not len(unknown):

@@ -12,29 +12,28 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.next_photographs import (
-    Board,
-    Design,
-    Room,
-    candidate_shots,
-    furthest,
-    look_alikes,
-)
-from fisheye_svp_ros.diagnosis.next_question import next_photographs
-from fisheye_svp_ros.diagnosis.plan import plan
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.planning.optimal_design import (
+    Design,
+    FlatBoard,
+    ViewLimits,
+    candidate_shots,
+    confounded_effects,
+    max_view_angle,
+)
+from fisheye_svp_ros.planning.plan import next_photographs, plan
 from fisheye_svp_ros.pose import rotation_from_vector
 from fisheye_svp_ros.reporting.shot_list import instruction, purpose, rows
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.simulation import simulate
 
-ROOM, NOISE = Room(0.25, 1.5), 0.1
+ROOM, NOISE = ViewLimits(0.25, 1.5), 0.1
 SHIFTED = replace(AIR, viewpoint_shift=Gennery(e0=0.003))
 FREE = intrinsic_names(AIR)
 
@@ -52,7 +51,7 @@ def linear():
 
 @pytest.fixture(scope='module')
 def board(linear):
-    return Board.seen_in(linear.data.observations, linear.state.pose)
+    return FlatBoard.from_observations(linear.data.observations, linear.state.pose)
 
 
 @pytest.fixture(scope='module')
@@ -132,7 +131,7 @@ def test_chosen_photographs_tell_more_than_random_ones(linear, board, shots):
 
 
 def test_doubt_between_a_cause_and_its_look_alikes_is_settled(linear, board, shots):
-    effects = look_alikes(linear, ('radial_profile', 'target_shape'))
+    effects = confounded_effects(linear, ('radial_profile', 'target_shape'))
     design = Design(linear, effects, board, shots, NOISE)
     question = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
     _, answers = design.choose(question, 4)
@@ -167,11 +166,11 @@ def test_what_cannot_be_planned_is_refused(linear, board):
     with pytest.raises(ParameterError, match='no number of the lens'):
         next_photographs(linear, [], NOISE, 1, 'colour', ROOM)
     with pytest.raises(GeometryError, match='does not see the whole board from 50 to 60 m'):
-        candidate_shots(linear.state, board, Room(50.0, 60.0), np.random.default_rng(0))
+        candidate_shots(linear.state, board, ViewLimits(50.0, 60.0), np.random.default_rng(0))
     seen = linear.data.observations
     bent = replace(seen, xyz=seen.xyz + [0, 0, 1] * np.abs(seen.xyz[:, :1]))
     with pytest.raises(GeometryError, match='not one flat board'):
-        Board.seen_in(bent, linear.state.pose)
+        FlatBoard.from_observations(bent, linear.state.pose)
 
 
 def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
@@ -218,7 +217,7 @@ def test_no_view_lies_far_beyond_what_was_seen_or_the_nearest_edge_of_the_image(
     data = prepare(photographs(wide, None, 6))
     linear = Linearised(data, fit(data, start(data, wide), FREE), FREE)
     wanted = next_photographs(linear, [], NOISE, 6, room=ROOM)
-    limit = furthest(wide, 0.0)
+    limit = max_view_angle(wide, 0.0)
     assert limit == pytest.approx(wide.image_height.angle(AIR.height / AIR.fy), 0.02)
     for shots in (wanted.shots, plan(replace(wide, calibration={'reached_deg': 30.0}),
                                      board.points, ROOM, 6, None, NOISE).wanted.shots):

@@ -1,36 +1,45 @@
-"""What the next photographs are to settle: the doubt of a diagnosis, or a number's error."""
+"""Which photographs to take: all of them, of a lens known by its type, or those that come next.
+
+The next ones settle what a cause is confounded with, or minimize the standard error of a number.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Index
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.model import Linearised
-from fisheye_svp_ros.diagnosis.next_photographs import (
-    Board,
-    Design,
-    Question,
-    Room,
-    Shots,
-    candidate_shots,
-    furthest,
-    look_alikes,
-)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
-from fisheye_svp_ros.pose import quaternion_from_rotation
+from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.planning.optimal_design import (
+    Criterion,
+    Design,
+    FlatBoard,
+    Shots,
+    ViewLimits,
+    candidate_shots,
+    confounded_effects,
+    max_view_angle,
+)
+from fisheye_svp_ros.pose import identity, quaternion_from_rotation
+from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.simulate.simulation import blank_views
 
-_NEARER, _FURTHER = 0.7, 1.5  # than in the photographs that there are: still sharp, still in reach
+# Over those of the photographs that there are: still sharp, still in reach
+_MIN_DISTANCE_RATIO, _MAX_DISTANCE_RATIO = 0.7, 1.5
 
 
-class Next(NamedTuple):
+class NextViews(NamedTuple):
     """Wanted photographs, most telling first.
 
     asked: a number, a cause, or `lens`; others: what the cause may be mistaken for; unit: of the
@@ -45,7 +54,7 @@ class Next(NamedTuple):
     unit: str
     answers: tuple[float, ...]
     shots: Shots
-    board: Board
+    board: FlatBoard
 
     def to_list(self) -> list[dict[str, Any]]:
         """Return what diagnosis.json holds: a mapping a photograph, SI units."""
@@ -66,8 +75,8 @@ class Next(NamedTuple):
 
 def next_photographs(
     after: Linearised, causes: Sequence[Cause], noise: float, count: int,
-    number: str | None = None, room: Room | None = None,
-) -> Next:
+    number: str | None = None, room: ViewLimits | None = None,
+) -> NextViews:
     """Choose `count` photographs beside those of a fit, of the same board by the same camera.
 
     number: whose error is to shrink; by default what the causes may be mistaken for, then what
@@ -78,40 +87,41 @@ def next_photographs(
     if after.data.cameras > 1:
         raise GeometryError('the next photographs can be planned for one camera only')
     pose = after.state.view_poses(after.data)
-    board = Board.seen_in(after.data.observations, pose)
+    board = FlatBoard.from_observations(after.data.observations, pose)
     if room is None:
         away = np.linalg.norm(board.points.mean(axis=0) - pose.position, axis=-1)
-        room = Room(_NEARER * float(away.min()), _FURTHER * float(away.max()))
+        room = ViewLimits(_MIN_DISTANCE_RATIO * float(away.min()),
+                          _MAX_DISTANCE_RATIO * float(away.max()))
     views = after.data.views
     seen = pose.into_body(views.points)[views.used]
     reached = float(np.arccos((seen[:, 2] / np.linalg.norm(seen, axis=-1)).min()))
-    room = room._replace(field=min(room.field, furthest(after.state.lens, reached)))
+    room = room._replace(field=min(room.field, max_view_angle(after.state.lens, reached)))
     asked, others, effects = _asked(after, causes, number)
     shots = candidate_shots(after.state, board, room, np.random.default_rng(0))
     design = Design(after, effects, board, shots, noise)
     others = tuple(o for o in others if any(o == n.partition('.')[0] for n in design.names))
-    question = whole_lens(design) if asked == 'lens' else design.question(asked, others)
+    question = lens_criterion(design) if asked == 'lens' else design.question(asked, others)
     chosen, answers = design.choose(question, count)
-    return answered(design, asked, others, question, chosen, answers)
+    return next_views(design, asked, others, question, chosen, answers)
 
 
-def answered(
-    design: Design, asked: str, others: tuple[str, ...], question: Question, chosen: Index,
+def next_views(
+    design: Design, asked: str, others: tuple[str, ...], question: Criterion, chosen: Index,
     answers: Sequence[float],
-) -> Next:
+) -> NextViews:
     """Return chosen views with their answers, in the unit that they are told in."""
     unit = design.units[question.interest[0]] if len(question.interest) == 1 else ''
     if not (unit or others):
         # Before the first photograph of all nothing is known to compare with.
         first = answers[0 if design.known_views else 1]
         answers = [answer / first for answer in answers]
-    return Next(asked, others, unit, tuple(answers), design.shots.take(chosen), design.board)
+    return NextViews(asked, others, unit, tuple(answers), design.shots.take(chosen), design.board)
 
 
-def whole_lens(design: Design) -> Question:
+def lens_criterion(design: Design) -> Criterion:
     """Ask for all numbers of the lens itself, causes and what looks like them left open."""
     interest = np.flatnonzero(['.' not in name for name in design.names])
-    return Question(interest, np.setdiff1d(np.arange(len(design.names)), interest))
+    return Criterion(interest, np.setdiff1d(np.arange(len(design.names)), interest))
 
 
 def _asked(
@@ -126,7 +136,7 @@ def _asked(
     for cause in mine:
         if cause.indistinguishable_from:
             alike = tuple(cause.indistinguishable_from)
-            return cause.effect, alike, look_alikes(after, alike)
+            return cause.effect, alike, confounded_effects(after, alike)
     if mine:
         return mine[0].effect, (), []
     if after.free:
@@ -150,3 +160,53 @@ def _holding(after: Linearised, number: str) -> Effect:
             if number in (name, *(parameter.name for parameter in form.parameters)):
                 return form
     raise ParameterError(f'--for {number}: no number of the lens or of an effect has this name')
+
+
+class Plan(NamedTuple):
+    """Wanted photographs, and the standard errors of the lens to expect from them, by name."""
+
+    wanted: NextViews
+    stderr: dict[str, float]
+
+
+def plan(
+    lens: Lens, points: Array, room: ViewLimits, count: int, number: str | None, noise: float
+) -> Plan:
+    """Choose photographs of a board with points (N, 3), m, z into the board.
+
+    number: whose error is to be small, the whole lens by default; a viewpoint shift is left open.
+    Raises GeometryError where the lens does not see the board, ParameterError for a number that
+    it does not have.
+    """
+    board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
+    state = State(identity(1), identity(1), lens, ())
+    if lens.reached is not None:
+        room = room._replace(field=max_view_angle(lens, lens.reached))
+    shots = candidate_shots(state, board, room, np.random.default_rng(0))
+    blank = make_observations(np.zeros(len(points), int), board.landmark, 0.0 * points[:, :2],
+                              points)
+    views = blank_views(board.landmark, points, len(shots.distance))
+    data = Data(blank, views, np.arange(len(shots.distance)), np.zeros(len(shots.distance), int))
+    posed = State(shots.camera, identity(1), lens, ())
+    linear = Linearised(data, posed, intrinsic_names(lens))
+    design = Design(linear, [ViewpointShiftEffect(1)], board, shots, noise, known=False)
+    question = lens_criterion(design) if number is None else design.question(number)
+    chosen, answers = design.choose(question, count)
+    information = design.known + design.added[chosen].sum(axis=0)
+    errors = np.sqrt(np.diag(np.linalg.inv(information)))
+    return Plan(
+        next_views(design, number or 'lens', (), question, chosen, answers),
+        {name.rpartition('.')[2]: float(error)
+         for name, error in zip(design.names, errors, strict=True)},
+    )
+
+
+def nominal_lens(image_size: tuple[int, int], field: float) -> Lens:
+    """Return an equidistant lens of a type: its field over the width of the image, rad.
+
+    Where its image is a circle, corners beyond that hold nothing.
+    """
+    width, height = image_size
+    lens = Lens('lens', width, height, width / field, width / field, (width - 1) / 2,
+                (height - 1) / 2, KannalaBrandt(), 1.0)
+    return replace(lens, max_incidence=min(field / 2, field_of_view(lens)))

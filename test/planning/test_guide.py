@@ -7,15 +7,21 @@ import pytest
 from helpers.guide import LENS, POINTS, SHEET, present, seen_from, session
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.diagnosis import guide as module
 from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.guide import Guide, Seen, Stand, consider, observations_of
 from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.next_photographs import Board
-from fisheye_svp_ros.diagnosis.next_question import next_photographs
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.planning import guide as module
+from fisheye_svp_ros.planning.guide import (
+    DetectedBoard,
+    Guide,
+    SessionState,
+    evaluate_session,
+    observations_of,
+)
+from fisheye_svp_ros.planning.optimal_design import FlatBoard
+from fisheye_svp_ros.planning.plan import next_photographs
 from fisheye_svp_ros.pose import Pose
 
 SYMMETRIC = parse_pattern('chessboard:5x5:30mm').symmetries
@@ -23,8 +29,8 @@ SYMMETRIC = parse_pattern('chessboard:5x5:30mm').symmetries
 
 @pytest.fixture(scope='module')
 def first():
-    stand = consider(session())
-    assert isinstance(stand, Stand)
+    stand = evaluate_session(session())
+    assert isinstance(stand, SessionState)
     return stand
 
 
@@ -42,7 +48,7 @@ def shifted(seen, t, px):
 def wanted_view(guide, t=0.0):
     """Return what the outline shows, as if it were seen."""
     ids = np.arange(len(POINTS))
-    return Seen(t, ids, np.array(guide.outline), np.full(len(ids), 0.03))
+    return DetectedBoard(t, ids, np.array(guide.outline), np.full(len(ids), 0.03))
 
 
 def test_the_score_rises_while_the_board_approaches(first):
@@ -79,7 +85,7 @@ def test_a_board_that_looks_the_same_when_turned_may_be_turned(first):
     guide = Guide(replace(session(), points=points), orders)
     guide.adopt(first._replace(outline=(points[:, :2] * 1e3,)))
     half = next(turn.source for turn in SYMMETRIC if turn.source[0] == 24)
-    turned = Seen(0.0, np.arange(25), guide.outline[half], np.ones(25))
+    turned = DetectedBoard(0.0, np.arange(25), guide.outline[half], np.ones(25))
     guide.look(0.0, turned)
     assert guide.score == pytest.approx(1)
 
@@ -95,7 +101,7 @@ def test_a_view_that_cannot_be_had_is_given_up(first):
     assert guide.thinking and len(guide.session.room.taken) == ones
     middles = [first.wanted.shots.camera.take(i).into_body(POINTS).mean(axis=0)
                for i in range(ones)]
-    again = consider(guide.session)
+    again = evaluate_session(guide.session)
     for i in range(len(again.outline)):
         middle = again.wanted.shots.camera.take(i).into_body(POINTS).mean(axis=0)
         away = np.linalg.norm(middle - middles, axis=1)
@@ -103,7 +109,7 @@ def test_a_view_that_cannot_be_had_is_given_up(first):
 
 
 def test_views_are_whole_with_the_squares_around_their_corners(first):
-    board = Board(np.arange(len(POINTS)), POINTS, np.zeros(len(POINTS), int), np.eye(3))
+    board = FlatBoard(np.arange(len(POINTS)), POINTS, np.zeros(len(POINTS), int), np.eye(3))
     assert board.rim.min(axis=0) == pytest.approx([-0.03, -0.03, 0])
     for i in range(len(first.outline)):
         local = first.wanted.shots.camera.take(i).into_body(board.rim)
@@ -130,26 +136,26 @@ def test_one_photograph_moves_the_data_sheet_no_further_than_it_must(first):
 def test_of_a_board_seen_in_part_the_whole_is_wanted(first):
     seen = present(LENS, first, np.random.default_rng(1))
     part = np.arange(18)
-    seen = Seen(0.0, part, seen.uv[part], seen.sigma[part])
-    stand = consider(replace(session(), taken=(seen,)))
+    seen = DetectedBoard(0.0, part, seen.uv[part], seen.sigma[part])
+    stand = evaluate_session(replace(session(), taken=(seen,)))
     assert np.shape(stand.outline) == (len(stand.outline), len(POINTS), 2)
     guide = guided(stand)
     there = wanted_view(guide)
     finite = np.isfinite(there.uv).all(axis=1)
     assert finite[part].all()
-    guide.look(0.0, Seen(0.0, there.ids[part], there.uv[part], there.sigma[part]))
+    guide.look(0.0, DetectedBoard(0.0, there.ids[part], there.uv[part], there.sigma[part]))
     assert guide.score == pytest.approx(1)
 
 
 def test_from_a_data_sheet_to_a_settled_shift(first):
     """Somebody presents the wanted views, a little off; the shift is 3 mm, the goal 0.3 mm."""
     guide, rng = guided(first), np.random.default_rng(5)
-    while not guide.done:
+    while not guide.finished:
         assert len(guide.session.taken) < 12
         seen = present(LENS, guide.stand, rng)
         guide.session = replace(guide.session, taken=(*guide.session.taken, seen))
-        stand = consider(guide.session)
-        assert isinstance(stand, Stand), stand
+        stand = evaluate_session(guide.session)
+        assert isinstance(stand, SessionState), stand
         guide.adopt(stand)
     assert guide.stand.settled and guide.stand.named == ('viewpoint_shift',)
     assert guide.stand.stderr <= 3e-4
@@ -172,8 +178,8 @@ def test_hope_to_tell_a_look_alike_ends(first, monkeypatch):
     monkeypatch.setattr(module, 'diagnose', alike)
     monkeypatch.setattr(module, 'next_photographs', hopeful)
     taken = tuple(present(LENS, first, rng) for _ in range(10))
-    few = consider(replace(session(), taken=taken[:9], goal=1.0))
-    many = consider(replace(session(), taken=taken, goal=1.0))
+    few = evaluate_session(replace(session(), taken=taken[:9], goal=1.0))
+    many = evaluate_session(replace(session(), taken=taken, goal=1.0))
     assert not few.settled and few.alike == many.alike == ('flat_port',)
     assert many.settled and len(found) == 3
 
@@ -186,7 +192,7 @@ def test_what_fails_is_left_out(first, monkeypatch):
     guide.fail()
     assert guide.thinking and guide.session.taken == (seen,)
     nowhere = replace(session(), room=session().room._replace(near=50.0, far=60.0))
-    assert isinstance(consider(nowhere), GeometryError)
-    monkeypatch.setattr(module, 'MOST', 1)
+    assert isinstance(evaluate_session(nowhere), GeometryError)
+    monkeypatch.setattr(module, 'MAX_PHOTOGRAPHS', 1)
     guide.adopt(first)
-    assert guide.done and guide.outline is None
+    assert guide.finished and guide.outline is None

@@ -1,8 +1,8 @@
 """A live guide: which view of the board is wanted now, whether it is there, when enough is known.
 
-`Guide` follows the board from image to image, which takes no time; `consider` solves what the
-photographs so far tell, and which one is wanted next, which takes a second: from the data sheet of
-the lens (`diagnosis.plan`), then with the lens as fitted so far, then with a diagnosis.
+`Guide` follows the board from image to image, which takes no time; `evaluate_session` solves what
+the photographs so far tell, and which one is wanted next, which takes a second: from the data
+sheet of the lens (`planning.plan`), then with the lens as fitted so far, then with a diagnosis.
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.next_photographs import Room
-from fisheye_svp_ros.diagnosis.next_question import Next, next_photographs
-from fisheye_svp_ros.diagnosis.plan import plan
 from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view
+from fisheye_svp_ros.planning.optimal_design import ViewLimits
+from fisheye_svp_ros.planning.plan import NextViews, next_photographs, plan
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 
-MOST = 40  # photographs; with so many what is still open stays open
-ENOUGH = 0.8  # score of a view that is taken
-_AHEAD = 4  # views chosen together
-_JUDGED = 6  # photographs before the first diagnosis
-_STILL, _STANDS = 0.003, 0.5  # of the image's width, and s
-_KEPT = 200  # images
-_PATIENCE = 20.0  # s; then a view is one that cannot be had
-_LIVE = 0.1  # px, noise where the detector does not say
-HOPE = 0.3  # that a few more photographs tell two causes apart, below which none will
-_HOPING = _JUDGED + _AHEAD  # photographs; what they have not told apart, more will not
+MAX_PHOTOGRAPHS = 40  # photographs; with so many what is still open stays open
+MIN_SCORE = 0.8  # score of a view that is taken
+_VIEWS_AHEAD = 4  # views chosen together
+_MIN_DIAGNOSED = 6  # photographs before the first diagnosis
+_MAX_MOTION, _STANDSTILL = 0.003, 0.5  # of the image's width, and s
+_MAX_IMAGES = 200  # images
+_VIEW_TIMEOUT = 20.0  # s; then a view is one that cannot be had
+_DEFAULT_NOISE = 0.1  # px, noise where the detector does not say
+MIN_PROBABILITY = 0.3  # that a few more photographs tell two causes apart, below which none will
+# photographs; what they have not told apart, more will not
+_MAX_UNDECIDED = _MIN_DIAGNOSED + _VIEWS_AHEAD
 _EFFECT = ViewpointShiftEffect(1)
 
 NUMBERS = (_EFFECT.parameters[0].name, *INTRINSICS, 'k1', 'k2', 'k3', 'k4')
 
 
-class Seen(NamedTuple):
+class DetectedBoard(NamedTuple):
     """A board in an image: time, s; points (M,) of the pattern, uv (M, 2) and sigma (M,), px."""
 
     t: float
@@ -66,14 +66,14 @@ class Session:
 
     lens: Lens
     points: Array
-    room: Room
+    room: ViewLimits
     number: str
     goal: float
-    taken: tuple[Seen, ...] = ()
+    taken: tuple[DetectedBoard, ...] = ()
     latest: tuple[Lens, float] | None = None
 
 
-class Stand(NamedTuple):
+class SessionState(NamedTuple):
     """Where matters stand.
 
     wanted: views, best first; outline: of each, its points (N, 2), px, NaN outside the field;
@@ -82,7 +82,7 @@ class Stand(NamedTuple):
     photographs could take away; latest: lens and e0, for the next session.
     """
 
-    wanted: Next
+    wanted: NextViews
     outline: tuple[Array, ...]
     value: float | None
     stderr: float | None
@@ -92,31 +92,32 @@ class Stand(NamedTuple):
     latest: tuple[Lens, float] | None
 
 
-def consider(session: Session) -> Stand | Exception:
+def evaluate_session(session: Session) -> SessionState | Exception:
     """Return what the photographs tell and which is wanted next; errors are returned, too."""
     try:
-        return _considered(session)
+        return _evaluate(session)
     except Exception as error:
         return error
 
 
-def _considered(session: Session) -> Stand:
+def _evaluate(session: Session) -> SessionState:
     number, room = session.number, session.room
     if not session.taken:
-        wanted = plan(session.lens, session.points, room, _AHEAD, number, _LIVE).wanted
-        return _stand(session, ForwardModel(session.lens), wanted)
+        planned = plan(session.lens, session.points, room, _VIEWS_AHEAD, number, _DEFAULT_NOISE)
+        return _session_state(session, ForwardModel(session.lens), planned.wanted)
     table = observations_of(session.taken, session.points)
-    linear = _refitted(session, table)
+    linear = _refit(session, table)
     lens, ((_, shift), *_) = linear.state.lens, linear.state.terms
     session = replace(session, latest=(lens, float(shift[0])))
-    if len(session.taken) >= _JUDGED:
+    if len(session.taken) >= _MIN_DIAGNOSED:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
-            return _judged(session, posable(table, lens)[0], lens)
-    wanted = next_photographs(linear, (), _noise(linear), _AHEAD, number, room)
-    return _stand(session, _model(linear), wanted, _value(linear, number), wanted.answers[0])
+            return _diagnose_session(session, posable(table, lens)[0], lens)
+    wanted = next_photographs(linear, (), _noise(linear), _VIEWS_AHEAD, number, room)
+    return _session_state(
+        session, _model(linear), wanted, _value(linear, number), wanted.answers[0])
 
 
-def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
+def _diagnose_session(session: Session, table: Observations, lens: Lens) -> SessionState:
     """Return where matters stand by a diagnosis.
 
     Settled once the number is known and what it belongs to is told from all else, or cannot be.
@@ -128,21 +129,22 @@ def _judged(session: Session, table: Observations, lens: Lens) -> Stand:
         names = cause.effect, *cause.indistinguishable_from
         if len(names) == 1 or _EFFECT.name not in names:
             continue
-        wanted = next_photographs(found.after, (cause,), found.noise_px, _AHEAD, room=room)
-        if wanted.answers[-1] > HOPE and len(session.taken) < _HOPING:
-            return _stand(session, _model(found.after), wanted, named=(cause.effect,),
+        wanted = next_photographs(found.after, (cause,), found.noise_px, _VIEWS_AHEAD, room=room)
+        if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
+            return _session_state(session, _model(found.after), wanted, named=(cause.effect,),
                           alike=names[1:])
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
         found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(left_out=alike))
         break
-    wanted = next_photographs(found.after, found.causes, found.noise_px, _AHEAD, number, room)
+    wanted = next_photographs(
+        found.after, found.causes, found.noise_px, _VIEWS_AHEAD, number, room)
     value, stderr = _value(found.after, number), wanted.answers[0]
     for cause in found.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
-    return _stand(session, _model(found.after), wanted, value, stderr,
+    return _session_state(session, _model(found.after), wanted, value, stderr,
                   tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
 
 
@@ -153,15 +155,16 @@ def _model(linear: Linearised) -> ForwardModel:
     return ForwardModel(linear.state.lens, terms)
 
 
-def _stand(
-    session: Session, model: ForwardModel, wanted: Next, value: float | None = None,
+def _session_state(
+    session: Session, model: ForwardModel, wanted: NextViews, value: float | None = None,
     stderr: float | None = None, named: tuple[str, ...] = (), alike: tuple[str, ...] = (),
     settled: bool = False,
-) -> Stand:
+) -> SessionState:
     count = len(session.points)
     views = blank_views(np.arange(count), session.points, len(wanted.shots.distance))
     outline = model.predict(wanted.shots.camera, views).uv
-    return Stand(wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
+    return SessionState(
+        wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
 
 
 def _value(linear: Linearised, number: str) -> float:
@@ -172,7 +175,7 @@ def _value(linear: Linearised, number: str) -> float:
     return values.get(number, 0.0)
 
 
-def _refitted(session: Session, table: Observations) -> Linearised:
+def _refit(session: Session, table: Observations) -> Linearised:
     """Return lens and e0 as far as the photographs tell them; the data sheet says the rest."""
     lens, shift = session.latest or (session.lens, 0.0)
     data, free = prepare(table), intrinsic_names(lens)
@@ -200,7 +203,7 @@ def _noise(linear: Linearised) -> float:
     return max(stated, float(np.sqrt(px @ px / max(px.size - unknown, 1))))
 
 
-def observations_of(taken: Sequence[Seen], points: Array) -> Observations:
+def observations_of(taken: Sequence[DetectedBoard], points: Array) -> Observations:
     """Return photographs of a board with points (N, 3), m, as a table; frames count from 0."""
     count = [len(seen.ids) for seen in taken]
     ids = np.concatenate([seen.ids for seen in taken])
@@ -208,7 +211,7 @@ def observations_of(taken: Sequence[Seen], points: Array) -> Observations:
     return make_observations(
         np.repeat(np.arange(len(taken)), count), ids, np.concatenate([s.uv for s in taken]),
         points[ids], t=np.repeat([seen.t for seen in taken], count),
-        sigma=np.where(np.isfinite(sigma), sigma, _LIVE), source='guide',
+        sigma=np.where(np.isfinite(sigma), sigma, _DEFAULT_NOISE), source='guide',
     )
 
 
@@ -222,32 +225,33 @@ class Guide:
 
     session: Session
     orders: Index
-    stand: Stand | None = None
+    stand: SessionState | None = None
     score: float = 0.0
     thinking: bool = True
     place: int = 0
     _since: float | None = None
-    _last: deque[Seen] = field(default_factory=lambda: deque(maxlen=_KEPT))
+    _last: deque[DetectedBoard] = field(default_factory=lambda: deque(maxlen=_MAX_IMAGES))
 
     @property
     def outline(self) -> Array | None:
         """The points of the wanted view (N, 2), px; None while there is none."""
-        if self.stand is None or self.thinking or self.done:
+        if self.stand is None or self.thinking or self.finished:
             return None
         return self.stand.outline[self.place]
 
     @property
-    def done(self) -> bool:
+    def finished(self) -> bool:
         """Whether no further photograph is wanted."""
-        return self.stand is not None and (self.stand.settled or len(self.session.taken) >= MOST)
+        return self.stand is not None and (
+            self.stand.settled or len(self.session.taken) >= MAX_PHOTOGRAPHS)
 
-    def adopt(self, stand: Stand) -> None:
+    def adopt(self, stand: SessionState) -> None:
         """Go on with what has been considered."""
         self.session = replace(self.session, latest=stand.latest)
         self.stand, self.thinking, self.place, self._since = stand, False, 0, None
         self.score = 0.0
 
-    def look(self, t: float, seen: Seen | None) -> bool:
+    def look(self, t: float, seen: DetectedBoard | None) -> bool:
         """Take note of an image at a time, s; return whether it is taken as a photograph."""
         outline = self.outline
         if outline is None:
@@ -257,30 +261,30 @@ class Guide:
             self._since = t
             self._last.clear()
         self.score = 0.0 if seen is None else self._likeness(seen, outline)
-        if seen is not None and self._stands(seen) and self.score >= ENOUGH:
+        if seen is not None and self._is_still(seen) and self.score >= MIN_SCORE:
             self.session = replace(self.session, taken=(*self.session.taken, seen))
             self.thinking = True
             return True
-        if t - self._since > _PATIENCE:
-            self._give_up()
+        if t - self._since > _VIEW_TIMEOUT:
+            self._skip_view()
         return False
 
-    def _likeness(self, seen: Seen, outline: Array) -> float:
+    def _likeness(self, seen: DetectedBoard, outline: Array) -> float:
         """Return 1 / (1 + d / r): d apart, r the size of the wanted view, root mean squares."""
         size = np.nanvar(outline, axis=0).sum()
         apart = [np.nanmean(((outline[order[seen.ids]] - seen.uv) ** 2).sum(axis=1))
                  for order in self.orders]
         return float(1 / (1 + np.sqrt(min(apart) / size)))
 
-    def _stands(self, seen: Seen) -> bool:
+    def _is_still(self, seen: DetectedBoard) -> bool:
         """Whether the board has stood still long enough."""
         last = self._last
         last.append(seen)
-        while seen.t - last[0].t > _STANDS and len(last) > 2 and seen.t - last[1].t >= _STANDS:
+        while len(last) > 2 and seen.t - last[1].t >= _STANDSTILL < seen.t - last[0].t:
             last.popleft()
-        if seen.t - last[0].t < _STANDS:
+        if seen.t - last[0].t < _STANDSTILL:
             return False
-        most = _STILL * self.session.lens.width
+        most = _MAX_MOTION * self.session.lens.width
         for one in last:
             _, mine, theirs = np.intersect1d(seen.ids, one.ids, return_indices=True)
             moved = np.abs(seen.uv[mine] - one.uv[theirs])
@@ -294,7 +298,7 @@ class Guide:
         self.session = replace(self.session, taken=self.session.taken[:-1], room=room, latest=None)
         self.thinking = True
 
-    def _give_up(self) -> None:
+    def _skip_view(self) -> None:
         """Ask for another view; where the board would have been it cannot be."""
         assert self.stand is not None
         wanted, session, self._since = self.stand.wanted, self.session, None
@@ -313,4 +317,4 @@ def start_session(
     furthest distance of the board, m.
     """
     open_lens = replace(lens, max_incidence=field_of_view(lens))
-    return Session(open_lens, points, Room(*room, field=lens.max_incidence), number, goal)
+    return Session(open_lens, points, ViewLimits(*room, field=lens.max_incidence), number, goal)
