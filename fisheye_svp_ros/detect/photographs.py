@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fisheye_svp_ros.detect.image_messages import image_pixels
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.files import read_bytes
@@ -33,20 +34,6 @@ _PNG = b'\x89PNG\r\n\x1a\n'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
 _ORIENTATION = re.compile(
     rb'Exif\0\0(?:(II)|MM).{8}(?:.{12})*?(?:\x12\x01\x03\0.{4}|\x01\x12\0\x03.{4})(..)', re.DOTALL)
-# Image encodings of sensor_msgs: type, channels, and what makes grey of them
-_ENCODINGS: dict[str, tuple[type, int, int | None]] = {
-    'mono8': (np.uint8, 1, None), '8UC1': (np.uint8, 1, None),
-    'mono16': (np.uint16, 1, None), '16UC1': (np.uint16, 1, None),
-    'rgb8': (np.uint8, 3, cv2.COLOR_RGB2GRAY), 'bgr8': (np.uint8, 3, cv2.COLOR_BGR2GRAY),
-    'rgba8': (np.uint8, 4, cv2.COLOR_RGBA2GRAY), 'bgra8': (np.uint8, 4, cv2.COLOR_BGRA2GRAY),
-    'bayer_rggb8': (np.uint8, 1, cv2.COLOR_BayerBG2GRAY),
-    'bayer_bggr8': (np.uint8, 1, cv2.COLOR_BayerRG2GRAY),
-    'bayer_gbrg8': (np.uint8, 1, cv2.COLOR_BayerGR2GRAY),
-    'bayer_grbg8': (np.uint8, 1, cv2.COLOR_BayerGB2GRAY),
-    'yuv422': (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
-    'uyvy': (np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY),
-    'yuv422_yuy2': (np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,27 +180,11 @@ def exif_turned(data: bytes) -> bool:
 def message_pixels(message: Any, typename: str, name: str) -> Pixels:
     """Return a sensor_msgs Image or CompressedImage in grey.
 
-    Raises ObservationError for an encoding without one, or data that are too short.
+    Raises ObservationError for an encoding without brightness, or data that are too short.
     """
-    data = bytes(message.data)
     if typename.endswith('CompressedImage'):
-        return decoded(data, name)
-    if message.encoding not in _ENCODINGS:
-        raise ObservationError(f'{name}: encoding {message.encoding!r} is not one of '
-                               f'{", ".join(_ENCODINGS)}')
-    kind, channels, grey = _ENCODINGS[message.encoding]
-    dtype = np.dtype(kind).newbyteorder('>' if message.is_bigendian else '<')
-    width = message.width * channels * dtype.itemsize
-    if not 0 < width <= message.step or not 0 < message.step * message.height <= len(data):
-        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
-                               f'{message.width}x{message.height} {message.encoding}')
-    rows = np.frombuffer(data, np.uint8)[:message.step * message.height]
-    rows = np.ascontiguousarray(rows.reshape(message.height, message.step)[:, :width])
-    pixels: Pixels = rows.view(dtype).astype(kind, copy=False)
-    if grey is None:
-        return pixels
-    shape = pixels.shape if channels == 1 else (message.height, message.width, channels)
-    return np.asarray(cv2.cvtColor(pixels.reshape(shape), grey))
+        return decoded(bytes(message.data), name)
+    return image_pixels(message, name)
 
 
 def _source(path: Path) -> Iterator[Photograph]:

@@ -86,11 +86,15 @@ def _raw_points(cloud: Any, what: str) -> Points:
         )
     fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields)
     layout = _layout(fields, step, bool(cloud.is_bigendian), what)
-    if len(cloud.data) != step * count:
+    data, row_step = cloud.data, int(cloud.row_step)
+    if row_step > step * cloud.width and len(data) == row_step * cloud.height > 0:
+        rows = np.frombuffer(data, np.uint8).reshape(cloud.height, row_step)
+        data = rows[:, :step * cloud.width].tobytes()  # without the padding of the rows
+    if len(data) != step * count:
         raise ObservationError(
             f'{what}: {len(cloud.data)} bytes of data do not hold {count} points of {step} bytes'
         )
-    return np.frombuffer(cloud.data, dtype=layout) if count else np.empty(0, dtype=layout)
+    return np.frombuffer(data, dtype=layout) if count else np.empty(0, dtype=layout)
 
 
 @lru_cache(maxsize=64)

@@ -36,11 +36,10 @@ from fisheye_svp_ros.detect.photographs import (
     doubtful_folders,
     exif_turned,
     find_photographs,
-    message_pixels,
 )
 from fisheye_svp_ros.detect.points import _least_square, find_points
 from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
-from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import project
@@ -508,32 +507,6 @@ class TestPhotographs:
         assert not exif_turned(head + entry.replace(b'\x06', b'\x01'))
         big = b'\xff\xd8\xff\xe1\x00\x22Exif\0\0MM\0*\0\0\0\x08\0\x01'
         assert exif_turned(big + b'\x01\x12\x00\x03\x00\x00\x00\x01\x00\x08\x00\x00')
-
-    @pytest.mark.parametrize(('encoding', 'shape'), [
-        ('mono8', (4, 6)), ('bgr8', (4, 6, 3)), ('rgba8', (4, 6, 4)), ('bayer_rggb8', (4, 6)),
-        ('mono16', (4, 6)), ('yuv422_yuy2', (4, 6, 2)),
-    ])
-    def test_messages(self, encoding: str, shape: tuple[int, ...]) -> None:
-        class Message:
-            height, width, is_bigendian = 4, 6, 0
-
-        message = Message()
-        kind = np.uint16 if encoding == 'mono16' else np.uint8
-        rows = np.full(shape, 100, kind)
-        message.encoding, message.step = encoding, rows.nbytes // 4 + 3
-        padded = np.pad(rows.view(np.uint8).reshape(4, -1), ((0, 0), (0, 3)))
-        message.data = padded.tobytes()
-        pixels = message_pixels(message, 'sensor_msgs/msg/Image', 'one')
-        assert pixels.shape == (4, 6)
-        assert np.abs(pixels.astype(int) - 100).max() <= 16
-        for empty in ('width', 'height'):
-            setattr(message, empty, 0)
-            with pytest.raises(ObservationError, match='do not hold'):
-                message_pixels(message, 'sensor_msgs/msg/Image', 'one')
-            delattr(message, empty)
-        message.data = message.data[:-8]
-        with pytest.raises(FisheyeSvpError, match='do not hold'):
-            message_pixels(message, 'sensor_msgs/msg/Image', 'one')
 
 
 class TestCameras:

@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2, PointField  # isort: skip
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import RESIDUALS, structured, unpack
+from fisheye_svp_ros.io.clouds import IMAGE_POINTS, RESIDUALS, structured, unpack
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -72,6 +72,20 @@ def test_other_field_order_width_and_endianness_are_read() -> None:
     message.data = array('B', raw.tobytes())
     back = decoding.read_image_points(message)
     assert back.uv.tolist() == [[2.5, 1.5]] and back.landmark.tolist() == [7]
+
+
+def test_rows_that_are_padded_are_read() -> None:
+    points = structured(IMAGE_POINTS, np.arange(6), np.arange(6.0), np.arange(6.0) + 10)
+    message = messages.cloud_message(points, STAMP, 'camera')
+    message.height, message.width = 2, 3
+    message.row_step = 3 * message.point_step + 5
+    rows = np.pad(np.frombuffer(points.tobytes(), np.uint8).reshape(2, -1), ((0, 0), (0, 5)))
+    message.data = array('B', rows.tobytes())
+    back = decoding.read_image_points(message)
+    assert back.landmark.tolist() == [*range(6)] and back.uv[:, 1].tolist() == [*range(10, 16)]
+    message.data = message.data[:-5]
+    with pytest.raises(ObservationError, match='do not hold 6 points'):
+        decoding.read_image_points(message)
 
 
 def test_an_empty_cloud_holds_no_image_points() -> None:

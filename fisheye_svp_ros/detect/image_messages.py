@@ -1,0 +1,82 @@
+"""The raw images of sensor_msgs in grey, whatever their encoding."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.errors import ObservationError
+
+
+class _Encoding(NamedTuple):
+    """Numbers of a pixel, what makes grey of them, and the bytes of the planes behind them.
+
+    planes: bytes that follow for each byte of the grey plane.
+    """
+
+    kind: type
+    channels: int
+    grey: int | None = None
+    planes: float = 0.0
+
+
+def _encodings() -> dict[str, _Encoding]:
+    """Return all that show brightness; those without an order of colors have OpenCV's."""
+    known = {f'nv{number}': _Encoding(np.uint8, 1, None, planes)
+             for number, planes in (('12', 0.5), ('21', 0.5), ('24', 2.0))}
+    for name, kind in (('8', np.uint8), ('16', np.uint16)):
+        known |= {f'mono{name}': _Encoding(kind, 1), f'{name}UC1': _Encoding(kind, 1),
+                  f'{name}UC3': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
+                  f'{name}UC4': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY),
+                  f'rgb{name}': _Encoding(kind, 3, cv2.COLOR_RGB2GRAY),
+                  f'bgr{name}': _Encoding(kind, 3, cv2.COLOR_BGR2GRAY),
+                  f'rgba{name}': _Encoding(kind, 4, cv2.COLOR_RGBA2GRAY),
+                  f'bgra{name}': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY)}
+        # OpenCV calls a pattern by its second row.
+        for pattern, grey in (('rggb', cv2.COLOR_BayerBG2GRAY), ('bggr', cv2.COLOR_BayerRG2GRAY),
+                              ('gbrg', cv2.COLOR_BayerGR2GRAY), ('grbg', cv2.COLOR_BayerGB2GRAY)):
+            known[f'bayer_{pattern}{name}'] = _Encoding(kind, 1, grey)
+    known |= {name: _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY) for name in ('yuv422', 'uyvy')}
+    known |= {name: _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2)
+              for name in ('yuv422_yuy2', 'yuyv')}
+    return known
+
+
+_ENCODINGS = _encodings()
+# What others are: signed, of 32 or 64 bit, or of two channels
+_NO_BRIGHTNESS = ('8SC', '16SC', '32SC', '32FC', '64FC', '8UC', '16UC')
+
+
+def image_pixels(message: Any, name: str) -> NDArray[Any]:
+    """Return a sensor_msgs Image in grey (H, W), uint8 or uint16.
+
+    Raises ObservationError for an encoding without brightness, or data that are too short.
+    """
+    encoding = _ENCODINGS.get(message.encoding)
+    if encoding is None:
+        raise ObservationError(f'{name}: encoding {_why_not(message.encoding)}')
+    dtype = np.dtype(encoding.kind).newbyteorder('>' if message.is_bigendian else '<')
+    data, height, step = bytes(message.data), message.height, message.step
+    width = message.width * encoding.channels * dtype.itemsize
+    if not 0 < width <= step or not 0 < step * height * (1 + encoding.planes) <= len(data):
+        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
+                               f'{message.width}x{height} {message.encoding}')
+    rows = np.frombuffer(data, np.uint8)[:step * height]
+    rows = np.ascontiguousarray(rows.reshape(height, step)[:, :width])
+    pixels: NDArray[Any] = rows.view(dtype).astype(encoding.kind, copy=False)
+    if encoding.grey is None:
+        return pixels
+    if encoding.channels > 1:
+        pixels = pixels.reshape(height, message.width, encoding.channels)
+    return np.asarray(cv2.cvtColor(pixels, encoding.grey))
+
+
+def _why_not(encoding: str) -> str:
+    reason = 'unknown'
+    if encoding.rstrip('0123456789') in _NO_BRIGHTNESS:
+        reason = 'not of brightness: depth, vectors or signed numbers, say'
+    return f'{encoding[:40]!r} is {reason}; have the driver send mono8, bgr8 or another of ' \
+           f'{", ".join(_ENCODINGS)}'
