@@ -8,6 +8,8 @@ ROS := $(if $(shell $(PYTHON) -c 'import rclpy.node; print("sourced")' 2>&-),,$(
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# Further arguments of pytest, for example PYTEST='-k lens'.
+PYTEST ?=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
@@ -19,7 +21,7 @@ demo: $(VENV)/ready
 # One thread each for NumPy, since the tests are spread over all cores.
 test test-oldest: export OMP_NUM_THREADS := 1
 test: $(VENV)/ready lint
-	$(BIN)/python -m pytest -n auto --dist loadgroup
+	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -65,7 +65,7 @@ setup(
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
-            'hypothesis>=6.80',
+            'hypothesis>=6.80', 'pytest-cov>=4.1',
         ],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.0', 'types-PyYAML', 'scipy-stubs'],
     },
