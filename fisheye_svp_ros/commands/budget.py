@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.io.files import together
 
 # Limits by quantity: option, unit, factor from the unit to SI.
@@ -47,7 +48,6 @@ def run(args: argparse.Namespace) -> None:
     import numpy as np
 
     from fisheye_svp_ros.io.files import write_json
-    from fisheye_svp_ros.io.lens_files import load_lens
     from fisheye_svp_ros.io.share import lens_path
     from fisheye_svp_ros.reporting.budget_report import Asked, answer, document, draw, rows
     from fisheye_svp_ros.reporting.progress import progress
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.scene.rigs import rig
     from fisheye_svp_ros.study.budget import Setup, at_point, make_budget, usual_spread
 
-    lens = load_lens(lens_path(args.lens))
+    lens = load_with_notes(lens_path(args.lens))
     spread = usual_spread(lens) if args.spread is None else np.radians(args.spread).item()
     limits = _limits(args)
     with progress('solving'):

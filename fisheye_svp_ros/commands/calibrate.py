@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, note_left_out, say
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
@@ -22,7 +23,7 @@ from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.io.files import together, write_json
-from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> None:
     observations, sizes = measured(args.observations, args)
     sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
     if args.lens:
-        air = load_lens(args.lens)
+        air = load_with_notes(args.lens)
         check_sizes(args.observations, sizes, {'': air})
         sizes = {'': (air.width, air.height)}
     unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
@@ -112,7 +113,7 @@ def _calibrated(
 
     port = port_of(args)
     note_huge(table)
-    air = load_lens(args.lens) if args.lens else None
+    air = load_with_notes(args.lens) if args.lens else None
 
     def fitted(rows: Observations) -> Calibration:
         if air and port:

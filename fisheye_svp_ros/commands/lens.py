@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
-from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
+from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace) -> None:
         if args.output:
             save_rig(foreign.rigs[0], args.output)
         return
-    lens = load_lens(path)
+    lens = load_with_notes(path)
     if several := cameras_in(path):
         say(f'{path}: it holds {", ".join(several)}; this is the first, {path}#{several[1]} is '
             'another')
@@ -52,10 +53,14 @@ def run(args: argparse.Namespace) -> None:
           ' deg')
     for name, value in lens.parameters.items():
         print(f'  {name:<18}{value:.10g}')
+    for name, entry in lens.corrections.items():
+        for parameter, value in entry.get('parameters', {}).items():
+            print(f'  {f"{name} {parameter}":<18} {value:.10g}')
     if foreign is not None:
         for camera, worst in foreign.worst_px.items():
             if worst > 0:
-                print(f'  {camera}: a fit of kannala_brandt, {worst:.2g} px off at worst')
+                print(f'  {camera}: a fit of kannala_brandt to {foreign.form}, {worst:.2g} px off '
+                      'at worst')
         _rigs(foreign)
     if args.output and args.format:
         text = write_foreign(lens, args.format)
@@ -78,7 +83,8 @@ def _lost(lens: Lens, written: Lens) -> None:
     from fisheye_svp_ros.reporting.tables import print_table
 
     port = () if lens.port is None else (PORT,)
-    named = [name for name in (*port, *lens.corrections, *lens.target) if name != LANDMARKS]
+    own = [name for name in lens.corrections if name not in written.corrections]
+    named = [name for name in (*port, *own, *lens.target) if name != LANDMARKS]
     if lens.viewpoint_shift is not None and written.viewpoint_shift != lens.viewpoint_shift:
         named.insert(0, 'the viewpoint shift')
     if named:

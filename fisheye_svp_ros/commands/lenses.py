@@ -6,10 +6,13 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file
 from fisheye_svp_ros.io.share import is_there, lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
+
+LARGE_DEVIATION = 0.5  # px, of a lens from what another tool's file says
 
 
 def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> None:
@@ -18,6 +21,26 @@ def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> Non
                         help=f'{purpose}a lens file, also of other tools, or the name of one that '
                         'comes with the package; left=LENS and right=LENS for a rig, or a file '
                         'or folder that holds both')
+
+
+def load_with_notes(path: str | Path) -> Lens:
+    """Return the lens of a file; say what is odd about it.
+
+    Raises LensError for one that cannot be read.
+    """
+    lens, foreign = load_lens(path), read_lens_file(path)
+    note_odd(lens, path, foreign.deviation_px(lens) if foreign else 0.0)
+    return lens
+
+
+def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
+    """Say where a lens may not be what is meant; worst: px from what another tool's file says."""
+    if not (-0.5 <= lens.cx <= lens.width - 0.5 and -0.5 <= lens.cy <= lens.height - 0.5):
+        say(f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
+            f'of {lens.width}x{lens.height} px; check cx, cy and the image size')
+    if worst > LARGE_DEVIATION:
+        say(f'{path}: no lens here comes nearer than {worst:.2g} px to the model of this file; '
+            'calibrate anew from its photographs')
 
 
 class Lenses(dict[str, 'Lens']):
@@ -43,7 +66,7 @@ def load_lenses(given: Sequence[str]) -> Lenses:
         if camera in lenses:
             raise LensError(f'--lens {text}: there is one {camera or "without a camera"} already')
         file = lens_path(path)
-        lenses[camera] = load_lens(file)
+        lenses[camera] = load_with_notes(file)
         if not camera:
             lenses.names = cameras_in(file)
             lenses.in_file = tuple(load_lens(f'{file}#{name}') for name in lenses.names)

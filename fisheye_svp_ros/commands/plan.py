@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import together, write_json
-from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import incidence
@@ -110,7 +110,7 @@ def _lens(args: argparse.Namespace) -> Lens:
     if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
         raise ParameterError('which lens is it? Give --lens LENS, or --fov and --image-size')
     if args.lens is not None:
-        return load_lens(lens_path(args.lens))
+        return load_with_notes(lens_path(args.lens))
     if not 0 < args.fov < 360:
         raise ParameterError(f'--fov {args.fov:g}: an angle between 0 and 360 degrees is needed')
     try:

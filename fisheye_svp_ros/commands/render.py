@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import together, write_bytes
-from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
     if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
         raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
                              'finite')
-    lens, rng = load_lens(lens_path(args.lens)), np.random.default_rng(args.seed)
+    lens, rng = load_with_notes(lens_path(args.lens)), np.random.default_rng(args.seed)
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:
         printed = Print(pattern.columns, pattern.rows, pattern.size,

@@ -37,11 +37,14 @@ class ImagePoints(NamedTuple):
 
 
 class CameraModel(NamedTuple):
-    """A CameraInfo: distortion model; width, height, px; fx, fy, cx, cy, px; coefficients."""
+    """A CameraInfo: distortion model; width, height, px; intrinsics; coefficients.
+
+    intrinsics: fx, fy, cx, cy and skew, px.
+    """
 
     model: str
     size: tuple[int, int]
-    intrinsics: tuple[float, float, float, float]
+    intrinsics: tuple[float, float, float, float, float]
     d: tuple[float, ...]
 
 
@@ -115,7 +118,7 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
     if part or max(message.binning_x, message.binning_y) > 1:
         raise ObservationError(f'{topic}: of a part of the image, or binned; whole images are '
                                'needed')
-    return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5]), d)
+    return CameraModel(str(message.distortion_model), size, (k[0], k[4], k[2], k[5], k[1]), d)
 
 
 def statuses(message: Any) -> list[Status]:

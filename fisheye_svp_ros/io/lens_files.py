@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Set
 from dataclasses import replace
 from functools import reduce
@@ -16,7 +17,7 @@ from fisheye_svp_ros.effects.target import LANDMARKS, Target
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
-from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
+from fisheye_svp_ros.io.lens_formats import READABLE, Foreign, read_foreign
 from fisheye_svp_ros.io.share import without_camera
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
@@ -31,6 +32,7 @@ _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift'
 LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
+OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
@@ -44,6 +46,9 @@ def load_lens(path: str | Path) -> Lens:
     text, camera = _read(path)
     foreign = read_foreign(path, text)
     if foreign is None and not camera:
+        if not OWN_SECTIONS.search(text):
+            raise LensError(f'{path}: no lens file: it has no projection, and is none of '
+                            f'{READABLE}')
         return lens_from_dict(parse_yaml(text, path, LensError), str(path))
     lenses = foreign.lenses if foreign else {}
     if foreign and not lenses:

@@ -141,7 +141,8 @@ def info(**changes: Any) -> Any:
 
 def test_what_a_camera_info_says() -> None:
     model = read_camera_info(info())
-    assert model == ('equidistant', (640, 480), K, (0.1, 0.0, 0.0, 0.0))
+    assert model == ('equidistant', (640, 480), (*K, 0.0), (0.1, 0.0, 0.0, 0.0))
+    assert read_camera_info(info(k=[K[0], 1.5, *info().k[2:]])).intrinsics == (*K, 1.5)
     assert read_camera_info(info(roi=RegionOfInterest(width=640, height=480))) == model
 
 

@@ -6,6 +6,7 @@ line in FORMATS.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -15,8 +16,24 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
-FORMATS = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'boofcv', 'transforms', 'rig')
-WRITABLE = FORMATS[:-3]
+# In the order in which they are asked: OpenCV's files are the most general of YAML.
+FORMATS = ('kalibr', 'ros', 'euroc', 'orbslam', 'camodocal', 'opencv', 'basalt', 'mrcal', 'colmap',
+           'nerfstudio', 'boofcv', 'metashape', 'ocamcalib', 'transforms', 'rig')
+WRITABLE = ('kalibr', 'ros', 'opencv', 'basalt', 'mrcal', 'colmap', 'nerfstudio')
+READABLE = ('ROS camera_info, Kalibr, OpenCV, Basalt, mrcal, EuRoC, COLMAP, ORB-SLAM3, CamOdoCal, '
+            'nerfstudio, Metashape, OCamCalib and BoofCV')
+# What is known by sight alone
+UNREADABLE_FORMATS = {
+    'an OpenMVG scene': '"sfm_data_version"',
+    'an OpenSfM camera': '"projection_type"',
+    'an AliceVision (Meshroom) scene': '"intrinsicId"',
+    'a lensfun database': '<lensdatabase',
+    'a Hugin or PTGui project': r'^[iop] w\d+ h\d+ f\d',
+    'a Bundler file': '^# Bundle file',
+    'a RealityScan (RealityCapture) XMP file': 'xcr:DistortionModel',
+    'an SVO (vikit) camera': r'^cam_model *:|^cameras: *\n *- camera:',
+    'a calibration of the MATLAB toolbox of Caltech': r'^ *fc *= *\[',
+}
 
 
 class Foreign(NamedTuple):
@@ -31,17 +48,27 @@ class Foreign(NamedTuple):
     rigs: tuple[Pose, ...]
     worst_px: dict[str, float]
 
+    def deviation_px(self, lens: Lens) -> float:
+        """Return how far a lens of the file is from what the file says, px."""
+        return next((self.worst_px.get(camera, 0.0) for camera, one in self.lenses.items()
+                     if one == lens), 0.0)
+
 
 def read_foreign(path: str | Path, text: str) -> Foreign | None:
     """Return the lenses in a file of another tool, None where no format knows its content.
 
-    Raises LensError, naming file and field, for a file that is incomplete.
+    Raises LensError, naming file and field, for a file that is incomplete, and naming the format
+    of one that cannot be read.
     """
     for name in FORMATS:
         module = import_module(f'{__name__}.{name}')
         if module.recognises(text):
             read: Callable[[str, str], Foreign] = module.read
             return read(text, str(path))
+    for name, mark in UNREADABLE_FORMATS.items():
+        if re.search(mark, text, re.MULTILINE):
+            raise LensError(f'{path}: this is {name}, which cannot be read; those of {READABLE} '
+                            'can be')
     return None
 
 

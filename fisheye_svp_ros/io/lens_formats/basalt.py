@@ -1,17 +1,28 @@
-"""Basalt calibration JSON: kb4 as it stands, ds by a fit."""
+"""Basalt calibration JSON: kb4 as it stands, others by a fit."""
 
 from __future__ import annotations
 
 import itertools
 import json
+from collections.abc import Callable
 from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
+from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
+# Coefficients of each model, and what they make
+_MODELS: dict[str, tuple[tuple[str, ...], Callable[..., Distortion]]] = {
+    'kb4': (('k1', 'k2', 'k3', 'k4'), lambda *k: Distortion(radial.EQUIDISTANT, k)),
+    'ds': (('xi', 'alpha'), lambda *of: Distortion(radial.double_sphere(*of))),
+    'eucm': (('alpha', 'beta'), lambda *of: Distortion(radial.unified(*of))),
+    'ucm': (('alpha',), lambda alpha: Distortion(radial.unified(alpha, 1.0))),
+    'fov': (('w',), lambda omega: Distortion(radial.field_of_view_model(omega))),
+    'pinhole': ((), lambda: Distortion(radial.PERSPECTIVE)),
+}
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
 
 
@@ -33,19 +44,18 @@ def read(text: str, where: str) -> Foreign:
         rigs = _rigs(document.get('T_imu_cam', []), where)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole Basalt calibration ({cause!r})') from cause
-    return Foreign('basalt', lenses, rigs, worst)
+    return Foreign('Basalt', lenses, rigs, worst)
 
 
 def _lens(name: str, camera: dict[str, Any], size: list[float], where: str) -> tuple[Lens, float]:
     values, kind = camera['intrinsics'], camera['camera_type']
     pinhole = [float(values[key]) for key in ('fx', 'fy', 'cx', 'cy')]
-    if kind == 'kb4':
-        k = [float(values[f'k{i}']) for i in range(1, 5)]
-        return radial.kannala_brandt(name, size, pinhole, k, where), 0.0
-    if kind == 'ds':
-        curve, limit = radial.double_sphere(float(values['xi']), float(values['alpha']))
-        return radial.fitted(name, size, pinhole, curve, limit, where)
-    raise LensError(f'{where}: camera_type is {kind!r}; kb4 and ds can be read')
+    if kind not in _MODELS:
+        raise LensError(f'{where}: camera_type is {kind!r}; those that can be read are '
+                        f'{", ".join(_MODELS)}')
+    names, distortion = _MODELS[kind]
+    return nearest_lens(
+        name, size, pinhole, distortion(*(float(values[key]) for key in names)), where)
 
 
 def _rigs(entries: list[dict[str, float]], where: str) -> tuple[Pose, ...]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
 
 
 def recognises(text: str) -> bool:
@@ -19,9 +20,11 @@ def read(text: str, where: str) -> Foreign:
         pinhole, distortion = document['pinhole'], document['radial_tangential']
         size = float(pinhole['width']), float(pinhole['height'])
         intrinsics = [float(pinhole[name]) for name in ('fx', 'fy', 'cx', 'cy')]
-        curve, limit = radial.omnidirectional(
-            float(document['mirror_offset']), [float(k) for k in distortion['radial']])
-    except (KeyError, TypeError, ValueError, OverflowError) as cause:
+        base = radial.omnidirectional(float(document['mirror_offset']))
+        skew, t1, t2 = (float(given.get(name, 0.0)) for given, name in (
+            (pinhole, 'skew'), (distortion, 't1'), (distortion, 't2')))
+        bent = Distortion(base, [float(k) for k in distortion['radial']], (), (t1, t2))
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole BoofCV model ({cause!r})') from cause
-    lens, worst = radial.fitted('camera', size, intrinsics, curve, limit, where)
-    return Foreign('boofcv', {'camera': lens}, (), {'camera': worst})
+    lens, worst = nearest_lens('camera', size, (*intrinsics, skew), bent, where)
+    return Foreign('BoofCV', {'camera': lens}, (), {'camera': worst})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import LARGEST_YAML
+from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
 from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
 
 LARGEST = 1e12  # any number of a lens
@@ -33,6 +33,46 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
+
+
+def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list[float]:
+    """Return numbers of a mapping by their names; raise LensError naming the first missing one."""
+    for name in names:
+        value = mapping.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or (
+                not abs(value) < LARGEST):
+            raise LensError(f'{where}: {name} is {value!r}; a finite number is needed')
+    return [float(mapping[name]) for name in names]
+
+
+def coefficients(
+    mapping: Mapping[str, Any], name: str, counts: Sequence[int], where: str
+) -> list[float]:
+    """Return as many numbers of a list as one of `counts`, ascending; zeros may follow the last.
+
+    Raises LensError naming the field.
+    """
+    given = mapping.get(name)
+    count = len(given) if isinstance(given, list) else 0
+    numbers_given = numbers(mapping, name, count or counts[0], where)
+    if count > counts[-1] and not any(numbers_given[counts[-1]:]):
+        count = counts[-1]
+    if count not in counts:
+        raise LensError(f'{where}: {name} has {count} numbers, not '
+                        f'{" or ".join(map(str, counts))}')
+    return numbers_given[:count]
+
+
+def yaml(text: str, where: str) -> dict[str, Any]:
+    """Return the mapping of a YAML text, which may begin as OpenCV's do, with %YAML:1.0.
+
+    Raises LensError, naming `where` and line.
+    """
+    start = text.lstrip()
+    if start.startswith('%YAML'):
+        # The line stays, so that others keep their numbers.
+        text = '#' + start
+    return parse_yaml(text, where, LensError)
 
 
 def pose(place: ArrayLike, turn: ArrayLike, where: str) -> Pose:

@@ -1,19 +1,21 @@
-"""Kalibr camchain YAML: pinhole-equidistant as it stands; omni, ds, eucm and pinhole by a fit."""
+"""Kalibr camchain YAML, OpenVINS's too: pinhole-equidistant as it stands, others by a fit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
+from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
+from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
 _INTRINSICS = {'pinhole': 4, 'omni': 5, 'ds': 6, 'eucm': 6}
+_COEFFICIENTS = {'equidistant': 4, 'radtan': 4, 'fov': 1, 'none': 0}
 
 
 def recognises(text: str) -> bool:
@@ -23,7 +25,7 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming camera and field."""
-    document = parse_yaml(text, where, LensError)
+    document = fields.yaml(text, where)
     # YAML libraries write cam10 before cam2.
     names = sorted((name for name in map(str, document) if name.startswith('cam')),
                    key=lambda name: (len(name), name))
@@ -37,31 +39,39 @@ def read(text: str, where: str) -> Foreign:
                 raise LensError(f'{where}: {names[len(rigs) + 1]} has no T_cn_cnm1, and {name} '
                                 'after it has one; the chain is broken')
             rigs.append(_rig(camera['T_cn_cnm1'], f'{where}: {name}'))
-    return Foreign('kalibr', lenses, tuple(rigs), worst)
+    return Foreign('Kalibr', lenses, tuple(rigs), worst)
 
 
 def _lens(name: str, camera: Mapping[str, Any], where: str) -> tuple[Lens, float]:
-    model, distortion = str(camera.get('camera_model')), camera.get('distortion_model', 'none')
+    model = str(camera.get('camera_model'))
     if model not in _INTRINSICS:
         raise LensError(f'{where}: camera_model is {model!r}; known are {", ".join(_INTRINSICS)}')
     *own, fx, fy, cx, cy = fields.numbers(camera, 'intrinsics', _INTRINSICS[model], where)
-    size, pinhole = fields.numbers(camera, 'resolution', 2, where), (fx, fy, cx, cy)
-    if model == 'pinhole' and distortion == 'equidistant':
-        k = fields.numbers(camera, 'distortion_coeffs', 4, where)
-        return radial.kannala_brandt(name, size, pinhole, k, where), 0.0
-    k = [] if distortion == 'none' else fields.numbers(camera, 'distortion_coeffs', 4, where)
-    if distortion not in ('none', 'radtan') or (k and model in ('ds', 'eucm') and any(k)):
-        raise LensError(f'{where}: {model} with {distortion} is not a form that can be read')
-    if model == 'ds':
-        curve, limit = radial.double_sphere(*own)
-    elif model == 'eucm':
-        curve, limit = radial.unified(*own)
-    else:
-        curve, limit = radial.omnidirectional(own[0] if own else 0.0, k[:2])
-    lens, worst = radial.fitted(name, size, pinhole, curve, limit, where)
-    # Radtan's tangential part is no radial curve: what it moves at the edge is left out.
-    edge = float(curve(np.array([lens.max_incidence]))[0])
-    return lens, worst + 3 * edge**2 * max(map(abs, k[2:]), default=0.0) * max(fx, fy)
+    size = fields.numbers(camera, 'resolution', 2, where)
+    distortion = _distortion(camera, model, own, where)
+    return nearest_lens(name, size, (fx, fy, cx, cy), distortion, where)
+
+
+def _distortion(
+    camera: Mapping[str, Any], model: str, own: Sequence[float], where: str
+) -> Distortion:
+    """Return what the image is distorted by; own: numbers of the model beside the intrinsics."""
+    kind = str(camera.get('distortion_model', 'none'))
+    d = fields.coefficients(camera, 'distortion_coeffs', (_COEFFICIENTS[kind],), where) if (
+        _COEFFICIENTS.get(kind)) else []
+    match model, kind:
+        case 'pinhole', 'equidistant':
+            return Distortion(radial.EQUIDISTANT, d)
+        case 'pinhole', 'fov':
+            return Distortion(radial.field_of_view_model(*d))
+        case 'pinhole' | 'omni', 'radtan' | 'none':
+            base = radial.omnidirectional(*own) if own else radial.PERSPECTIVE
+            return brown(base, dict(zip(OPENCV, d, strict=False)))
+        case 'ds' | 'eucm', 'radtan' | 'none' if not any(d):
+            return Distortion((radial.double_sphere if model == 'ds' else radial.unified)(*own))
+    raise LensError(f'{where}: {model} with {kind} is not a form that can be read; those are '
+                    'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
+                    'and eucm')
 
 
 def _rig(rows: Any, where: str) -> Pose:

@@ -1,4 +1,6 @@
-"""OpenCV FileStorage (YAML, XML, JSON) of cv2.fisheye: a matrix and coefficients, or two cameras.
+"""OpenCV FileStorage (YAML, XML, JSON): a matrix and coefficients, or two cameras.
+
+Those of cv2.fisheye are read as they stand, of cv2.omnidir and cv2.calibrateCamera by a fit.
 
 Of two (K1, D1, K2, D2) R and T bring points of the first camera into the second, as
 cv2.fisheye.stereoCalibrate returns them.
@@ -6,14 +8,21 @@ cv2.fisheye.stereoCalibrate returns them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import parse_json, parse_yaml
+from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
+from fisheye_svp_ros.io.lens_formats.distortion import (
+    OPENCV,
+    Distortion,
+    brown,
+    nearest_lens,
+    skew_of,
+)
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -22,6 +31,8 @@ _COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoef
                  'distCoeffs1')
 _SECOND = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
 _WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
+_XI, _OF_FISHEYE = 'xi', 4
+_COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
 _SIZE = ('image_size', 'imageSize', 'size')
 
 
@@ -36,7 +47,7 @@ def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming what is missing."""
     # A file that is nested deeply ends the process in OpenCV's own parser.
     if text.lstrip().startswith('%YAML'):
-        document = parse_yaml(text.lstrip().partition('\n')[2], where, LensError)
+        document = fields.yaml(text, where)
     elif text.lstrip().startswith('{'):
         document = parse_json(text, where, LensError)
     else:
@@ -53,20 +64,36 @@ def read(text: str, where: str) -> Foreign:
     else:
         size = fields.numbers({'size': [value(_WIDTH), value(_HEIGHT)]}, 'size', 2, where)
 
-    def lens(name: str, matrix: tuple[str, ...], coefficients: tuple[str, ...]) -> Lens:
+    def lens(name: str, matrix: tuple[str, ...], named: tuple[str, ...]) -> tuple[Lens, float]:
         k = _matrix(value(matrix), ((3, 3),), where)
-        d = _matrix(value(coefficients), ((1, 4), (4, 1)), where)
-        return radial.kannala_brandt(name, size, (k[0], k[4], k[2], k[5]), d, where)
+        distortion = _distortion(_matrix(value(named), _COUNTS, where), document, where)
+        return nearest_lens(name, size, (k[0], k[4], k[2], k[5], k[1]), distortion, where)
 
-    if not any(name in document for name in _SECOND[0]):
-        return Foreign('opencv', {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}, (), {})
-    pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_SECOND)}
+    pair = {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}
+    if any(name in document for name in _SECOND[0]):
+        pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_SECOND)}
     rigs: tuple[Pose, ...] = ()
     if 'R' in document or 'T' in document:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
         place = _matrix(value(('T',)), ((3, 1), (1, 3)), where)
         rigs = (fields.pose(place, turn, f'{where}: R, T'),)
-    return Foreign('opencv', pair, rigs, {})
+    return Foreign('OpenCV', {name: one for name, (one, _) in pair.items()}, rigs,
+                   {name: worst for name, (_, worst) in pair.items()})
+
+
+def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> Distortion:
+    """Four coefficients are those of cv2.fisheye, with xi of cv2.omnidir; more, of a pinhole."""
+    if _XI in document:
+        given = document[_XI]
+        xi = _matrix(given, ((1, 1),), where)[0] if isinstance(given, dict) else (
+            fields.values(document, (_XI,), where)[0])
+        return brown(radial.omnidirectional(xi), dict(zip(OPENCV, d, strict=False)))
+    if len(d) == _OF_FISHEYE:
+        return Distortion(radial.EQUIDISTANT, d)
+    if any(d[len(OPENCV):]):
+        raise LensError(f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '
+                        'of cv2.fisheye, or five or eight of cv2.calibrateCamera can be read')
+    return brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
 
 
 def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[float]:
@@ -74,7 +101,7 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
     if not isinstance(value, dict) or (value.get('rows'), value.get('cols')) not in shapes:
         raise LensError(f'{where}: a matrix of 3 x 3 and the four coefficients of cv2.fisheye are '
                         'needed (of a rig R, 3 x 3, and T, 3 x 1)')
-    return fields.numbers(value, 'data', int(np.prod(shapes[0])), where)
+    return fields.numbers(value, 'data', value['rows'] * value['cols'], where)
 
 
 def _from_xml(text: str, where: str) -> dict[str, Any]:
@@ -104,7 +131,7 @@ def write(lens: Lens) -> str:
     storage.write('image_width', near.width)
     storage.write('image_height', near.height)
     storage.write('camera_matrix', np.array(
-        [[near.fx, 0, near.cx], [0, near.fy, near.cy], [0, 0, 1]]))
+        [[near.fx, skew_of(near), near.cx], [0, near.fy, near.cy], [0, 0, 1]]))
     storage.write('distortion_coefficients', np.array([radial.coefficients(near)]))
     text: str = storage.releaseAndGetString()
     return text

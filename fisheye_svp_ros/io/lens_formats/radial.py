@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,16 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 
 Curve = Callable[[Array], Array]  # image height for unit focal length, of the incidence angle
 
+
+class Base(NamedTuple):
+    """A curve, and the incidence angle, rad, up to which it holds."""
+
+    height: Curve
+    limit: float
+
+
 _GRID = 600
+_INSIDE = 1 - 1e-3  # of the angle at which a curve ends
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 
 
@@ -66,7 +76,8 @@ def fitted(
     inside = np.logical_and.accumulate(grows) & (heights <= corner)
     if inside.sum() < 20:
         raise LensError(f'{where}: the projection does not grow with the incidence angle')
-    theta = np.linspace(0.0, theta[inside][-1], _GRID)[1:]
+    # Denser to the end, so that the worst deviation is near the least that there can be
+    theta = theta[inside][-1] * np.sin(np.linspace(0.0, np.pi / 2, _GRID)[1:])
     heights = curve(theta)
     powers = theta[:, None] ** np.arange(1, 10, 2)
     scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
@@ -76,26 +87,6 @@ def fitted(
     lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
                           [value / scale for value in rest], where, shift)
     return replace(lens, max_incidence=min(lens.max_incidence, float(theta[-1]))), worst
-
-
-def omnidirectional(xi: float, radial: Sequence[float]) -> tuple[Curve, float]:
-    """Return Mei's curve (Mei and Rives, ICRA 2007) and its limit; xi 0 is a pinhole."""
-    def curve(theta: Array) -> Array:
-        height = np.sin(theta) / (np.cos(theta) + xi)
-        z = height * height
-        return np.asarray(height * (1 + sum(k * z ** (i + 1) for i, k in enumerate(radial))))
-
-    edge = -xi if xi <= 1 else -1 / xi
-    return curve, float(np.arccos(edge)) * (1 - 1e-3)
-
-
-def double_sphere(xi: float, alpha: float) -> tuple[Curve, float]:
-    """Return the double sphere's curve (Usenko, Demmel, Cremers, 3DV 2018) and its limit."""
-    def curve(theta: Array) -> Array:
-        z = np.cos(theta) + xi
-        return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
-
-    return curve, np.pi * (1 - 1e-3)
 
 
 def nearest(lens: Lens) -> Lens:
@@ -117,10 +108,49 @@ def coefficients(lens: Lens) -> list[float]:
     return list(lens.image_height.coefficients)
 
 
-def unified(alpha: float, beta: float) -> tuple[Curve, float]:
-    """Return the curve of the extended unified model (Khomutenko et al., RA-L 2016)."""
-    def curve(theta: Array) -> Array:
+def omnidirectional(xi: float) -> Base:
+    """Return Mei's heights (Mei and Rives, ICRA 2007); xi 0 is a pinhole."""
+    def height(theta: Array) -> Array:
+        return np.asarray(np.sin(theta) / (np.cos(theta) + xi))
+
+    return Base(height, float(np.arccos(-xi if xi <= 1 else -1 / xi)) * _INSIDE)
+
+
+def double_sphere(xi: float, alpha: float) -> Base:
+    """Return the double sphere's heights (Usenko, Demmel, Cremers, 3DV 2018)."""
+    def height(theta: Array) -> Array:
+        z = np.cos(theta) + xi
+        return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
+
+    return Base(height, np.pi * _INSIDE)
+
+
+def unified(alpha: float, beta: float) -> Base:
+    """Return the heights of the extended unified model (Khomutenko et al., RA-L 2016)."""
+    def height(theta: Array) -> Array:
         sin, cos = np.sin(theta), np.cos(theta)
         return np.asarray(sin / (alpha * np.sqrt(beta * sin**2 + cos**2) + (1 - alpha) * cos))
 
-    return curve, np.pi * (1 - 1e-3)
+    return Base(height, np.pi * _INSIDE)
+
+
+def field_of_view_model(omega: float) -> Base:
+    """Return the heights of the FOV model (Devernay and Faugeras, MVA 2001); omega in rad."""
+    def height(theta: Array) -> Array:
+        return np.asarray(np.arctan(2 * np.tan(theta) * np.tan(omega / 2)) / omega)
+
+    return PERSPECTIVE if not omega else Base(height, np.pi / 2 * _INSIDE)
+
+
+def division(k: float) -> Base:
+    """Return the heights of the division model (Fitzgibbon, CVPR 2001), of one coefficient."""
+    def height(theta: Array) -> Array:
+        slope = np.tan(theta)
+        return np.asarray(2 * slope / (1 + np.sqrt(1 - 4 * k * slope**2)))
+
+    return Base(height, np.pi / 2 * _INSIDE)
+
+
+EQUIDISTANT = Base(np.asarray, np.pi)
+EQUISOLID = Base(lambda theta: np.asarray(2 * np.sin(theta / 2)), np.pi * _INSIDE)
+PERSPECTIVE = Base(np.tan, np.pi / 2 * (1 - 1e-6))

@@ -1,0 +1,108 @@
+"""COLMAP's cameras.txt: fisheye models as they stand, the others by a fit.
+
+Its image begins at 0, so that the center of the first pixel is at 0.5.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats.distortion import Distortion, brown, nearest_lens
+from fisheye_svp_ros.optics.lens import Lens
+
+Values = dict[str, float]
+
+_CORNER = 0.5  # px, of our first pixel's center from the corner where COLMAP's image begins
+_ROW = re.compile(
+    r'^ *(\d+)[ ,\t]+([A-Z][A-Z\d_]+)[ ,\t]+(\d+)[ ,\t]+(\d+)((?:[ ,\t]+[-+.\deE]+)+)[ \t]*$',
+    re.MULTILINE)
+
+
+def _fisheye(values: Values) -> Distortion:
+    k = [values.get(f'k{i}', 0.0) for i in range(1, 5)]
+    return Distortion(radial.EQUIDISTANT, k, (), (values.get('p1', 0.0), values.get('p2', 0.0)),
+                      prism=((values.get('sx1', 0.0),), (values.get('sy1', 0.0),)))
+
+
+def fisheye624(values: Values) -> Distortion:
+    """Return the distortion of six radial, two tangential and four thin prism coefficients."""
+    k, s = ([values[f'{name}{i}'] for i in range(count)] for name, count in (('k', 6), ('s', 4)))
+    # Its p0 belongs to u, as OpenCV's p2 does.
+    return Distortion(radial.EQUIDISTANT, k, (), (values['p1'], values['p0']),
+                      prism=(s[:2], s[2:]), late=True)
+
+
+def _brown(values: Values) -> Distortion:
+    return brown(radial.PERSPECTIVE, values)
+
+
+# Parameters in their order, and what they distort
+_MODELS: dict[str, tuple[str, Callable[[Values], Distortion]]] = {
+    'OPENCV_FISHEYE': ('fx fy cx cy k1 k2 k3 k4', _fisheye),
+    'SIMPLE_RADIAL_FISHEYE': ('f cx cy k1', _fisheye),
+    'RADIAL_FISHEYE': ('f cx cy k1 k2', _fisheye),
+    'SIMPLE_FISHEYE': ('f cx cy', _fisheye),
+    'FISHEYE': ('fx fy cx cy', _fisheye),
+    'THIN_PRISM_FISHEYE': ('fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1', _fisheye),
+    'RAD_TAN_THIN_PRISM_FISHEYE': (
+        'fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3', fisheye624),
+    'FOV': ('fx fy cx cy omega', lambda v: Distortion(radial.field_of_view_model(v['omega']))),
+    'EUCM': ('fx fy cx cy alpha beta',
+             lambda v: Distortion(radial.unified(v['alpha'], v['beta']))),
+    'SIMPLE_PINHOLE': ('f cx cy', _brown),
+    'PINHOLE': ('fx fy cx cy', _brown),
+    'SIMPLE_RADIAL': ('f cx cy k1', _brown),
+    'RADIAL': ('f cx cy k1 k2', _brown),
+    'OPENCV': ('fx fy cx cy k1 k2 p1 p2', _brown),
+    'FULL_OPENCV': ('fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6', _brown),
+    'SIMPLE_DIVISION': ('f cx cy k', lambda v: Distortion(radial.division(v['k']))),
+    'DIVISION': ('fx fy cx cy k', lambda v: Distortion(radial.division(v['k']))),
+}
+
+
+def recognises(text: str) -> bool:
+    """Say whether a text is such a file."""
+    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != '#']
+    return bool(lines) and all(map(_ROW.fullmatch, lines))
+
+
+def read(text: str, where: str) -> Foreign:
+    """Read all cameras, by their ids; raises LensError, naming camera and model."""
+    lenses, worst = {}, {}
+    for camera, model, width, height, rest in _ROW.findall(text):
+        try:
+            values = [float(word) for word in rest.replace(',', ' ').split()]
+        except ValueError as cause:
+            raise LensError(f'{where}: camera {camera}: {cause}') from cause
+        lenses[camera], worst[camera] = _lens(
+            f'camera{camera}', model, (int(width), int(height)), values,
+            f'{where}: camera {camera}')
+    return Foreign('COLMAP', lenses, (), worst)
+
+
+def _lens(
+    name: str, model: str, size: Sequence[float], given: Sequence[float], where: str
+) -> tuple[Lens, float]:
+    if model not in _MODELS:
+        raise LensError(f'{where}: model is {model}; those that can be read are '
+                        f'{", ".join(_MODELS)}')
+    names, distortion = _MODELS[model][0].split(), _MODELS[model][1]
+    if len(given) != len(names):
+        raise LensError(f'{where}: {model} has {len(given)} parameters; needed are '
+                        f'{", ".join(names)}')
+    values = dict(zip(names, given, strict=True))
+    focal = values.get('fx', values.get('f', 0.0)), values.get('fy', values.get('f', 0.0))
+    middle = values['cx'] - _CORNER, values['cy'] - _CORNER
+    return nearest_lens(name, size, (*focal, *middle), distortion(values), where)
+
+
+def write(lens: Lens) -> str:
+    """Return the lens in this form, as its first camera."""
+    near = radial.nearest(lens)
+    values = (near.fx, near.fy, near.cx + _CORNER, near.cy + _CORNER, *radial.coefficients(near))
+    return ('# Camera list with one line of data per camera:\n'
+            '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'
+            f'1 OPENCV_FISHEYE {near.width} {near.height} {" ".join(map(repr, values))}\n')

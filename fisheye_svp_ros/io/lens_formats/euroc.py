@@ -1,0 +1,38 @@
+"""EuRoC's sensor.yaml of a camera: equidistant as it stands, radial-tangential by a fit."""
+
+from __future__ import annotations
+
+import re
+
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
+from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+
+_OF_CAMERA = re.compile(r'^sensor_type: *camera', re.MULTILINE)
+
+
+def recognises(text: str) -> bool:
+    """Say whether a text is such a file."""
+    return bool(_OF_CAMERA.search(text)) and 'intrinsics:' in text
+
+
+def read(text: str, where: str) -> Foreign:
+    """Read the lens; raises LensError, naming the field."""
+    document = fields.yaml(text, where)
+    model, kind = document.get('camera_model'), document.get('distortion_model', 'none')
+    if model != 'pinhole':
+        raise LensError(f'{where}: camera_model is {model!r}; pinhole can be read')
+    name = 'distortion_coefficients'
+    if kind == 'equidistant':
+        k = fields.coefficients(document, name, (4,), where)
+        distortion = Distortion(radial.EQUIDISTANT, k)
+    elif kind in ('radial-tangential', 'none'):
+        d = fields.coefficients(document, name, (4, 5), where) if kind != 'none' else ()
+        distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
+    else:
+        raise LensError(f'{where}: distortion_model is {kind!r}; equidistant and '
+                        'radial-tangential can be read')
+    lens, worst = nearest_lens(
+        'camera', fields.numbers(document, 'resolution', 2, where),
+        fields.numbers(document, 'intrinsics', 4, where), distortion, where)
+    return Foreign('EuRoC', {'camera': lens}, (), {'camera': worst})

@@ -1,0 +1,71 @@
+"""ORB-SLAM3's settings: KannalaBrandt8 as it stands, PinHole by a fit; both cameras of a rig.
+
+Stereo.T_c1_c2 (Tlr in older files) is the second camera in the first one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
+from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+
+_FOCAL = re.compile(r'^Camera1?\.fx *:', re.MULTILINE)
+_CAMERAS = {'left': ('Camera1.', 'Camera.'), 'right': ('Camera2.',)}
+_STEREO = ('Stereo.T_c1_c2', 'Tlr')
+
+
+def recognises(text: str) -> bool:
+    """Say whether a text is such a file."""
+    return _FOCAL.search(text) is not None
+
+
+def read(text: str, where: str) -> Foreign:
+    """Read one lens or two and the rig; raises LensError, naming the field."""
+    document = fields.yaml(text, where)
+    prefixes = {camera: next((p for p in known if f'{p}fx' in document), '')
+                for camera, known in _CAMERAS.items()}
+    if not prefixes['right']:
+        lens, worst = _lens('camera', prefixes['left'], document, where)
+        return Foreign('ORB-SLAM3', {'camera': lens}, (), {'camera': worst})
+    found = {camera: _lens(camera, prefix, document, f'{where}: {prefix.rstrip(".")}')
+             for camera, prefix in prefixes.items()}
+    rigs = tuple(_rig(document[name], f'{where}: {name}') for name in _STEREO if name in document)
+    return Foreign('ORB-SLAM3', {camera: lens for camera, (lens, _) in found.items()}, rigs[:1],
+                   {camera: worst for camera, (_, worst) in found.items()})
+
+
+def _lens(
+    name: str, prefix: str, document: Mapping[str, Any], where: str
+) -> tuple[Lens, float]:
+    def values(*names: str) -> list[float]:
+        return fields.values(document, [f'{prefix}{name}' for name in names], where)
+
+    kind = document.get('Camera.type', 'PinHole')
+    size = fields.values(document, ('Camera.width', 'Camera.height'), where)
+    intrinsics = values('fx', 'fy', 'cx', 'cy')
+    if kind == 'KannalaBrandt8':
+        distortion = Distortion(radial.EQUIDISTANT, values('k1', 'k2', 'k3', 'k4'))
+    elif kind == 'PinHole':
+        names = [name for name in OPENCV if f'{prefix}{name}' in document]
+        distortion = brown(radial.PERSPECTIVE, dict(zip(names, values(*names), strict=True)))
+    else:
+        raise LensError(f'{where}: Camera.type is {kind!r}; KannalaBrandt8 and PinHole can be '
+                        'read')
+    return nearest_lens(name, size, intrinsics, distortion, where)
+
+
+def _rig(matrix: Any, where: str) -> Pose:
+    """Return the first camera in the second one."""
+    data = matrix.get('data') if isinstance(matrix, dict) else None
+    if not isinstance(data, list) or len(data) not in (12, 16):
+        raise LensError(f'{where}: a matrix of 4 x 4 or 3 x 4 is needed')
+    rows = np.reshape(fields.numbers(matrix, 'data', len(data), where), (-1, 4))
+    return fields.pose(rows[:3, 3], rows[:3, :3], where).inverse()
