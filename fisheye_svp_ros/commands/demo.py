@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import argparse
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.commands.lock_step import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
 from fisheye_svp_ros.commands.processes import Processes
+from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
 from fisheye_svp_ros.io.files import together, write_json, write_text
-from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, tabulate
+from fisheye_svp_ros.io.recording import (
+    Columns,
+    ResidualSet,
+    has_residuals,
+    is_tabulated,
+    tabulate,
+)
 from fisheye_svp_ros.paper.demonstration import (
-    DEPTH_POSES,
     TASKS,
     DemoRow,
+    camera_parameters,
+    compute_demo,
     demo_rows,
     residual_fields,
 )
@@ -30,7 +37,7 @@ from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import print_table
 from fisheye_svp_ros.scene.landmarks import RADII
 
-_MARK = '.demo'
+_MARK, _RECORDING = '.demo', 'recording'
 _PATIENCE = 900.0  # s; only a hang takes this long
 
 
@@ -47,21 +54,38 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Run the graph; make everything else from its recording."""
-    bag = args.output / 'recording'
-    with progress('running the nodes'):
-        record(bag, args.output / 'logs', args.lenses, args.radii)
-    columns = tabulate(Bag(bag).records(is_tabulated))
+    """Run the graph; make everything else from its recording.
+
+    Where no node can run, the same scenarios are computed in this process.
+    """
+    bag: Path | None = args.output / _RECORDING
+    if reason := missing_rclpy():
+        print(f'  Without ROS 2 ({reason}): the same scenarios in one process, no node graph.')
+        bag = None
+        columns, fields = compute_demo(args.lenses, args.radii)
+    else:
+        columns, fields = _record(args.output, args.lenses, args.radii)
     rows = demo_rows(columns, args.lenses, args.radii)
     with together():
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'demo.json', {
-            'recording': str(bag), 'rows': [row._asdict() for row in rows],
+            'recording': bag and str(bag), 'rows': [row._asdict() for row in rows],
         })
-        _draw(args.output, bag, rows)
+        _draw(args.output, rows, fields)
     note_formats()
     _print(rows)
-    print(f'  recording, table, pictures: {args.output}')
+    print(f'  {"recording, " if bag else ""}table, pictures: {args.output}')
+
+
+def _record(
+    folder: Path, lenses: Sequence[str], radii: Sequence[float]
+) -> tuple[Columns, list[ResidualSet]]:
+    """Run the node graph into a recording; return what is to be tabulated and drawn of it."""
+    bag = folder / _RECORDING
+    with progress('running the nodes'):
+        record(bag, folder / 'logs', lenses, radii)
+    columns = tabulate(Bag(bag).records(is_tabulated))
+    return columns, residual_fields(Bag(bag).records(has_residuals))
 
 
 def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float]) -> None:
@@ -78,30 +102,12 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
             cameras.append(f'camera_{task.name}')
             start_in_step(
                 processes, cameras[-1], [task.node], ['-r', f'__ns:=/{task.name}'],
-                values(**dict(_scenarios(task.name, lenses, radii))),
+                values(**camera_parameters(task, lenses, radii)),
             )
         processes.wait(cameras, _PATIENCE)
         processes.stop('recorder')
         for task in TASKS:
             processes.stop(task.node)
-
-
-def _scenarios(
-    task: str, lenses: Sequence[str], radii: Sequence[float]
-) -> Iterator[tuple[str, Any]]:
-    """Yield the camera's parameters for the scenarios of a task."""
-    swept, over = next((t.swept, t.values) for t in TASKS if t.name == task)
-    yield 'sweep.lens', _list(lenses)
-    yield 'sweep.radius', _list(radii)
-    yield f'sweep.{swept}', _list(over)
-    if task == 'calibration':
-        yield 'poses_file', 'calibration'
-    if task == 'depth':
-        yield 'poses', _list([number for pose in DEPTH_POSES for number in pose])
-
-
-def _list(values: Sequence[Any]) -> str:
-    return '[' + ', '.join(map(str, values)) + ']'
 
 
 def _print(rows: Sequence[DemoRow]) -> None:
@@ -128,9 +134,8 @@ def _cells(row: DemoRow) -> tuple[str, ...]:
     )
 
 
-def _draw(folder: Path, bag: Path, rows: Sequence[DemoRow]) -> None:
+def _draw(folder: Path, rows: Sequence[DemoRow], fields: Sequence[ResidualSet]) -> None:
     from fisheye_svp_ros.paper.demonstration_plots import draw_comparison, draw_residual_fields
 
-    fields = residual_fields(Bag(bag).records(has_residuals))
     draw_comparison(rows, folder / 'errors.png')
     draw_residual_fields(fields, folder / 'residuals.png')

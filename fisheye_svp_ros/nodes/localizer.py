@@ -11,7 +11,6 @@ from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
@@ -22,10 +21,10 @@ from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.localization import Localization, sight
+from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import Solved, localized
+from fisheye_svp_ros.study.solutions import Solved, localized, residual_points
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
@@ -83,7 +82,7 @@ class Localizer(SolverNode):
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
         self._residuals.publish(
-            messages.cloud_message(residuals(model, views, solution), stamp, camera)
+            messages.cloud_message(residual_points(model, views, solution), stamp, camera)
         )
         self._transforms.publish(pose, stamp, world, camera)
         if true is not None:
@@ -140,10 +139,3 @@ def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
     nearest = np.linalg.norm(pose.into_body(views.points)[0], axis=-1).min()
     return bool(np.linalg.norm(change[:3]) < _NEAR * nearest
                 and np.linalg.norm(change[3:]) < _NEAR)
-
-
-def residuals(model: ForwardModel, views: Views, solution: Localization) -> Points:
-    """Return the residuals of one view: px; incidence angle, rad, and range, m, as solved."""
-    theta, distance = sight(model, solution.pose, views)
-    columns = (*views.uv[0].T, *solution.residual[0].T, theta[0], distance[0])
-    return structured(RESIDUALS, views.landmark[0], *columns)

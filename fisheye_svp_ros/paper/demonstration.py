@@ -1,4 +1,4 @@
-"""What the demo shows: the paper's scenarios, out of a recording, beside the published numbers."""
+"""What the demo shows: the paper's scenarios, recorded or computed, beside what it prints."""
 
 from __future__ import annotations
 
@@ -20,6 +20,11 @@ from fisheye_svp_ros.paper.tables import (
     STYLE_NAMES,
 )
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
+from fisheye_svp_ros.scene.observations import group_views
+from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simulate_scenario
+from fisheye_svp_ros.study.settings import LocalizerSettings
+from fisheye_svp_ros.study.solutions import localized, residual_points
+from fisheye_svp_ros.study.sweep import CAMERA, plan_sweep, sweep_rows
 
 # Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
 DEPTH_POSES = [
@@ -72,8 +77,50 @@ class DemoRow(NamedTuple):
     published_pixels: tuple[float, float]
 
 
+def camera_parameters(
+    task: Task, lenses: Sequence[str], radii: Sequence[float]
+) -> dict[str, Any]:
+    """Return the camera's parameters for the scenarios of a task."""
+    parameters: dict[str, Any] = {
+        'sweep.lens': list(lenses), 'sweep.radius': list(radii),
+        f'sweep.{task.swept}': list(task.values),
+    }
+    if task.name == 'calibration':
+        parameters['poses_file'] = 'calibration'
+    if task.name == 'depth':
+        parameters['poses'] = [number for pose in DEPTH_POSES for number in pose]
+    return parameters
+
+
+def compute_demo(
+    lenses: Sequence[str], radii: Sequence[float]
+) -> tuple[Columns, list[ResidualSet]]:
+    """Return what the recording of the node graph would tell, computed offline: no stamps."""
+    parts = []
+    for task in TASKS:
+        plan = plan_sweep({CAMERA: camera_parameters(task, lenses, radii)})
+        plan = plan._replace(solvers={task.node: plan.solvers[task.node]})
+        part = sweep_rows(plan, range(len(plan.sweep)))
+        count = len(part['set'])
+        parts.append((count, {NAMESPACE: [f'/{task.name}'] * count, **part}))
+    names = dict.fromkeys(name for _, part in parts for name in part)
+    columns = {name: [cell for count, part in parts for cell in part.get(name, [None] * count)]
+               for name in names}
+    fields = [_residual_field(Scenario(lens=lens, radius=radius))
+              for lens, radius in itertools.product(lenses, radii)]
+    return columns, fields
+
+
+def _residual_field(scenario: Scenario) -> ResidualSet:
+    views = group_views(simulate_scenario(scenario).observations)
+    model = model_of(scenario.lens, 1.0, LocalizerSettings().solves_svp)
+    points = residual_points(model, views, localized(model, views).checked().solution)
+    tags = {name: str(value) for name, value in scalars(scenario).items()}
+    return ResidualSet('/localization/localizer/residuals', 0, points, tags)
+
+
 def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[DemoRow]:
-    """Return the rows of the demo from the table of its recording.
+    """Return the rows of the demo from its table, as `tabulate` or `compute_demo` make it.
 
     Raises BagError where a scenario is missing or stands there twice.
     """

@@ -62,7 +62,7 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
         axis.hlines(place, ours, low, color=FAINT, linewidth=1.5)
         axis.plot(low, place, 'o', color=PUBLISHED, label='published', fillstyle='none')
         axis.axvline(0.0, color='#808890', linewidth=0.8)
-    axis.plot(ours, place, 'o', color=OURS, label='from the recording', markersize=5)
+    axis.plot(ours, place, 'o', color=OURS, label='this package', markersize=5)
     axis.set_yticks(place, [f'{row.where} {row.radius:g} m' for row in rows])
     axis.grid(visible=False, axis='y')
 

@@ -12,9 +12,10 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask, placed
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
-from fisheye_svp_ros.solve.localization import Localization, localize
+from fisheye_svp_ros.solve.localization import Localization, localize, sight
 from fisheye_svp_ros.solve.reliability import examine, misfit_fails, misfit_reason
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration, calibrate_stereo
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate, triangulate_optimally
@@ -84,6 +85,13 @@ def localized(
         residual = np.where(checked.gross[..., None], np.nan, found.residual)
     metrics = localization_metrics(found.pose, residual, true)
     return Solved(found, metrics, found.converged, _NO_POSE, reasons)
+
+
+def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:
+    """Return the residuals of one view (1,): px; incidence angle, rad, and range, m, as solved."""
+    theta, distance = sight(model, solution.pose, views)
+    columns = (*views.uv[0].T, *solution.residual[0].T, theta[0], distance[0])
+    return structured(RESIDUALS, views.landmark[0], *columns)
 
 
 def calibrated(

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from helpers.nodes import until
+from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
@@ -53,6 +53,7 @@ def _runs(pid: int) -> bool:
 def test_a_demo_deletes_only_what_a_demo_made(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    need_ros()
     (tmp_path / 'recording').mkdir()
     (tmp_path / 'recording' / 'mine.txt').write_text('precious')
     assert main(['demo', '-o', str(tmp_path)]) == 2

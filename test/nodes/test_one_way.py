@@ -20,13 +20,14 @@ from fisheye_svp_ros.io.decoding import read_pose
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.localizer import Localizer, residuals
+from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, group_views, make_observations
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.study.solutions import residual_points
 from fisheye_svp_ros.study.sweep import plan_sweep, sweep_rows
 
 SETS = 116
@@ -118,7 +119,7 @@ def test_angles_and_ranges_are_those_of_the_corrected_target(tmp_path: Path) -> 
                  '-o', f'{tmp_path}/out']) == 0
     told = CsvTable(tmp_path / 'out' / 'residuals.csv', ['theta', 'range'])
     model, views = ForwardModel(lens), group_views(table)
-    cloud = residuals(model, views, localize(model, views))
+    cloud = residual_points(model, views, localize(model, views))
     for name, true in (('theta', theta), ('range', away)):
         np.testing.assert_allclose(told.numbers(name)[:, 0], true, atol=1e-8)
         np.testing.assert_allclose(cloud[name], true, atol=1e-8)

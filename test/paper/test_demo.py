@@ -9,16 +9,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from helpers import graph  # noqa: F401 - skips where there is no rclpy
-from helpers.nodes import ROOT
+from helpers.nodes import ROOT, need_ros
 
+from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.errors import BagError, GraphError, ObservationError
 from fisheye_svp_ros.io.bags import Bag
+from fisheye_svp_ros.io.clouds import RESIDUALS
+from fisheye_svp_ros.io.columns import read_columns
 from fisheye_svp_ros.io.readers import read_observations
-from fisheye_svp_ros.io.recording import is_tabulated, tabulate
-from fisheye_svp_ros.paper.demonstration import demo_rows
+from fisheye_svp_ros.io.recording import has_residuals, is_tabulated, tabulate
+from fisheye_svp_ros.paper.demonstration import TASKS, compute_demo, demo_rows, residual_fields
 
 pytestmark = pytest.mark.xdist_group('demo')  # run once
 
@@ -26,6 +29,7 @@ pytestmark = pytest.mark.xdist_group('demo')  # run once
 @pytest.fixture(scope='module')
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Run the demo once; return its folder and what it printed."""
+    need_ros()
     folder = tmp_path_factory.mktemp('demo')
     env = {name: value for name, value in os.environ.items() if name != 'ROS_DOMAIN_ID'}
     env['PYTHONPATH'] = os.pathsep.join([str(ROOT), env.get('PYTHONPATH', '')])
@@ -110,7 +114,47 @@ def test_a_missing_scenario_is_named(demo: Any) -> None:
         demo_rows(twice, ['fish180'], [0.5])
 
 
+@pytest.fixture
+def computed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Any:
+    """Run the demo where there is no rclpy; return its folder and what it printed."""
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    assert main(['demo', '-o', str(tmp_path), '--lenses', 'fish180', '--radii', '0.5']) == 0
+    return tmp_path, capsys.readouterr().out
+
+
+def test_without_ros_the_same_scenarios_are_computed(computed: Any) -> None:
+    folder, printed = computed
+    first, *others = printed.splitlines()
+    assert first.startswith('  Without ROS 2 (') and 'in one process, no node graph' in first
+    assert sum(line.startswith('  fish180 ') for line in others) == 9
+    assert sorted(path.name for path in folder.iterdir() if path.suffix != '.parquet') == [
+        'demo.json', 'errors.png', 'residuals.png', 'table.csv']
+    assert json.loads((folder / 'demo.json').read_text())['recording'] is None
+    counts = read_columns(folder / 'table.csv')['namespace']
+    assert [counts.count(f'/{task.name}') for task in TASKS] == [3, 3 * 10, 3 * 2]
+
+
+def test_the_graph_tells_what_is_computed_without_it(demo: Any, computed: Any) -> None:
+    recorded, offline = (json.loads((folder / 'demo.json').read_text())['rows']
+                         for folder, _ in (demo, computed))
+    for told, mine in zip(recorded, offline, strict=True):
+        numbers = {name for name, value in mine.items() if isinstance(value, float)}
+        assert {k: v for k, v in told.items() if k not in numbers} == {
+            k: v for k, v in mine.items() if k not in numbers}
+        for name in numbers:
+            assert told[name] == pytest.approx(mine[name], abs=1e-9, nan_ok=True), name
+    one, = residual_fields(Bag(demo[0] / 'recording').records(has_residuals))
+    other, = compute_demo(['fish180'], [0.5])[1]
+    for name in RESIDUALS.names or ():
+        np.testing.assert_allclose(one.points[name], other.points[name], atol=1e-8)
+    assert demo[1].splitlines() == [
+        *computed[1].splitlines()[1:-1], f'  recording, table, pictures: {demo[0]}']
+
+
 def test_a_process_that_fails_is_named_and_none_is_left(tmp_path: Path) -> None:
+    need_ros()
     with (
         pytest.raises(GraphError, match=r"bad ended with status 2: .*'nothere' is neither"),
         Processes(tmp_path / 'logs') as processes,
