@@ -6,6 +6,7 @@ import fcntl
 import os
 import random
 import socket
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -18,9 +19,12 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 # Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
-from helpers.nodes import Caller, NodeProcess  # noqa: E402
+from helpers.nodes import TIMEOUT, Caller, NodeProcess  # noqa: E402
 
+from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments  # noqa: E402
 from fisheye_svp_ros.optics import engines  # noqa: E402
+
+_SEGMENTS = segments()
 
 
 def _is_free(domain: int) -> bool:
@@ -31,6 +35,12 @@ def _is_free(domain: int) -> bool:
         except OSError:
             return False
     return True
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Remove the shared memory of nodes that tests have killed, once all workers have ended."""
+    if not hasattr(session.config, 'workerinput'):
+        remove_orphans(_SEGMENTS)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -80,7 +90,7 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
 def start_process(
     ros_domain: int
 ) -> Iterator[Callable[[list[str], dict[str, str]], NodeProcess]]:
-    """Return a function that starts a command; what runs when the test ends is killed."""
+    """Return a function that starts a command; what runs when the test ends is ended."""
     started: list[NodeProcess] = []
 
     def start(command: list[str], env: dict[str, str]) -> NodeProcess:
@@ -89,7 +99,11 @@ def start_process(
 
     yield start
     for node in started:
-        if node.process.poll() is None:
+        node.process.terminate()  # killed, it would leave its shared memory behind
+    for node in started:
+        try:
+            node.process.wait(TIMEOUT)
+        except subprocess.TimeoutExpired:
             node.process.kill()
             node.process.wait()
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
 from fisheye_svp_ros.errors import GraphError
 
 _POLL = 0.05  # s
@@ -23,13 +24,14 @@ _GRACE = 10.0  # s to end after a signal
 
 
 class Processes:
-    """A context manager that leaves no process behind; each writes DIR/NAME.log."""
+    """A context manager that leaves no process and no shared memory; each writes DIR/NAME.log."""
 
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': domain(), 'PYTHONUNBUFFERED': '1'}
         self._environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
         self._running: dict[str, subprocess.Popen[bytes]] = {}
+        self._segments = segments()
 
     def __enter__(self) -> Processes:
         self._logs.mkdir(parents=True, exist_ok=True)
@@ -44,6 +46,8 @@ class Processes:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
+        if any((process.returncode or 0) < 0 for process in self._running.values()):
+            remove_orphans(self._segments)
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """Start `fisheye-svp ARGUMENTS`."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,7 +13,10 @@ import pytest
 from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands.processes import Processes
+from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
 from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
+from fisheye_svp_ros.errors import GraphError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.share import lens_path
 
@@ -44,6 +49,28 @@ def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) 
     parent.send_signal(number)
     parent.wait()
     until(lambda: not any(map(_runs, children)), 20)
+
+
+def _held(pid: int) -> set[str]:
+    """Return the shared memory of a process: segments, and not ports, which others soon have."""
+    return set(re.findall(r'/dev/shm/(fastrtps_[0-9a-f]{16})\b',
+                          Path(f'/proc/{pid}/maps').read_text()))
+
+
+def test_a_node_that_is_killed_leaves_no_shared_memory(tmp_path: Path, ros_domain: int) -> None:
+    need_ros()
+    with Processes(tmp_path) as processes:
+        for name in ('killed', 'other'):
+            processes.start(name, ['run', 'localizer'])
+        killed, other = (one.pid for one in processes._running.values())
+        left, ended = (until(lambda pid=pid: _held(pid)) for pid in (killed, other))
+        os.kill(killed, signal.SIGKILL)
+        with pytest.raises(GraphError, match='killed ended with status -9'):
+            processes.wait(['killed'], 60.0)
+        # What a living process holds stays.
+        remove_orphans(segments() - ended)
+        assert _held(other) <= segments()
+    assert not (left | ended) & segments()
 
 
 def _runs(pid: int) -> bool:
