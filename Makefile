@@ -46,7 +46,7 @@ blind: $(VENV)/ready
 blind-images: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind_images --trials 100
 
-# How accurate detected corners are, into docs/detectors.md.
+# How accurate detected corners are, into docs/results/detectors.md.
 detectors: $(VENV)/ready
 	$(BIN)/python -m benchmark.detectors --count 60
 
@@ -55,11 +55,11 @@ detectors: $(VENV)/ready
 blind-independent: $(VENV)/ready
 	$(BIN)/python -m benchmark.independent --trials 69 -o $(OUT)/blind_independent
 
-# The live guide tried on rendered images by somebody who holds the board, into docs/next/.
+# The live guide tried on rendered images by somebody who holds the board, into docs/results/next/.
 guided: $(VENV)/ready
 	$(BIN)/python -m benchmark.guided
 
-# Speed beside what a user would pick instead, into docs/benchmarks.md; leave the machine alone.
+# Speed beside what a user would pick instead, into docs/results/benchmarks.md; leave the machine alone.
 bench: .venv-bench/ready
 	.venv-bench/bin/python -m benchmark.speed
 
@@ -72,7 +72,7 @@ bench: .venv-bench/ready
 		.venv-bench/mrcal || echo 'mrcal: no sources to be had; its rows are left out'
 	touch $@
 
-# Held-out corners of real cameras through other calibrations, into docs/compare.md; ten minutes.
+# Held-out corners of real cameras through other calibrations, into docs/results/compare.md; ten minutes.
 COMPARE_PYTHON ?= python3.12
 COMPARE_DATA ?= data
 compare: .venv-compare/ready
@@ -86,25 +86,25 @@ compare: .venv-compare/ready
 	.venv-compare/bin/pip install --quiet --no-deps mrcal || echo 'mrcal: not to be had here'
 	touch $@
 
-# What spoilt views do to poses, into docs/reliability.md; ten minutes.
+# What spoilt views do to poses, into docs/results/reliability.md; ten minutes.
 poses: $(VENV)/ready
 	$(BIN)/python -m benchmark.poses
 
-# Hostile input by the million for every reader, table and callback, into docs/reliability.md;
+# Hostile input by the million for every reader, table and callback, into docs/results/reliability.md;
 # half an hour.
 fuzz: $(VENV)/ready
 	$(BIN)/python -m benchmark.fuzz
 
-# A million hostile messages over DDS against running nodes, into docs/reliability.md; half an hour.
+# A million hostile messages over DDS against running nodes, into docs/results/reliability.md; half an hour.
 soak: $(VENV)/ready
 	$(BIN)/python -m benchmark.soak
 
-# What is left of a command that is killed, or may not write, into docs/reliability.md; needs root
+# What is left of a command that is killed, or may not write, into docs/results/reliability.md; needs root
 # for its small disks; an hour.
 kills: $(VENV)/ready
 	$(BIN)/python -m benchmark.kills
 
-# How many of 300 small faults the tests find, into docs/mutation.md; goes on where it was
+# How many of 300 small faults the tests find, into docs/results/mutation.md; goes on where it was
 # interrupted; one and a half hours.
 mutation: $(VENV)/ready
 	$(BIN)/pip install --quiet 'cosmic-ray>=8.3' 'pytest-cov>=7'

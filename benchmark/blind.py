@@ -1,7 +1,8 @@
 """Blind tests of the diagnosis: `python -m benchmark.blind --trials 200 --workers 2`.
 
 Hides random effects in random scenes, hands table and lens to `diagnose`, and writes what came of
-it: a file a mode in docs/blind/, and docs/blind.md from all that are there (design, section 8).
+it: a file a mode in docs/results/blind/, and docs/results/blind.md from all that are there
+(design, section 8).
 """
 
 from __future__ import annotations
@@ -85,7 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
     parser.add_argument('--seed', type=int, default=0, help='another seed, other trials')
     parser.add_argument('--modes', nargs='+', choices=MODES, default=MODES, help='what to hide')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs'), help='directory')
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
+                        help='directory')
     asked = parser.parse_args(arguments)
     (asked.output / 'blind').mkdir(parents=True, exist_ok=True)
     for mode in asked.modes:

@@ -3,8 +3,8 @@
 An effect is hidden in rendered photographs; `detect`, `calibrate` and `diagnose` get nothing but
 the pictures and the board's nominal size (of a lens that was bumped after its calibration, that
 calibration as well).  Its amount is such that it leaves `size` times the noise of the corners once
-a lens without it is fitted.  Appends each trial to docs/blind/images.jsonl, leaves out those that
-are there, and writes docs/blind_images.md of all.
+a lens without it is fitted.  Appends each trial to docs/results/blind/images.jsonl, leaves out
+those that are there, and writes docs/results/blind_images.md of all.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.measured import localize_measured, rms_px
 
-PAGE = Path('docs/blind_images.md')
-KEPT = Path('docs/blind/images.jsonl')
+PAGE = Path('docs/results/blind_images.md')
+KEPT = Path('docs/results/blind/images.jsonl')
 BOARD = 'chessboard:9x6:25mm'
 NOISE = 0.0053  # px, of a corner's u and v in these photographs
 PHOTOGRAPHS = 20

@@ -1,4 +1,4 @@
-"""The report of the blind tests: docs/blind.md and the pictures and numbers beside it."""
+"""The report of the blind tests: docs/results/blind.md and the pictures and numbers beside it."""
 
 from __future__ import annotations
 

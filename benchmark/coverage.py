@@ -7,7 +7,7 @@ within their intervals in 95 of 100 cases, by noise alone, with the lens's param
 misfit that remains (`diagnosis.uncertainty`).  Without a table: simulated cameras with displaced
 landmarks and an image field that no catalogue holds, of which the truth is known: poses of the
 other half, and points that two of the cameras see as a rig, by what the lens files carry
-(`diagnosis.lens_errors`); how often each cause was named.  Writes docs/coverage.json.
+(`diagnosis.lens_errors`); how often each cause was named.  Writes docs/results/coverage.json.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--name', help='of the data in the output')
     parser.add_argument('--deals', type=int, default=0, help='random ones, to halves')
     parser.add_argument('--cameras', type=int, default=20, help='simulated ones')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/coverage.json'))
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/coverage.json'))
     asked = parser.parse_args(arguments)
     width, height = map(int, asked.image_size.split('x'))
     sets = [Simulated(joined([read_observations(path) for path in asked.tables]), (width, height),

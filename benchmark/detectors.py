@@ -1,7 +1,8 @@
 """How accurate detected corners are, by incidence angle.
 
 On rendered photographs, whose corners are known, and as what a lens fit leaves on real ones.
-Writes docs/detectors.md.  Run: python -m benchmark.detectors [--count 60] [--photographs FOLDER]
+Writes docs/results/detectors.md.  Run:
+python -m benchmark.detectors [--count 60] [--photographs FOLDER]
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from fisheye_svp_ros.simulate.render import Exposure, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'detectors.md'
+PAGE = Path(__file__).resolve().parents[1] / 'docs' / 'results' / 'detectors.md'
 DETECTORS = ('saddle', 'sb', 'classic')
 ANGLES = (0, 25, 45, 60, 75, 85, 95)
 LENS = Lens('benchmark', 848, 800, 285.0, 285.0, 423.6, 399.3,

@@ -5,8 +5,8 @@ detector finds it; the guide knows the data sheet (field of view, to 2 %) and no
 Whoever holds the board sees the guide's picture and knows what the words say: the board goes
 where it is wanted, a few centimetres and degrees off, and is then brought nearer to the outline by
 eye, with a hand that errs and trembles.  Photographs are those that the guide takes by itself.
-Then `calibrate` and `diagnose` are given them.  Writes docs/next/guided.json and, of the first
-camera, docs/images/guide.jpg.
+Then `calibrate` and `diagnose` are given them.  Writes docs/results/next/guided.json and, of the
+first camera, docs/images/guide.jpg.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the trial, write it, print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.guided')
     parser.add_argument('--cameras', type=int, default=10)
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/next/guided.json'))
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/next/guided.json'))
     asked = parser.parse_args(arguments)
     with progress('cameras', asked.cameras) as advance:
         cameras = []

@@ -5,7 +5,7 @@ of them while they write.  Then: are the files of the set all there, as a whole 
 none?  Is a temporary file left, a process?  Does the same command go through afterwards, with the
 same tables to the last byte?  Disks that are full at some point of a run, folders that are
 read-only or another user's, need root.  Ctrl-C ends it early and reports what was tried.  Writes
-docs/reliability.md.
+docs/results/reliability.md.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pathlib import Path
 
 from fisheye_svp_ros.reporting.progress import progress
 
-_DOC = Path(__file__).parents[1] / 'docs' / 'reliability.md'
+_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'reliability.md'
 _BEGIN, _END = '<!-- kills -->', '<!-- end of kills -->'
 _WRITING = 0.15  # of a run: the end, where most is written
 _PATIENCE = 20.0  # s to end after SIGTERM, and for children to go with their parent
@@ -312,7 +312,7 @@ def _judge(
 def section(
     commands: dict[str, Outcome], nodes: dict[str, Outcome], disks: dict[str, Outcome], how: str
 ) -> str:
-    """Return the section of docs/reliability.md."""
+    """Return the section of docs/results/reliability.md."""
     lines = [
         f'`{how}`:', '',
         '| killed | SIGTERM | SIGKILL | all files | none | some | temporary files (SIGTERM) | '

@@ -7,7 +7,7 @@ field, another one in every photograph, points far off, points not found. The le
 Kannala-Brandt and diagnosed; then once more with the shift taken in, so that e0 is estimated
 whether it is named or not.
 
-Writes docs/local_errors.json and .md.
+Writes docs/results/local_errors.json and .md.
 """
 
 from __future__ import annotations
@@ -148,7 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog='python -m benchmark.local_errors')
     parser.add_argument('--trials', type=int, default=200)
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs'), help='directory')
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
+                        help='directory')
     asked = parser.parse_args(arguments)
     trials = in_processes('sets', trial, range(asked.trials), asked.workers)
     lines = ',\n'.join(json.dumps(one) for one in trials)

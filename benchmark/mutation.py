@@ -2,8 +2,9 @@
 
 `python -m benchmark.mutation --sample 300` changes one operator or number at a time in a copy of
 the tree, runs the tests that reach it (`mutation_reach`), the quickest first and up to the first
-that fails, and writes docs/mutation.md: what died, and each survivor with its change.  Mutants
-that the compiler cannot tell from the original (annotations, docstrings) are not drawn.
+that fails, and writes docs/results/mutation.md: what died, and each survivor with its change.
+Mutants that
+the compiler cannot tell from the original (annotations, docstrings) are not drawn.
 Interrupted runs go on where they were (--folder).
 """
 
@@ -266,7 +267,7 @@ def main() -> None:
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--budget', type=float, default=60.0, help='s of tests a mutant')
     parser.add_argument('--folder', type=Path, default=Path('out/mutation'), help='goes on here')
-    parser.add_argument('-o', '--output', type=Path, default=ROOT / 'docs/mutation.md')
+    parser.add_argument('-o', '--output', type=Path, default=ROOT / 'docs/results/mutation.md')
     args = parser.parse_args()
     tree = args.folder.resolve() / 'tree'
     if not tree.exists():

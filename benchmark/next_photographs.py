@@ -7,7 +7,7 @@ criterion of the Calibration Wizard (Peng and Sturm, ICCV 2019).  Counted is how
 a standard error of e0, and to be 95 % sure that a shift of 2 mm is not a lens curve or a bent
 board.  Predicted errors are held against refits.  With --data the same is done by choosing among
 the frames that there are, and counted is, too, how many it takes for `diagnose` to name the shift.
-Writes docs/next/*.json.
+Writes docs/results/next/*.json.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--cameras', type=int, default=100)
     parser.add_argument('--data', type=Path, help='observations CSV: choose among its frames')
     parser.add_argument('--image-size', default='1280x800', help='of --data')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/next'))
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/next'))
     asked = parser.parse_args(arguments)
     if asked.data:
         width, height = map(int, asked.image_size.split('x'))

@@ -1,6 +1,6 @@
 """What spoilt views do to poses, and whether wrong ones are said to be wrong.
 
-`python -m benchmark.poses` writes the section "Poses" of docs/reliability.md.
+`python -m benchmark.poses` writes the section "Poses" of docs/results/reliability.md.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CASES = {
 # From one view these cannot be told: a mirrored plane is the same plane seen from behind.
 UNTESTABLE = {('mirrored', 'board')}
 _LENS, _OTHER = 'fish214', 'fish180'
-_DOC = Path(__file__).parents[1] / 'docs' / 'reliability.md'
+_DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'reliability.md'
 _BEGIN, _END = '<!-- poses -->', '<!-- end of poses -->'
 
 
@@ -149,7 +149,7 @@ def lost_minima(points: int, cone: float, count: int, rng: np.random.Generator) 
 
 
 def section(outcomes: dict[tuple[str, str], Outcome], lost: dict[int, tuple[int, int]]) -> str:
-    """Return the section of docs/reliability.md."""
+    """Return the section of docs/results/reliability.md."""
     spoilt_views = [o for (case, _), o in outcomes.items() if case != 'clean']
     told = [o for place, o in outcomes.items() if place not in UNTESTABLE and place[0] != 'clean']
     clean = [o for (case, _), o in outcomes.items() if case == 'clean']

@@ -6,7 +6,7 @@ choice, once with the causes of the whole set. For each intrinsic and e0: chi^2 
 estimates about their weighted mean, under their stated errors, over its 2 degrees of freedom; the
 mean over all deals is 1 where the stated errors are all that there is.
 
-Writes docs/thirds.md.
+Writes docs/results/thirds.md.
 """
 
 from __future__ import annotations
@@ -96,7 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--image-size', required=True, metavar='WxH')
     parser.add_argument('--deals', type=int, default=5)
     parser.add_argument('--workers', type=int, default=os.cpu_count(), help='processes')
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs'), help='directory')
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results'),
+                        help='directory')
     asked = parser.parse_args(arguments)
     width, height = (int(side) for side in asked.image_size.split('x'))
     todo, labels = [], []

@@ -5,7 +5,7 @@ offsets of single corners, an image field of each lens and of each frame, outlie
 only one camera sees or that the detector numbered from the other end.  Each is calibrated and
 diagnosed as a user would, and asked what the two cameras say of each other.  Some pairs are
 rendered: photographs alone go to `detect`.  Pairs that the output holds already are not run again;
-writes docs/two_cameras.json and the table in docs/whats_wrong.md.
+writes docs/results/two_cameras.json and the table in docs/how_to/whats_wrong.md.
 """
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
 
 
 def section(found: Sequence[dict[str, Any]]) -> str:
-    """Return the table of docs/whats_wrong.md."""
+    """Return the table of docs/how_to/whats_wrong.md."""
     lines = [
         '| pairs | agree, undecided, contradict | correlation of the maps | rms of the one that '
         'did not find it, px | less scatter of the rig: translation | rotation | by the truth | '
@@ -351,7 +351,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the pairs, write those that are done and print a line for each."""
     parser = argparse.ArgumentParser(description=__doc__, prog='python -m benchmark.two_cameras')
     parser.add_argument('--pairs', type=int, default=10, help='of each kind')
-    parser.add_argument('-o', '--output', type=Path, default=DOCS / 'two_cameras.json')
+    parser.add_argument('-o', '--output', type=Path, default=DOCS / 'results' / 'two_cameras.json')
     asked = parser.parse_args(arguments)
     found = json.loads(asked.output.read_text()) if asked.output.is_file() else []
     done = {(one['kind'], one['seed']) for one in found}
@@ -364,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.stdout.write(lines[-1] + '\n')
             sys.stdout.flush()
             write_text(asked.output, '[\n' + ',\n'.join(lines) + '\n]\n')
-    page = DOCS / 'whats_wrong.md'
+    page = DOCS / 'how_to' / 'whats_wrong.md'
     between = f'{BEGIN}\n{section(found)}\n{END}'
     write_text(page, re.sub(f'{BEGIN}.*{END}', lambda _: between, page.read_text(), flags=re.S))
 

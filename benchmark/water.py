@@ -5,7 +5,7 @@ little off) photograph a board through a tilted port into a hidden medium, or do
 through a plate with air on both sides, have another focal length or another curve.  Lens and
 table alone are handed to `diagnose`; with --air the lens is what `calibrate` makes of photographs
 in air.  Rays are traced here by bisection, as nowhere else in the package.  Writes
-docs/water/trials.json.
+docs/results/water/trials.json.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument('--rough', action='store_true', help='with errors of board and frames')
     parser.add_argument('--air', action='store_true', help='lenses calibrated in air')
     parser.add_argument('--workers', type=int, default=os.cpu_count())
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/water/trials.json'))
+    parser.add_argument('-o', '--output', type=Path,
+                        default=Path('docs/results/water/trials.json'))
     asked = parser.parse_args(arguments)
     run = partial(run_trial, rough=asked.rough, air=asked.air)
     outcomes = in_processes('trials', run, range(asked.trials), asked.workers)

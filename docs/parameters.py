@@ -34,7 +34,7 @@ def markdown(table: list[Row]) -> str:
 
 def parameter_file(node: str, table: list[Row]) -> str:
     """Return a commented parameter file that holds the defaults."""
-    lines = [f'# Parameters of {node}, with their defaults.  docs/nodes.md says more.',
+    lines = [f'# Parameters of {node}, with their defaults.  docs/reference/nodes.md says more.',
              '/**:', '  ros__parameters:']
     for row in table:
         unit = f' [{row.unit}]' if row.unit else ''
@@ -47,7 +47,7 @@ def parameter_file(node: str, table: list[Row]) -> str:
 
 def documents() -> dict[Path, str]:
     """Return what the files should hold."""
-    page = ROOT / 'docs' / 'nodes.md'
+    page = ROOT / 'docs' / 'reference' / 'nodes.md'
     text, wanted = page.read_text(encoding='utf-8'), {}
     for node in NODES:
         if not (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists():
@@ -57,7 +57,7 @@ def documents() -> dict[Path, str]:
         new = _TABLE.format(node=node, table=markdown(table))
         text, found = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)
         if not found:
-            raise SystemExit(f'docs/nodes.md has no place for the parameters of {node}')
+            raise SystemExit(f'docs/reference/nodes.md has no place for the parameters of {node}')
         wanted[ROOT / 'config' / f'{node}.yaml'] = parameter_file(node, table)
     return {**wanted, page: text}
 

@@ -66,7 +66,7 @@ def test_a_page_runs_as_printed(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    found = _BLOCK.findall((ROOT / 'docs' / page).read_text())
+    found = _BLOCK.findall((ROOT / 'docs' / 'reference' / page).read_text())
     assert len(found) == blocks
     for code, expected in found:
         printed = io.StringIO()

@@ -1,7 +1,7 @@
 """`python -m benchmark.compare DATA`: the same held-out corners through ours and through others.
 
 DATA holds the folders ov_plane, ov_cube (train.csv, test.csv) and photos (chessboard,
-square_grid); what is not there is left out.  Writes docs/compare.md.
+square_grid); what is not there is left out.  Writes docs/results/compare.md.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from fisheye_svp_ros.library import Localized  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 
-_DOC = Path(__file__).parents[2] / 'docs' / 'compare.md'
+_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'
 _MARK = '<!-- figures -->'
 _OV = (1280, 800)
 SETS: dict[str, Callable[[Path], Set]] = {
@@ -159,7 +159,7 @@ def _incidence(test: Observations, start: Localized) -> Array:
 
 
 def section(data: Set, rows: list[Row]) -> list[str]:
-    """Return the part of docs/compare.md on one set."""
+    """Return the part of docs/results/compare.md on one set."""
     best = min((row.rms_px for row in rows if not row.ours and np.isfinite(row.rms_px)),
                default=np.nan)
     boards = len(np.unique(data.train.board))

@@ -21,7 +21,7 @@ from benchmark.fuzz.trials import LARGEST, SLOWEST, WAITING, Outcome, every, tri
 
 _HUNG = 60.0  # s without an answer, then a worker is ended
 _CHUNK = 500  # inputs of a task
-_DOC = Path(__file__).parents[2] / 'docs' / 'reliability.md'
+_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'reliability.md'
 Task = tuple[str, int, int]  # surface, first seed, number of seeds
 _BEGIN, _END = '<!-- fuzz -->', '<!-- end of fuzz -->'
 
@@ -127,7 +127,7 @@ def _halves(worker: _Worker, outcomes: dict[str, Outcome]) -> list[Task]:
 
 
 def section(outcomes: dict[str, Outcome], command: str) -> str:
-    """Return the section of docs/reliability.md."""
+    """Return the section of docs/results/reliability.md."""
     whole = Outcome()
     for outcome in outcomes.values():
         whole.add(outcome)
@@ -155,7 +155,8 @@ def main() -> int:
     parser.add_argument('--workers', type=int, default=os.cpu_count())
     parser.add_argument('--only', default='', help='surfaces whose names contain this')
     parser.add_argument('--seed', type=int, help='try this one, here, and show what it raises')
-    parser.add_argument('--no-docs', action='store_true', help='leave docs/reliability.md alone')
+    parser.add_argument('--no-docs', action='store_true',
+                        help='leave docs/results/reliability.md alone')
     args = parser.parse_args()
     wanted = [surface for surface in every() if args.only in surface.name]
     if args.seed is not None:

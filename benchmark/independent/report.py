@@ -28,7 +28,7 @@ lies where the hidden effect does; under a background, which lies everywhere, it
 
 
 def write_reports(docs: Path, name: str, table: Mapping[str, Any]) -> None:
-    """Write docs/blind/independent_NAME.json, then the page over all such tables."""
+    """Write docs/results/blind/independent_NAME.json, then the page over all such tables."""
     folder = docs / 'blind'
     folder.mkdir(parents=True, exist_ok=True)
     lines = ',\n'.join(json.dumps(score) for score in table['scores'])

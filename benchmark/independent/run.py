@@ -83,7 +83,7 @@ def main() -> None:
     parser.add_argument('--background', type=float, nargs='+', default=[0.0, 0.5, 1.0],
                         help='rms of the background, in noise levels')
     parser.add_argument('--mode', nargs='+', choices=MODES, default=list(MODES))
-    parser.add_argument('--docs', type=Path, default=Path('docs'))
+    parser.add_argument('--docs', type=Path, default=Path('docs/results'))
     parser.add_argument('-o', '--output', type=Path, required=True,
                         help='folder of the sets and of what was said about them')
     args = parser.parse_args()

@@ -24,7 +24,7 @@ _AHEAD = 1000  # messages that a node has not counted, and sets that wait, in th
 _CHUNK = 100
 _LONG = 600.0  # s for all nodes to come up, on a machine that may be busy
 _STEADY = 0.2  # of a round, after which memory is compared
-_DOC = Path(__file__).parents[2] / 'docs' / 'reliability.md'
+_DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'reliability.md'
 _BEGIN, _END = '<!-- soak -->', '<!-- end of soak -->'
 
 
@@ -139,7 +139,7 @@ def row(victim: Victim, answers_well: str) -> str:
 
 
 def section(rounds: list[list[str]], total: int, how: str) -> str:
-    """Return the section of docs/reliability.md."""
+    """Return the section of docs/results/reliability.md."""
     head = ('| node | hostile | sent | lost by the sender | received | read | unusable | dropped '
             '| sets taken | solved | not solved | sets dropped | incomplete | internal errors '
             '| memory grown MB | answers |')
@@ -155,7 +155,8 @@ def main() -> int:
     parser.add_argument('--messages', type=int, default=1_000_000)
     parser.add_argument('--flood', type=float, default=0.2, help='share of the second round')
     parser.add_argument('--nodes', nargs='*', choices=KINDS, default=[*KINDS])
-    parser.add_argument('--no-docs', action='store_true', help='leave docs/reliability.md alone')
+    parser.add_argument('--no-docs', action='store_true',
+                        help='leave docs/results/reliability.md alone')
     asked = parser.parse_args()
     flood = round(asked.flood * asked.messages)
     wire = Wire()

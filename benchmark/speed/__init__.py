@@ -1,1 +1,1 @@
-"""`make bench`: speed beside what a user would pick instead, written to docs/benchmarks.md."""
+"""`make bench`: speed beside other tools, written to docs/results/benchmarks.md."""

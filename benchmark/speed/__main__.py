@@ -1,4 +1,4 @@
-"""`python -m benchmark.speed`: measure everything and write docs/benchmarks.md."""
+"""`python -m benchmark.speed`: measure everything and write docs/results/benchmarks.md."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def main() -> None:
     """Measure and write."""
     parser = argparse.ArgumentParser(prog='python -m benchmark.speed', description=__doc__)
     parser.add_argument('--only', nargs='+', choices=_PARTS, default=list(_PARTS))
-    parser.add_argument('-o', '--output', type=Path, default=Path('docs/benchmarks.md'))
+    parser.add_argument('-o', '--output', type=Path, default=Path('docs/results/benchmarks.md'))
     args = parser.parse_args()
     chosen = '' if args.only == list(_PARTS) else f' --only {" ".join(args.only)}'
     sections = []

@@ -1,4 +1,4 @@
-"""docs/benchmarks.md from what was measured."""
+"""docs/results/benchmarks.md from what was measured."""
 
 from __future__ import annotations
 

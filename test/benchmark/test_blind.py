@@ -1,7 +1,7 @@
 """Blind tests: what the generator hides is what it says, and the diagnosis finds it.
 
-The full runs, with their rates, are in docs/blind.md; here a few trials that never change, and a
-few that nobody has seen before.
+The full runs, with their rates, are in docs/results/blind.md; here a few trials that never
+change, and a few that nobody has seen before.
 """
 
 import random
@@ -25,8 +25,9 @@ from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 
 # A sound build misses a threshold less than once in this many runs.
 RUNS = 10_000
-# Rates that a sound build keeps: the lower ends (95 %) of what docs/blind.md has measured, 48 of
-# 48 at sizes from 0.2 times the noise, 93 of 95 for clean data.  Successes are then binomial.
+# Rates that a sound build keeps: the lower ends (95 %) of what docs/results/blind.md has
+# measured, 48 of 48 at sizes from 0.2 times the noise, 93 of 95 for clean data.  Successes are
+# then binomial.
 NAMED, ADEQUATE = 0.92, 0.92
 FIXED = tuple(
     Task('one', 0.5, (name,), 2024, 0) for name in (

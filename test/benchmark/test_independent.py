@@ -387,9 +387,10 @@ def test_trials_are_not_diagnosed_twice_and_reported(mode, tmp_path, monkeypatch
     this = run.Run(mode, SEED, 0.5, 2)
     scores = [run.trial(this, i, tmp_path) for i in range(2)]
     assert scores == [run.trial(this, i, tmp_path) for i in range(2)]
-    report.write_reports(tmp_path / 'docs', this.name, {**this._asdict(), 'scores': scores})
-    table = json.loads((tmp_path / f'docs/blind/independent_{this.name}.json').read_text())
+    report.write_reports(
+        tmp_path / 'docs/results', this.name, {**this._asdict(), 'scores': scores})
+    table = json.loads((tmp_path / f'docs/results/blind/independent_{this.name}.json').read_text())
     assert table['scores'] == scores
-    page = (tmp_path / 'docs/blind_independent.md').read_text()
+    page = (tmp_path / 'docs/results/blind_independent.md').read_text()
     assert f'--seed {SEED} --background 0.5 --mode {mode}' in page
     assert 'explained' in page

@@ -1,4 +1,4 @@
-"""Sets like real ones: what is hidden in them is found; the rates are in docs/local_errors.md."""
+"""What is hidden in sets like real ones is found; rates are in docs/results/local_errors.md."""
 
 from benchmark.local_errors import photographed, report, trial
 

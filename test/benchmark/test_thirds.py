@@ -1,4 +1,4 @@
-"""Thirds of the frames: chi^2 of estimates; the figures are in docs/thirds.md."""
+"""Thirds of the frames: chi^2 of estimates; the figures are in docs/results/thirds.md."""
 
 import numpy as np
 

@@ -19,15 +19,13 @@ from helpers.nodes import ROOT, need_ros
 
 from fisheye_svp_ros import cli
 
-PAGES = ('paper.md', 'sweeps.md', 'neglect_the_shift.md', 'record_and_compare.md',
-         'whats_wrong.md', 'photographs.md', 'water.md', 'next_photographs.md', 'nodes.md',
-         '../README.md')
+PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
 BLOCKS = [
-    pytest.param(block, id=f'{page} {number}')
+    pytest.param(block, id=f'{page.name} {number}')
     for page in PAGES
-    for number, block in enumerate(_BLOCK.findall((ROOT / 'docs' / page).read_text()))
+    for number, block in enumerate(_BLOCK.findall(page.read_text()))
 ]
 
 
@@ -67,8 +65,7 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
     assert 'dask' in block or 'Traceback' not in text, text
 
 
-@pytest.mark.parametrize('page', [ROOT / 'README.md', *sorted((ROOT / 'docs').glob('*.md'))],
-                         ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_every_command_is_one(page: Path) -> None:
     blocks = re.findall(r'```(?:ba)?sh\n(.*?)```', page.read_text(), re.DOTALL)
     text = '\n'.join(blocks).replace('\\\n', ' ') + '\n'.join(
@@ -85,7 +82,7 @@ def test_every_command_is_one(page: Path) -> None:
 
 
 def test_architecture_names_every_room_and_what_is_there() -> None:
-    page = (ROOT / 'docs' / 'architecture.md').read_text()
+    page = (ROOT / 'docs' / 'explanation' / 'architecture.md').read_text()
     paths = re.findall(r'`([\w./]+/[\w./]*|\w+\.(?:py|toml))`', page)
     assert len(paths) > 40
     for path in paths:
