@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, note_left_out, say
 from fisheye_svp_ros.commands.photographs import (
@@ -30,6 +29,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.progress import progress, stages
 from fisheye_svp_ros.reporting.tables import UNITS, interval, noise_text, print_table, with_error
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
+from fisheye_svp_ros.scene.photograph_names import list_frames
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
 from fisheye_svp_ros.solve.measured import rms_px, sigma_known
@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> None:
                 path = args.output if alone else args.output / f'{camera}.yaml'
                 _write(result, trusts[camera], path)
     for camera, result in results.items():
-        _report(result, trusts[camera], args.model, tables[camera].sigma)
+        _report(result, trusts[camera], args.model, tables[camera])
     if pair := rig_cameras(observations.cameras):
         _rig(observations, results, pair, args.output)
 
@@ -131,17 +131,17 @@ def _calibrated(
                             f'({cause}); is what the camera looked through another?') from cause
 
 
-def _report(result: Calibration, trust: Trust, model: str, sigmas: Array) -> None:
-    """Print the lens, and what there is to say against it; sigmas (N,), px, NaN = unknown."""
+def _report(result: Calibration, trust: Trust, model: str, table: Observations) -> None:
+    """Print the lens, and what there is to say against it; table: what it was fitted to."""
     _print(result, trust)
     for name, range_ in trust.doubtful_shift.items():
         low, high = 1e3 * range_.low, 1e3 * range_.high
         say(f'{name} is not settled: from {low:.2f} to {high:.2f} mm over all targets that '
             'these data admit, whose shape can explain it; ask `fisheye-svp diagnose`')
-    note_left_out(result.left_out)
+    note_left_out(table, result.left_out)
     if not result.adjusted.converged:
         say('the adjustment has not converged; take the lens for a rough one')
-    rms, sigma = (result.adjusted.lens.calibration or {})['rms_px'], float(np.median(sigmas))
+    rms, sigma = (result.adjusted.lens.calibration or {})['rms_px'], float(np.median(table.sigma))
     if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
         say(f'{model} leaves {rms:.1f} px: it does not fit this lens, or image points and '
             'landmarks do not belong together (order, units, axes, image size)')
@@ -239,7 +239,7 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
     torn = sorted({int(both.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
                    if why == FRAME})
     if torn:
-        say(f'rig: frames {", ".join(map(str, torn))} are left out: {FRAME}')
+        say(f'rig: left out: {list_frames(both, torn)}: {FRAME}')
     return shared(both.take(~np.isin(np.arange(len(both)), gross.rows)))
 
 

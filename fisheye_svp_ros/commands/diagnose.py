@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,12 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
-from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes, measured
+from fisheye_svp_ros.commands.photographs import (
+    add_observation_arguments,
+    check_sizes,
+    measured,
+    search_options,
+)
 from fisheye_svp_ros.commands.plan import view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
@@ -21,6 +26,7 @@ from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import photograph_names
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
@@ -147,9 +153,9 @@ def _read(
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = given[''] if one else lenses
     observations, left_out = posable(table, lens)
-    note_left_out(left_out)
+    note_left_out(table, left_out)
     observations, again = without_copies(observations)
-    note_copies(again)
+    note_copies(table, again)
     return observations, lens
 
 
@@ -207,18 +213,25 @@ def _write(
     if diagnosis.rig:
         cameras, rig = diagnosis.rig
         save_rig(rig, folder / 'rig.yaml', cameras)
-    _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations.cameras)
+    _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations)
     write_report(diagnosis, points, known, Inputs(
-        args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free
+        args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free,
+        search_options(args) if args.board else (),
     ), wanted)
 
 
-def _write_residuals(path: Path, points: PointResiduals, cameras: Sequence[str]) -> None:
-    named = {'camera': np.array(cameras)[points.camera]} if len(cameras) > 1 else {}
+def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:
+    cameras = np.array(table.cameras)[points.camera]
+    named = {'camera': cameras} if len(table.cameras) > 1 else {}
+    names = photograph_names(table)
+    photographs = {'photograph': np.array([
+        names.get(view, '') for view in zip(points.frame.tolist(), cameras.tolist(), strict=True)
+    ])} if names else {}
     write_table(path, {
         'frame': points.frame, **named, 'landmark': points.landmark,
         'u': points.uv[:, 0], 'v': points.uv[:, 1],
         'du_before': points.before[:, 0], 'dv_before': points.before[:, 1],
         'du_after': points.after[:, 0], 'dv_after': points.after[:, 1],
         'theta': points.theta, 'range': points.range, 'outlier': points.outlier.astype(int),
+        **photographs,
     })

@@ -17,6 +17,8 @@ from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured, rms_px
 
@@ -55,15 +57,18 @@ def run(args: argparse.Namespace) -> None:
                 uncertainty = pose_summary(parts)
             else:
                 measured = localize_measured(model, table)
-        _print(measured, uncertainty, ' '.join(filter(None, (args.observations, name))))
-        note_left_out(measured.left_out)
-        note_doubtful(measured.views.frame.tolist(), measured.reasons)
+        title = ' '.join(filter(None, (args.observations, name)))
+        _print(table, measured, uncertainty, title)
+        note_left_out(table, measured.left_out)
+        note_doubtful(table, measured.views.frame.tolist(), measured.reasons)
         if args.output:
             with together():
-                _write(args.output / name, model, measured, uncertainty)
+                _write(args.output / name, model, table, measured, uncertainty)
 
 
-def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> None:
+def _print(
+    table: Observations, measured: MeasuredPoses, uncertainty: _Parts | None, source: str
+) -> None:
     views, result = measured.views, measured.result
     worst = [
         np.sqrt(np.linalg.eigvalsh(result.covariance[:, part, part])[:, -1])
@@ -73,7 +78,8 @@ def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> 
     for i, frame in enumerate(views.frame[:_SHOWN]):
         place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
         rows.append((
-            str(frame), str(int(views.used[i].sum())), f'{rms_px(measured.fitted[i]):.4f}', *place,
+            _called(table, int(frame)), str(int(views.used[i].sum())),
+            f'{rms_px(measured.fitted[i]):.4f}', *place,
             f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
         ))
     header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm', 'and deg')
@@ -88,6 +94,11 @@ def _print(measured: MeasuredPoses, uncertainty: _Parts | None, source: str) -> 
     print(f'  {said}, in the worst direction')
 
 
+def _called(table: Observations, frame: int) -> str:
+    """Return the photograph's name, or the number of a frame without one."""
+    return frame_name(table, frame).removeprefix('frame ')
+
+
 def _parts_text(uncertainty: _Parts) -> str:
     by = uncertainty['position_m']
     shares = ', '.join(f'{words} {1000 * by[name]:.3g} mm' for name, words in (
@@ -97,7 +108,8 @@ def _parts_text(uncertainty: _Parts) -> str:
 
 
 def _write(
-    folder: Path, model: ForwardModel, measured: MeasuredPoses, uncertainty: _Parts | None
+    folder: Path, model: ForwardModel, table: Observations, measured: MeasuredPoses,
+    uncertainty: _Parts | None,
 ) -> None:
     views, result = measured.views, measured.result
     write_poses(folder / 'poses.csv', views.frame, result.pose)
@@ -123,12 +135,13 @@ def _write(
         'left_out': measured.left_out,
         'sigma_px': measured.sigma,
         'gross': [
-            {'frame': int(views.frame[i]), 'landmark': int(views.landmark[i, j]),
+            {'frame': int(views.frame[i]), **photograph_entry(table, int(views.frame[i])),
+             'landmark': int(views.landmark[i, j]),
              'px': float(np.linalg.norm(result.residual[i, j]))}
             for i, j in np.argwhere(measured.gross)
         ],
         'doubtful': [
-            {'frame': int(frame), 'reason': reason}
+            {'frame': int(frame), **photograph_entry(table, int(frame)), 'reason': reason}
             for frame, reason in zip(views.frame, measured.reasons, strict=True) if reason
         ],
         **({} if uncertainty is None else {'uncertainty': uncertainty}),

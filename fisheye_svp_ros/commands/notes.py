@@ -7,11 +7,12 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.scene.photograph_names import frame_name, list_frames
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis.noise import Gross
     from fisheye_svp_ros.scene.observations import Observations
 
-_SHOWN = 10
 _ALIKE = 3  # frames whose reasons differ by numbers alone; of more the first speaks for all
 _DIGITS = re.compile(r'\d')
 _HUGE = 20.0  # m; a target larger than this was measured in other units
@@ -31,17 +32,18 @@ def note_formats() -> None:
         say(problem)
 
 
-def note_left_out(frames: Sequence[int]) -> None:
-    """Name the frames that could not be posed, if there are any."""
+def note_left_out(table: Observations, frames: Sequence[int]) -> None:
+    """Name the frames of a table that could not be posed, if there are any."""
     if frames:
         say(f'left out, since their points do not fix a pose (all near one line, or of '
-            f'another lens?): {_frames(frames)}')
+            f'another lens?): {list_frames(table, frames)}')
 
 
-def note_copies(frames: Sequence[int]) -> None:
-    """Name the frames that are other frames once more, if there are any."""
+def note_copies(table: Observations, frames: Sequence[int]) -> None:
+    """Name the frames of a table that are other frames once more, if there are any."""
     if frames:
-        say(f'left out, since their image points are those of an earlier frame: {_frames(frames)}')
+        say('left out, since their image points are those of an earlier frame: '
+            f'{list_frames(table, frames)}')
 
 
 def note_huge(table: Observations) -> None:
@@ -55,18 +57,21 @@ def note_gross_errors(table: Observations, gross: Gross) -> None:
     """Say how many rows of a table are set aside, and which are furthest off."""
     if len(gross.rows):
         worst = ', '.join(
-            f'frame {table.frame[gross.rows[i]]} landmark {table.landmark[gross.rows[i]]} '
+            f'{frame_name(table, int(table.frame[gross.rows[i]]))} landmark '
+            f'{table.landmark[gross.rows[i]]} '
             f'({gross.px[i]:.1f} px)' for i in (-gross.px).argsort()[:3])
         frames = table.frame[gross.rows]
         whole = [frame for frame in dict.fromkeys(frames.tolist())
                  if (frames == frame).sum() == (table.frame == frame).sum()]
-        views = f'; all points of {_frames(whole)}: in another order?' if whole else ''
+        views = f'; all points of {list_frames(table, whole)}: in another order?' if whole else ''
         say(f'{len(gross.rows)} of {len(table)} points lie too far off and are left out, '
             f'furthest {worst}{views}')
 
 
-def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
-    """Name the frames whose poses should not be relied on as they are, and why."""
+def note_doubtful(
+    table: Observations, frames: Sequence[int], reasons: Sequence[str]
+) -> None:
+    """Name the frames of a table whose poses should not be relied on as they are, and why."""
     alike: dict[str, list[tuple[int, str]]] = {}
     for frame, reason in zip(frames, reasons, strict=True):
         if reason:
@@ -74,12 +79,6 @@ def note_doubtful(frames: Sequence[int], reasons: Sequence[str]) -> None:
     for doubtful in alike.values():
         shown = len(doubtful) if len(doubtful) <= _ALIKE else 1
         for frame, reason in doubtful[:shown]:
-            say(f'frame {frame}: {reason}')
+            say(f'{frame_name(table, frame)}: {reason}')
         if rest := [frame for frame, _ in doubtful[shown:]]:
-            say(f'{_frames(rest)}: likewise')
-
-
-def _frames(frames: Sequence[int]) -> str:
-    names = ', '.join(map(str, frames[:_SHOWN]))
-    more = f' and {len(frames) - _SHOWN} more' if len(frames) > _SHOWN else ''
-    return f'frame{"s" if len(frames) > 1 else ""} {names}{more}'
+            say(f'{list_frames(table, rest)}: likewise')

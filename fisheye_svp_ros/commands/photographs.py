@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,13 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         help='take one of N photographs or video frames')
 
 
+def search_options(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the options with which another command finds the same board in photographs."""
+    options = ['--board', args.board]
+    options += ['--detector', args.detector] if args.detector else []
+    return (*options, *(['--every', str(args.every)] if args.every > 1 else []))
+
+
 def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare OBS, and what a search needs where these are photographs."""
     parser.add_argument('observations', metavar='OBS',
@@ -59,7 +67,24 @@ def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
     if is_photographs(Path(path)):
         raise ParameterError(f'{path}: these are photographs; say what they show, for example '
                              '--board chessboard:9x6:24mm')
-    return read_observations(path), {}
+    table = read_observations(path)
+    return replace(table, photographs=_photographs_beside(Path(path), table.cameras)), {}
+
+
+def _photographs_beside(
+    path: Path, cameras: Sequence[str]
+) -> tuple[tuple[int, str, str], ...]:
+    """Return frame, camera and path of the photographs that `detect` wrote beside observations."""
+    beside = path.with_suffix('.detect.json')
+    if not beside.exists():
+        return ()
+    try:
+        entries = [(int(one['frame']), str(one['camera']), str(one['name']))
+                   for one in read_json(beside, ObservationError).get('photographs', ())]
+    except (KeyError, TypeError, ValueError) as cause:
+        raise ObservationError(f'{beside}: photographs are no list of name, camera and frame '
+                               f'({cause}); run `fisheye-svp detect` again') from cause
+    return tuple(one for one in entries if one[0] >= 0 and one[1] in cameras)
 
 
 def sizes_beside(path: Path) -> Sizes:

@@ -304,10 +304,12 @@ def _observations(
     def column(values: list[float]) -> Array:
         return np.repeat(np.array(values, dtype=float), count)
 
-    return make_observations(
+    table = make_observations(
         column([number[one.key] for one in found]).astype(np.int64), index,
         np.concatenate([one.uv for one in points]), pattern.points[index],
         camera=column([cameras.index(one.camera) for one in found]).astype(np.int64),
         t=column([one.t for one in found]), cameras=cameras, source=source,
         sigma=np.concatenate([one.sigma for one in points]),
     )
+    return replace(table, photographs=tuple(
+        (number[one.key], one.camera, one.name) for one in found))

@@ -17,6 +17,7 @@ from fisheye_svp_ros.diagnosis.residuals import standardised_squares
 from fisheye_svp_ros.diagnosis.search import Found
 from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import frame_names
 
 DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
                 'that: the lens was off in air')
@@ -26,10 +27,14 @@ _MOST = 8
 
 @dataclass(frozen=True)
 class Advice:
-    """One thing to do: what, to which frames, landmarks and boards; gain: of held-out misfit."""
+    """One thing to do: what, to which frames, landmarks and boards; gain: of held-out misfit.
+
+    photographs: the files of the frames, as far as they are known.
+    """
 
     what: str
     frames: list[int] = field(default_factory=list)
+    photographs: list[str] = field(default_factory=list)
     landmarks: list[int] = field(default_factory=list)
     boards: list[int] = field(default_factory=list)
     gain: float = 0.0
@@ -62,10 +67,11 @@ def advise(
     if measured.test is None:
         alone = _numbers(found)[~measured.predicted]
         if len(alone):
-            advice.append(Advice(
+            advice.append(_about_frames(
+                found.evidence.linear.data.observations,
                 'take more photographs like these: the others do not predict them, since they '
                 'alone show some of the image, or since something is wrong with them; the '
-                'held-out rms is that of the others', frames=alone.tolist()))
+                'held-out rms is that of the others', alone.tolist()))
     else:
         table = measured.test.observations
         advice += _set_aside(table, measured.test_gross, 'held-out ')
@@ -75,12 +81,12 @@ def advise(
                 'numbers in other places, so that nothing of what stays with the target is '
                 'predicted there'))
         if measured.test_moved:
-            advice.append(Advice(
-                'look at these held-out photographs: their cameras do not stand as in the '
+            advice.append(_about_frames(
+                table, 'look at these held-out photographs: their cameras do not stand as in the '
                 'others, so that each view was posed by itself; was the rig touched, are the '
                 'cameras exchanged, are photographs of one moment numbered alike, and the points '
                 'from the same end?',
-                frames=_seen_by_several(table)))
+                _seen_by_several(table)))
     advice += [
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
         if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
@@ -145,9 +151,10 @@ def _frames(found: Found) -> list[Advice]:
     advice = []
     if bad.any():
         order = np.flatnonzero(bad)[np.argsort(-size[bad])][:_MOST]
-        advice.append(Advice(
+        advice.append(_about_frames(
+            found.evidence.linear.data.observations,
             'take these photographs again: they scatter more than the others',
-            frames=[int(numbers[i]) for i in order],
+            [int(numbers[i]) for i in order],
         ))
     return advice
 
@@ -163,8 +170,16 @@ def _set_aside(table: Observations, gross: Gross, where: str = '') -> list[Advic
     off = {reason: sorted({int(table.frame[row]) for row, why in
                            zip(gross.rows, gross.why, strict=True) if why == reason})
            for reason in (VIEW, FRAME)}
-    return [Advice(f'look at these {where}photographs: {reason}', frames=frames)
+    return [_about_frames(table, f'look at these {where}photographs: {reason}', frames)
             for reason, frames in off.items() if frames]
+
+
+def _about_frames(table: Observations, what: str, frames: list[int]) -> Advice:
+    """Return what to do about frames of a table, with the photographs that they are."""
+    known = {frame for frame, _, _ in table.photographs}
+    names = [name for frame in dict.fromkeys(frames) if frame in known
+             for name in frame_names(table, frame)]
+    return Advice(what, frames=frames, photographs=names)
 
 
 def _seen_by_several(table: Observations) -> list[int]:

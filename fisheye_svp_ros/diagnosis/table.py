@@ -10,6 +10,7 @@ from fisheye_svp_ros.diagnosis.causes import Cause, plain_cause
 from fisheye_svp_ros.diagnosis.noise import Gross, NoiseCause
 from fisheye_svp_ros.diagnosis.structure import Structure
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import photograph_entry
 
 
 def table_causes(observations: Observations, gross: Gross, step: float) -> list[Cause]:
@@ -50,14 +51,15 @@ def gross_rows(
     observations: Observations, gross: Gross, where: str = ''
 ) -> list[dict[str, Any]]:
     """Return gross errors by frame and landmark, the farthest first."""
-    order = np.argsort(-gross.px, kind='stable')
-    return [
-        {
-            'frame': int(observations.frame[gross.rows[i]]),
-            'landmark': int(observations.landmark[gross.rows[i]]),
+    found = []
+    for i in np.argsort(-gross.px, kind='stable'):
+        row = gross.rows[i]
+        frame = int(observations.frame[row])
+        camera = observations.cameras[observations.camera[row]]
+        found.append({
+            'frame': frame, **photograph_entry(observations, frame, camera),
+            'landmark': int(observations.landmark[row]),
             'px': float(gross.px[i]), 'why': where + gross.why[i],
-            **({'camera': observations.cameras[observations.camera[gross.rows[i]]]}
-               if len(observations.cameras) > 1 else {}),
-        }
-        for i in order
-    ]
+            **({'camera': camera} if len(observations.cameras) > 1 else {}),
+        })
+    return found

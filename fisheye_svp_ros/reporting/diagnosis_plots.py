@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,8 @@ from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.points import PointResiduals
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import frame_name
 from fisheye_svp_ros.solve.measured import rms_px
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
@@ -24,6 +26,7 @@ _SIDES = (('before', BEFORE), ('after', AFTER))
 _WIDTH = 9.2  # in
 _BINS = 16
 _ARROWS = 2500
+_TICKS = 60  # names along an axis
 _CELLS = 18  # of the mean field, along the image
 
 
@@ -33,12 +36,13 @@ Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 class Shown(NamedTuple):
     """What the pictures are of: observations without gross errors, lenses by camera, noise (px).
 
-    lenses: '' is that of all cameras.
+    lenses: '' is that of all cameras; table: the observations, which name photographs.
     """
 
     points: PointResiduals
     lenses: dict[str, Lens]
     noise: float
+    table: Observations
 
     @classmethod
     def of(cls, diagnosis: Diagnosis, points: PointResiduals) -> Shown:
@@ -48,7 +52,7 @@ class Shown(NamedTuple):
         shown = PointResiduals._make(array[kept] for array in points)
         state = diagnosis.after.state
         lenses = dict(zip(state.labels, state.lenses, strict=True))
-        return cls(shown, lenses, diagnosis.scatter_px)
+        return cls(shown, lenses, diagnosis.scatter_px, diagnosis.after.data.observations)
 
     def of_camera(self, camera: int) -> PointResiduals:
         """Return the points that were seen through one of the lenses."""
@@ -178,15 +182,21 @@ def _legend(figure: Figure, axis: Axes) -> None:
     figure.legend(handles, labels, loc='upper right', ncols=len(labels), fontsize=8)
 
 
-def draw_groups(path: Path, shown: Shown, group: Index, x: Array | None, label: str) -> None:
-    """Rms of the residuals of each group (K,): landmark or frame, or over a variable (K,)."""
+def draw_groups(
+    path: Path, shown: Shown, group: Index, x: Array | None, label: str,
+    ticks: Sequence[str] = (),
+) -> None:
+    """Rms of the residuals of each group (K,): landmark or frame, or over a variable (K,).
+
+    ticks: names of the groups 0, 1, ...
+    """
     names, label_of, count = np.unique(group, return_inverse=True, return_counts=True)
     place = names if x is None else np.bincount(label_of, weights=x) / count
     order = np.argsort(place, kind='stable')
     low, high = (
         np.sqrt(special.chdtri(2 * count, 1 - p) / count) * shown.noise for p in (0.025, 0.975)
     )
-    with picture(path, _WIDTH, 2.8) as figure:
+    with picture(path, _WIDTH, 3.6 if ticks else 2.8) as figure:
         axis = figure.subplots()
         axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
                           step='mid', label='where noise alone keeps 95 %')
@@ -196,6 +206,9 @@ def draw_groups(path: Path, shown: Shown, group: Index, x: Array | None, label: 
             axis.plot(place[order], rms[order], 'o' if len(names) > 60 else 'o-', ms=3.5, lw=1,
                       color=colour, label=side)
         axis.set(xlabel=label, ylabel='rms residual / px', ylim=(0, None))
+        if ticks:
+            step = -(-len(ticks) // _TICKS)
+            axis.set_xticks(range(0, len(ticks), step), ticks[::step], rotation=90, fontsize=7)
         _legend(figure, axis)
 
 
@@ -250,6 +263,15 @@ def _polar(shown: Shown, residual: Array) -> Array:
     return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)
 
 
+def _by_photograph(shown: Shown) -> tuple[Index, None, str, list[str]]:
+    """Return the view of each point, no variable, a label, and the photographs' names."""
+    views, which = np.unique(
+        np.stack([shown.points.camera, shown.points.frame]), axis=1, return_inverse=True)
+    names = [frame_name(shown.table, frame, shown.table.cameras[camera])
+             for camera, frame in views.T.tolist()]
+    return which.reshape(-1), None, 'photograph', names
+
+
 def residual_pictures(shown: Shown) -> Iterator[Picture]:
     """Yield name, function and arguments of every picture of residuals."""
     points = shown.points
@@ -258,8 +280,11 @@ def residual_pictures(shown: Shown) -> Iterator[Picture]:
     yield 'theta', draw_against, (shown, np.degrees(points.theta), 'incidence angle / deg')
     yield 'range', draw_against, (shown, points.range, 'distance of the landmark / m', spread)
     yield 'landmark', draw_groups, (shown, points.landmark, None, 'landmark')
-    timed = (points.t - points.t.min(), 'time / s') if np.isfinite(points.t).all() else (
-        None, 'frame')
-    yield 'frame', draw_groups, (shown, points.frame, *timed)
+    if shown.table.photographs:
+        yield 'frame', draw_groups, (shown, *_by_photograph(shown))
+    elif np.isfinite(points.t).all():
+        yield 'frame', draw_groups, (shown, points.frame, points.t - points.t.min(), 'time / s')
+    else:
+        yield 'frame', draw_groups, (shown, points.frame, None, 'frame')
     yield 'phase', draw_phase, (shown,)
     yield 'histogram', draw_histogram, (shown,)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.headline import headline
+from fisheye_svp_ros.reporting.outlier_rows import outlier_rows
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
@@ -51,7 +53,10 @@ _ROWS = 24
 
 
 class Inputs(NamedTuple):
-    """What was diagnosed, as the user named it; folder: where the report goes."""
+    """What was diagnosed, as the user named it; folder: where the report goes.
+
+    search: options of a command that finds the board in the photographs, where these are some.
+    """
 
     observations: str
     lens: str
@@ -59,6 +64,7 @@ class Inputs(NamedTuple):
     held_out: str | None
     folder: Path
     free_intrinsics: bool
+    search: tuple[str, ...] = ()
 
 
 def write_report(
@@ -89,17 +95,21 @@ def write_report(
         next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
-        extended=_extended(diagnosis, inputs.folder),
+        extended=_extended(diagnosis, inputs),
     ))
     return [report, *pictures]
 
 
-def _extended(diagnosis: Diagnosis, folder: Path) -> dict[str, str]:
-    """Return the extended lens files: as options of a command, and the first one."""
-    files = {camera: folder / camera / text.EXTENDED for camera in diagnosis.lenses}
-    options = [f'--lens {camera}={path}' if camera else f'--lens {path}'
-               for camera, path in files.items()]
-    return {'options': ' '.join(options), 'first': str(next(iter(files.values())))}
+def _extended(diagnosis: Diagnosis, inputs: Inputs) -> dict[str, str]:
+    """Return what commands need to go on: the observations, the extended lenses, the first one."""
+    files = {camera: inputs.folder / camera / text.EXTENDED for camera in diagnosis.lenses}
+    options = [word for camera, path in files.items()
+               for word in ('--lens', f'{camera}={path}' if camera else str(path))]
+    return {
+        'observations': shlex.join([inputs.observations, *inputs.search]),
+        'options': shlex.join(options), 'search': shlex.join(inputs.search),
+        'first': shlex.quote(str(next(iter(files.values())))),
+    }
 
 
 def _next(wanted: NextViews | None) -> dict[str, Any]:
@@ -216,8 +226,5 @@ def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
             for effect, why in diagnosis.untestable.items()
         ],
         'outlier_count': len(diagnosis.gross),
-        'outliers': [
-            (row['frame'], row['landmark'], f'{row["px"]:.2f}', row['why'])
-            for row in diagnosis.gross[:_ROWS]
-        ],
+        'outliers': outlier_rows(diagnosis.gross)[:_ROWS],
     }

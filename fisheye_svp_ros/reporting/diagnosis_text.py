@@ -153,7 +153,8 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
     """Return one variable of what remains as a clause."""
     if variable == 'outliers' and diagnosis.gross:
         worst, count = diagnosis.gross[0], len(diagnosis.gross)
-        which = f'frame {worst["frame"]} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
+        where = worst.get('photograph') or f'frame {worst["frame"]}'
+        which = f'{where} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
         return (f'{count} points lie far off, furthest {which}' if count > 1 else
                 f'a point lies far off, {which}')
     if variable == 'size':
@@ -312,11 +313,13 @@ def _next(d: Diagnosis) -> str:
 
 def advice_text(advice: Advice) -> str:
     """Return one thing to do, with the names of what it is about."""
-    about = [
+    frames = [] if advice.photographs else [*dict.fromkeys(advice.frames)]
+    about = [listed(advice.photographs[:_MOST])] if advice.photographs else []
+    about += [
         f'{name}s {listed([str(n) for n in numbers[:_MOST]])}' if len(numbers) > 1
         else f'{name} {numbers[0]}'
-        for name, numbers in (('frame', [*dict.fromkeys(advice.frames)]),
-                              ('board', advice.boards), ('landmark', advice.landmarks)) if numbers
+        for name, numbers in (('frame', frames), ('board', advice.boards),
+                              ('landmark', advice.landmarks)) if numbers
     ]
     what = advice.what.replace('the extended lens file', EXTENDED)
     return f'{what} ({", ".join(about)})' if about else what

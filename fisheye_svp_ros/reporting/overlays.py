@@ -56,13 +56,15 @@ def _overlay(pixels: np.ndarray, searched: Searched) -> np.ndarray:
 def write_coverage(detection: Detection, path: Path) -> None:
     """Draw all corners on the image, and, as a first calibration has them, angles and ranges."""
     table = detection.observations
+    found = sum(one.points is not None for one in detection.searched)
+    shown = f'{found} photographs of {len(detection.searched)}'
     width, height = np.max([*detection.image_sizes.values()], axis=0).tolist()
     with picture(path, 10.0, 4.5) as figure:
         image, field = figure.subplots(1, 2)
         image.plot(table.uv[:, 0], table.uv[:, 1], '.', color=OURS, markersize=2)
         image.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect='equal',
                   xlabel='u, px', ylabel='v, px',
-                  title=f'{len(table)} corners in {len(table.frames)} photographs')
+                  title=f'{len(table)} corners in {shown}')
         for camera, name in enumerate(table.cameras):
             _angles(field, detection, camera, name)
         field.set(xlabel='incidence angle, deg', ylabel='range, m',

@@ -18,7 +18,8 @@ class Observations:
 
     frame, landmark, board: whole numbers; camera: index into `cameras`; uv (N, 2), px;
     xyz (N, 3): the landmark as the user believes it to be, m, in the target frame;
-    t: s and sigma: px, NaN where unknown; source names where the rows came from.
+    t: s and sigma: px, NaN where unknown; source names where the rows came from; photographs:
+    frame, camera and path of the image file of a view, as far as they are known.
     """
 
     frame: Index
@@ -31,6 +32,7 @@ class Observations:
     sigma: Array
     cameras: tuple[str, ...] = ('',)
     source: str = 'observations'
+    photographs: tuple[tuple[int, str, str], ...] = ()
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -63,7 +65,7 @@ class Observations:
 
 
 STEREO = ('left', 'right')
-_SHARED = ('cameras', 'source')
+_SHARED = ('cameras', 'source', 'photographs')
 
 
 def make_observations(
