@@ -18,6 +18,17 @@ def placed(where: Mask, values: Array) -> Array:
     return whole
 
 
+def gather_rows(parts: Sequence[tuple[Index, Array]]) -> Array:
+    """Return one array of the rows of all parts, each with the places (M,) that they go to."""
+    if len(parts) == 1:
+        return parts[0][1]
+    first = parts[0][1]
+    whole = np.empty((sum(len(rows) for rows, _ in parts), *first.shape[1:]), first.dtype)
+    for rows, values in parts:
+        whole[rows] = values
+    return whole
+
+
 class Batch:
     """Methods of a named tuple whose fields, arrays or batches, share their leading axes."""
 

@@ -23,13 +23,12 @@ from fisheye_svp_ros.io.poses_csv import pose_columns
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
-from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.measured import localize_measured, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate

@@ -25,12 +25,11 @@ from fisheye_svp_ros.io.files import together, write_json
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.progress import progress, stages
 from fisheye_svp_ros.reporting.tables import UNITS, interval, noise_text, print_table, with_error
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
 from fisheye_svp_ros.scene.photograph_names import list_frames
-from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
 from fisheye_svp_ros.solve.measured import rms_px, sigma_known
 from fisheye_svp_ros.study.solutions import calibrated

@@ -12,6 +12,7 @@ Nearly all effects are linear in their parameters: displacement = columns @ valu
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
@@ -20,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, placed
+from fisheye_svp_ros.arrays import Array, Index, gather_rows, placed
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.camera import Incidence
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
@@ -51,7 +52,8 @@ class Scene:
     """All that an effect may look at: views, lens, the camera's poses (S,) and ideal images.
 
     uv (S, N, 2), px: predicted without detector effects; incidence: where the rays meet the lens,
-    None before the ray stage.
+    None before the ray stage; cameras: of a rig whose lenses differ, the views (rows of all),
+    number and scene of each camera.
     """
 
     views: Views
@@ -59,6 +61,7 @@ class Scene:
     pose: Pose
     uv: Array
     incidence: Incidence | None = None
+    cameras: tuple[tuple[Index, int, Scene], ...] = ()
 
     @cached_property
     def boards(self) -> list[Board]:
@@ -100,6 +103,8 @@ class Scene:
 
     def normalised(self) -> Array:
         """Image points (S, N, 2) relative to the principal point, over the focal length."""
+        if self.cameras:
+            return gather_rows([(rows, own.normalised()) for rows, _, own in self.cameras])
         centre, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
         return np.asarray((self.uv - np.array(centre)) / np.array(focal))
 
@@ -115,8 +120,24 @@ class Effect(ABC):
     of_motion: ClassVar[bool] = False  # whether it follows from how the camera moves
     abrupt: ClassVar[bool] = False  # whether what changes smoothly is no sign of it
     asked_after: ClassVar[tuple[str, ...]] = ()  # more common ones that it does, too, and more
+    of_frames: ClassVar[bool] = False  # whether its size hangs on how each frame was taken
+    # How its displacements of landmarks are shown: 'smooth' over boards, 'single' ones; or not
+    target_map: ClassVar[str] = ''
+    when_untestable: ClassVar[str] = ''  # what to do where frames differ and it cannot be tested
     signature: ClassVar[str]
     to_separate: ClassVar[str]
+
+    @classmethod
+    def budget_stage(cls) -> str:
+        """Return its stage in the variance budget: lens, target, frame or noise."""
+        if cls.of_frames:
+            return 'frame'
+        return cls.stage if cls.stage in ('target', 'noise') else 'lens'
+
+    @classmethod
+    def summary(cls) -> str:
+        """Return what it is, as a sentence: the docstring of its module."""
+        return inspect.getdoc(inspect.getmodule(cls)) or cls.name
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -19,6 +19,7 @@ class DetectorBiasEffect(Effect):
 
     name = 'detector_bias'
     stage = 'detector'
+    of_frames = True
     signature = 'residuals that repeat with the fractional part of the image point'
     to_separate = 'another detector, or the same images magnified'
 

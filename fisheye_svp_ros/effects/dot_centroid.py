@@ -24,6 +24,7 @@ class DotCentroidEffect(Effect):
     name = 'dot_centroid'
     stage = 'image'
     of_target = True  # it is the target's dots that are so large
+    of_frames = True
     signature = 'residuals across tilted boards that grow with the size of the dot in the image'
     to_separate = 'dots of half the size, or corners instead of dots'
 

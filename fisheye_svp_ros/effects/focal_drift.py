@@ -29,6 +29,11 @@ class FocalDriftEffect(PlaneEffect):
 
     name = 'focal_drift'
     of_recording = True
+    of_frames = True
+    when_untestable = (
+        'give the time of each frame (a column t, s): what drifts, jumps or moves while rows are '
+        'exposed can then be told'
+    )
     signature = 'residuals in proportion to the image height that change smoothly with time'
     to_separate = 'a longer recording with the temperature noted; frames well spread in time'
 

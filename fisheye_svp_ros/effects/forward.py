@@ -1,27 +1,40 @@
-"""The forward model: landmarks and poses through target, pose, ray, image and detector."""
+"""The forward model: landmarks and poses through target, pose, ray, image and detector.
+
+Of one lens, or of the lenses of a rig: then each view is that of its camera.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Index, Mask, gather_rows
 from fisheye_svp_ros.effects.base import Effect, NoiseEffect, Scene
 from fisheye_svp_ros.effects.base import Term as Term
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import curved_lens
+from fisheye_svp_ros.effects.of_cameras import OfCameras, camera_terms
 from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.optics import camera, engines
-from fisheye_svp_ros.optics.camera import Image, LinearImage, Rays
+from fisheye_svp_ros.optics.camera import Image, Incidence, LinearImage, Rays, lens_columns
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Views, views_of
 
 _STEP = 1e-4  # px
+
+
+class CameraViews(NamedTuple):
+    """The views (rows of all) of one camera of a rig, linearized."""
+
+    rows: Index
+    camera: int
+    linear: LinearViews
 
 
 @dataclass(frozen=True)
@@ -30,7 +43,8 @@ class LinearViews:
 
     uv (S, N, 2), px; valid (S, N); d_pose (S, N, 2, 6), px/m and px/rad, by the small change of
     `pose.Pose.retract`; ideal, optical (S, N, 2), px: uv before image effects, and before detector
-    effects; lens, pose (S,), points (S, N, 3), m: what was seen, after target and pose effects.
+    effects; lens, pose (S,), points (S, N, 3), m: what was seen, after target and pose effects;
+    cameras: of a rig whose lenses differ, the same camera by camera.
     """
 
     uv: Array
@@ -42,6 +56,7 @@ class LinearViews:
     pose: Pose
     points: Array
     limited: bool
+    cameras: tuple[CameraViews, ...] = ()
 
     @cached_property
     def d_target(self) -> Array:
@@ -50,30 +65,57 @@ class LinearViews:
 
     @cached_property
     def image(self) -> LinearImage:
-        """The lens's own derivatives."""
+        """The lens's own derivatives; of a rig each camera has its own."""
         d_point = self.d_target @ self.pose.rotation[:, None]
         local = self.pose.into_body(self.points)
         return LinearImage(self.lens, local, self.limited, self.ideal, self.valid, d_point)
 
 
 class ForwardModel:
-    """A lens with its effects, ready to predict and to be solved with."""
+    """A lens with its effects, or those of a rig, ready to predict and to be solved with.
 
-    def __init__(self, lens: Lens, terms: Sequence[Term] | None = None) -> None:
+    cameras: of a rig whose lenses differ, the model of each camera.
+    """
+
+    def __init__(
+        self, lens: Lens | Sequence[Lens], terms: Sequence[Term] | None = None
+    ) -> None:
         """Take the corrections of the lens and of its target, or other effects in their place.
 
+        One lens, and its effects, is that of every camera.
         Raises LensError for an effect that is unknown or incomplete.
         """
+        self.cameras: tuple[ForwardModel, ...] = ()
+        if not isinstance(lens, Lens):
+            if len(lens) > 1:
+                self.cameras = tuple(
+                    ForwardModel(one, None if terms is None else camera_terms(terms, i))
+                    for i, one in enumerate(lens))
+                terms = ()
+            lens = lens[0]
         own = load_effects(lens.corrections, lens.name) if terms is None else terms
         self.terms = tuple(own)
         self._target = Target.of(lens.target, lens.name) if terms is None else None
         self._given = lens
         self.lens = curved_lens(lens, self.terms)
 
+    def camera(self, number: int) -> ForwardModel:
+        """Return the model of one camera."""
+        return self.cameras[number] if self.cameras else self
+
+    def split(self, views: Views) -> Iterator[tuple[Index, int, ForwardModel]]:
+        """Yield the views (rows of all), number and model of each camera; of one lens all."""
+        if not self.cameras:
+            yield np.arange(len(views.frame)), 0, self
+            return
+        for number in np.unique(views.camera).tolist():
+            yield np.flatnonzero(views.camera == number), number, self.cameras[number]
+
     @property
     def plain(self) -> bool:
-        """Whether what the lens's own curves do is all there is."""
-        return self._target is None and not self._acts('target', 'pose', 'image', 'detector')
+        """Whether what the lens's own curves do is all there is, of one lens."""
+        bare = not self.cameras and self._target is None
+        return bare and not self._acts('target', 'pose', 'image', 'detector')
 
     def seeing(self, views: Views) -> ForwardModel:
         """Return the model without corrections of a target that none of the views shows."""
@@ -134,6 +176,10 @@ class ForwardModel:
 
     def through(self, linear: LinearViews, views: Views, columns: Array) -> Array:
         """Return columns (S, N, 2, P) that move ideal image points as they move measured ones."""
+        if self.cameras:
+            return gather_rows([
+                (rows, self.cameras[i].through(own, views.take(rows), columns[rows]))
+                for rows, i, own in linear.cameras])
         for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
             if self._acts(stage):
                 columns = columns + self._slope(linear, views, stage, uv) @ columns
@@ -163,7 +209,17 @@ class ForwardModel:
 
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
         """Return what effects may look at once the views are linearised."""
-        return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
+        if not self.cameras:
+            return Scene(views, self.lens, pose, linear.ideal, linear.image.incidence)
+        parts = tuple((rows, i, self.cameras[i].scene(pose.take(rows), views.take(rows), own))
+                      for rows, i, own in linear.cameras)
+        rays = [(rows, own.image.incidence) for rows, _, own in linear.cameras]
+        unit = gather_rows([(rows, np.moveaxis(ray.unit, 0, -1)) for rows, ray in rays])
+        incidence = Incidence(
+            gather_rows([(rows, ray.theta) for rows, ray in rays]), np.moveaxis(unit, -1, 0),
+            gather_rows([(rows, ray.valid.astype(float)) for rows, ray in rays]) > 0,
+        )
+        return Scene(views, self.lens, pose, linear.ideal, incidence, parts)
 
     def noise_scale(self, scene: Scene) -> Array | float:
         """Factor (S, N) on the standard deviation of the noise of each point."""
@@ -174,6 +230,8 @@ class ForwardModel:
 
     def effect_columns(self, effect: Effect, scene: Scene, linear: LinearViews) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""
+        if self.cameras:
+            return self._effect_columns_by_camera(effect, scene, linear)
         if effect.stage == 'detector':
             scene = replace(scene, uv=linear.optical)
         columns = effect.columns(scene)
@@ -186,7 +244,36 @@ class ForwardModel:
             stage = {'target': linear.d_target, 'pose': linear.d_pose}[effect.stage]
         return np.asarray(stage @ columns)
 
+    def _effect_columns_by_camera(
+        self, effect: Effect, scene: Scene, linear: LinearViews
+    ) -> Array:
+        count = len(effect.parameters)
+        columns = np.zeros((*linear.uv.shape, count))
+        for (rows, number, own), (_, _, seen) in zip(linear.cameras, scene.cameras, strict=True):
+            model = self.cameras[number]
+            if not isinstance(effect, OfCameras):
+                columns[rows] = model.effect_columns(effect, seen, own)
+            elif term := effect.of_camera(number, np.arange(float(count))):
+                block = np.zeros((*own.uv.shape, count))
+                block[..., term[1].astype(int)] = model.effect_columns(term[0], seen, own)
+                columns[rows] = block
+        return columns
+
+    def lens_columns(self, linear: LinearViews, names: Sequence[Sequence[str]]) -> Array:
+        """Derivatives (S, N, 2, K) by named parameters of each lens (K: of all in turn)."""
+        if not self.cameras:
+            return lens_columns(self.lens, linear.image, names[0])
+        ends = np.cumsum([0, *map(len, names)])
+        columns = np.zeros((*linear.uv.shape, ends[-1]))
+        for rows, i, own in linear.cameras:
+            block = np.zeros((*own.uv.shape, ends[-1]))
+            block[..., ends[i] : ends[i + 1]] = self.cameras[i].lens_columns(own, names[i : i + 1])
+            columns[rows] = block
+        return columns
+
     def _through(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
+        if self.cameras:
+            return self._by_camera(pose, views, limited)
         views = self.labelled(views)
         points = self._seen_points(pose, views)
         ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
@@ -198,6 +285,17 @@ class ForwardModel:
             scene = Scene(views, self.lens, pose, uv[-1], linear.image.incidence)
             uv.append(uv[-1] + self._moved(scene, stage))
         return replace(linear, uv=uv[2], optical=uv[1])
+
+    def _by_camera(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
+        parts = tuple(
+            CameraViews(rows, i, model._through(pose.take(rows), views.take(rows), limited))
+            for rows, i, model in self.split(views))
+        uv, d_pose, ideal, optical, points = (
+            gather_rows([(rows, getattr(own, name)) for rows, _, own in parts])
+            for name in ('uv', 'd_pose', 'ideal', 'optical', 'points'))
+        valid = gather_rows([(rows, own.valid.astype(float)) for rows, _, own in parts]) > 0
+        return LinearViews(
+            uv, valid, d_pose, ideal, optical, self.lens, pose, points, limited, parts)
 
     def _seen_points(self, pose: Pose, views: Views) -> Array:
         """Return the points (S, N, 3), m, where target and pose effects make them be seen."""

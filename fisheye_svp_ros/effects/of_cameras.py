@@ -72,8 +72,8 @@ class OfCameras(Effect):
 @cache
 def of_cameras(kind: type[Effect]) -> type[OfCameras]:
     """Return the class of an effect's forms by camera; it has the effect's name."""
-    words = {name: getattr(kind, name)
-             for name in ('name', 'stage', 'rarer_than', 'asked_after', 'to_separate', 'abrupt')}
+    words = {name: getattr(kind, name) for name in (
+        'name', 'stage', 'rarer_than', 'asked_after', 'to_separate', 'abrupt', 'of_frames')}
     return type(f'{kind.__name__}OfCameras', (OfCameras,), words)
 
 

@@ -24,6 +24,7 @@ class RigFlexEffect(Effect):
     name = 'rig_flex'
     stage = 'pose'
     of_recording = True
+    of_frames = True
     signature = 'residuals of one camera against the other that differ from frame to frame'
     to_separate = 'a stiffer rig; frames with the rig unloaded and loaded'
 

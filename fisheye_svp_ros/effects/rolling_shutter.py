@@ -18,6 +18,7 @@ class RollingShutterEffect(Effect):
     name = 'rolling_shutter'
     stage = 'pose'
     of_motion = True
+    of_frames = True
     signature = (
         'residuals that grow with the distance from the middle row and with the camera speed'
     )

@@ -35,6 +35,7 @@ class SessionStepEffect(Effect):
     asked_after = ('focal_length', 'principal_point')
     of_recording = True
     abrupt = True
+    of_frames = True
     signature = 'residuals that change at one frame and keep their new pattern'
     to_separate = 'frames taken in turns before and after the suspected event, of the same scene'
 

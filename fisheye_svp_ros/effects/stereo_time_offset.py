@@ -18,6 +18,7 @@ class StereoTimeOffsetEffect(Effect):
     name = 'stereo_time_offset'
     stage = 'pose'
     of_motion = True
+    of_frames = True
     signature = 'residuals of one camera against the other that grow with the speed of the rig'
     to_separate = 'the same scene with the rig at rest; a flash of light seen by both cameras'
 

@@ -28,6 +28,7 @@ class TargetShapeEffect(Effect):
 
     name = 'target_shape'
     stage = 'target'
+    target_map = 'smooth'
     signature = (
         'residuals that keep to the board: the same place is off by the same height in every '
         'view'

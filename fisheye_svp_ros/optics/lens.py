@@ -125,6 +125,16 @@ class Lens:
         return next((wrong for part in parts if part is not None and (wrong := part.check())), '')
 
 
+def parameter_values(lens: Lens, names: Sequence[str]) -> list[float]:
+    """Return the values of named parameters; `f` is that of fx."""
+    return [lens.fx if name == 'f' else lens.parameters[name] for name in names]
+
+
+def intrinsic_names(lens: Lens) -> tuple[str, ...]:
+    """Return the intrinsics that a calibration frees: the four, and the height's coefficients."""
+    return (*INTRINSICS, *lens.image_height.coefficient_names)
+
+
 def curve_limit(lens: Lens) -> float:
     """Return the angle, rad, up to which both curves of a lens hold."""
     limit = lens.image_height.limit

@@ -23,7 +23,7 @@ from fisheye_svp_ros.pose import PAPER_FROM_OPTICAL, Pose, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import BASELINE
-from fisheye_svp_ros.solve.lens_adjustment import adjust
+from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
 from fisheye_svp_ros.solve.localization import localize
 
 CALIBRATION_NOISE = 0.2  # px
@@ -93,7 +93,7 @@ def calibrated_shift(lens: Lens) -> Lens:
     start = lens.svp()
     pose = localize(ForwardModel(start), views, right).pose
     known = scaled_shift(lens, 0.0).with_parameters(['s0'], [lens.parameters['s0']])
-    return adjust(known, views, pose, _FREE).lens
+    return adjust_lens(known, views, pose, _FREE).lens
 
 
 VARIANTS: dict[str, Callable[[Lens], Lens]] = {

@@ -19,7 +19,6 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.choice import CLASS_SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.evidence import block_basis
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
@@ -265,7 +264,7 @@ def confounded_effects(linear: Linearised, names: Sequence[str]) -> list[Effect]
     there = {effect.name for effect, _ in linear.state.terms}
     found = []
     for name in names:
-        if name in there or stage_of(name) not in ('lens', 'target'):
+        if name in there or CATALOGUE[name].budget_stage() not in ('lens', 'target'):
             continue
         try:
             forms = CATALOGUE[name].candidates(linear.scene)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names
 from fisheye_svp_ros.effects.base import Effect, Untestable
@@ -132,7 +131,8 @@ def _asked(
     if number is not None:
         known = {*after.free, *(p.name for e, _ in after.state.terms for p in e.parameters)}
         return number, (), [] if number in known | fitted else [_holding(after, number)]
-    mine = [c for c in causes if c.effect in fitted and stage_of(c.effect) in ('lens', 'target')]
+    mine = [c for c in causes if c.effect in fitted
+            and CATALOGUE[c.effect].budget_stage() in ('lens', 'target')]
     for cause in mine:
         if cause.indistinguishable_from:
             alike = tuple(cause.indistinguishable_from)

@@ -47,7 +47,6 @@ _PICTURE_OF = {
     'outliers': 'histogram', 'scatter_vs_theta': 'theta', 'scatter_vs_frame': 'frame',
     'size': 'histogram',
 }
-_DISPLACING = {'target_shape', 'landmark_survey'}
 _BAR = 220  # px of a share of 1
 _ROWS = 24
 
@@ -134,12 +133,13 @@ def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterato
 
 def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
     """Yield maps of the boards where landmarks are displaced other than all together."""
-    effects = {cause.effect for cause in diagnosis.causes}
+    mapped = [c.effect for c in diagnosis.causes if CATALOGUE[c.effect].target_map]
     shown: list[tuple[str, tuple[str, ...]]] = []
-    if effects & _DISPLACING:
+    if mapped:
         shown.append(('the target in the extended model', ()))
-    if effects >= _DISPLACING:
-        shown.append(('target_shape alone', ('target_shape',)))
+    if len(mapped) > 1:
+        shown += [(f'{name} alone', (name,)) for name in mapped
+                  if CATALOGUE[name].target_map == 'smooth']
     for title, names in shown:
         yield from ((title, m) for m in board_maps(diagnosis.after, names) if m.spread_out)
 

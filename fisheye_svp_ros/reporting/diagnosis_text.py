@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, Advice
-from fisheye_svp_ros.diagnosis.budget import stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
 from fisheye_svp_ros.diagnosis.known_truth import Compared
@@ -81,7 +79,7 @@ _FEW = 4  # parameters that are read one by one
 
 def what(effect: str) -> str:
     """Return what an effect is, as the end of a sentence."""
-    text = inspect.getdoc(inspect.getmodule(CATALOGUE[effect])) or effect
+    text = CATALOGUE[effect].summary()
     return text[0].lower() + text[1:].rstrip('.')
 
 
@@ -94,14 +92,15 @@ def quantity(entry: Mapping[str, Any]) -> str:
 
 def size(diagnosis: Diagnosis, cause: Cause) -> str:
     """Return how large a cause is: its parameters, or what many of them amount to."""
-    if cause.effect == 'target_shape':
+    shown = CATALOGUE[cause.effect].target_map
+    if shown == 'smooth':
         maps = board_maps(diagnosis.after, (cause.effect,))
         return '; '.join(
             (f'board {m.board}: ' if len(maps) > 1 else '')
             + f'{1e3 * m.peak_to_valley:.2f} mm from the lowest to the highest place'
             for m in maps if m.peak_to_valley > 0
         )
-    if cause.effect == 'landmark_survey':
+    if shown == 'single':
         return _landmarks(diagnosis, cause)
     named = [
         f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
@@ -238,7 +237,7 @@ def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
         text += (f', which takes away {percent(d.gain.value)} (95 % interval '
                  f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
     lens = d.lens_only.heldout_rms_px
-    if 'target' in {stage_of(c.effect) for c in moving}:
+    if 'target' in {CATALOGUE[c.effect].budget_stage() for c in moving}:
         better = lens < before
         text += (f'; the lens alone, on the target as it is said to be, '
                  f'{"reaches" if better else "does not help:"} {lens:.3g} px')
@@ -291,20 +290,19 @@ def _next(d: Diagnosis) -> str:
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
-            if stage_of(c.effect) == 'frame' and c.effect in d.lens.corrections]
+            if CATALOGUE[c.effect].budget_stage() == 'frame' and c.effect in d.lens.corrections]
     refuted = d.named.heldout_rms_px >= d.base.heldout_rms_px
     if held and not refuted and f'solve with {EXTENDED}' not in steps:
         steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
-              if stage_of(c.effect) == 'frame' and not c.indistinguishable_from]
+              if CATALOGUE[c.effect].budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if CATALOGUE[c.effect].stage == 'noise']
-    if 'focal_drift' in d.untestable and 'frame' in {one.variable for one in d.remaining}:
-        steps.append('give the time of each frame (a column t, s): what drifts, jumps or moves '
-                     'while rows are exposed can then be told')
+    if 'frame' in {one.variable for one in d.remaining}:
+        steps += filter(None, (CATALOGUE[name].when_untestable for name in d.untestable))
     if d.remaining:
         steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
     text = '; '.join(steps) or 'keep the lens as it is'

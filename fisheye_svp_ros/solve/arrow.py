@@ -65,7 +65,7 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     depends on stays where it is.
     """
     equations = ArrowEquations(*normal)
-    scaled, block_scale, shared_scale = _scaled(equations, damping)
+    scaled, block_scale, shared_scale = _scale(equations, damping)
     eliminated, reduced = _eliminate(scaled)
     right = scaled.shared_gradient - np.einsum(
         'svbk,svb->sk', eliminated[..., :-1], scaled.block_gradient
@@ -75,13 +75,13 @@ def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
         eliminated[..., :-1] @ shared_step[:, None, :, None]
     )[..., 0]
     block_step, shared_step = block_step / block_scale, shared_step / shared_scale
-    return (block_step, shared_step), _moved(equations, block_step, shared_step)
+    return (block_step, shared_step), _squared_change(equations, block_step, shared_step)
 
 
 def arrow_information(normal: Arrays) -> Array:
     """Return the information (S, K, K) about the shared parameters, the blocks being unknown."""
     equations = ArrowEquations(*normal)
-    scaled, _, shared_scale = _scaled(equations, np.zeros(len(equations.shared)))
+    scaled, _, shared_scale = _scale(equations, np.zeros(len(equations.shared)))
     _, reduced = _eliminate(scaled)
     information: Array = reduced * shared_scale[:, :, None] * shared_scale[:, None, :]
     return information
@@ -93,7 +93,7 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     A direction that the rows do not determine is left out of it: check `arrow_information` first.
     """
     equations = ArrowEquations(*normal)
-    scaled, block_scale, shared_scale = _scaled(equations, np.zeros(len(equations.shared)))
+    scaled, block_scale, shared_scale = _scale(equations, np.zeros(len(equations.shared)))
     eliminated, reduced = _eliminate(scaled)
     shared = _inverse(reduced)
     leverage = eliminated[..., :-1]
@@ -104,7 +104,7 @@ def arrow_covariance(normal: Arrays) -> ArrowCovariance:
     )
 
 
-def _scaled(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
+def _scale(equations: ArrowEquations, damping: Array) -> tuple[ArrowEquations, Array, Array]:
     """Scale to a unit diagonal and damp it; return also the scales (S, V, B) and (S, K)."""
     blocks, block_scale = with_unit_diagonal(equations.blocks, damping[:, None])
     shared, shared_scale = with_unit_diagonal(equations.shared, damping)
@@ -147,7 +147,7 @@ def _trace(matrix: Array) -> Array:
     return trace
 
 
-def _moved(equations: ArrowEquations, block_step: Array, shared_step: Array) -> Array:
+def _squared_change(equations: ArrowEquations, block_step: Array, shared_step: Array) -> Array:
     inner = equations.blocks @ block_step[..., None] + 2 * (
         equations.cross @ shared_step[:, None, :, None]
     )

@@ -16,7 +16,7 @@ from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.pose import Pose, cross_matrix, nearest_rotation, rotation_from_vector
 
 _STEPS, _MORE_STEPS = 4, 10  # Gauss-Newton, of an algebraic turn and of any turn
-_LONGEST = 0.7  # rad, a step
+_MAX_TURN = 0.7  # rad, a step
 _DOUBTFUL = 1e-3  # mean squared sine (about 2 degrees) above which evenly spread starts are tried
 _FLOOR = 1e-12  # relative; keeps rays that are all parallel invertible
 
@@ -61,13 +61,13 @@ def initial_poses(points: Array, direction: Array, weight: Array, spread: bool =
     problem = _problem(points, direction, weight)
     local, d = problem.local, problem.direction
     misfit = _misfit(local, d, np.any(d, axis=-1))
-    rotation, translation, error = _best(
+    rotation, translation, error = _best_turn(
         _algebraic_rotations(local, misfit), misfit, local, d, _STEPS)
     rows = np.flatnonzero(error > _DOUBTFUL) if spread else np.empty(0, dtype=np.int64)
     if rows.size:
         turns = np.broadcast_to(_cube_turns(), (len(rows), 24, 3, 3))
         own = _Misfit(misfit.form[rows], misfit.pull[rows])
-        other = _best(turns, own, local[rows], d[rows], _MORE_STEPS)
+        other = _best_turn(turns, own, local[rows], d[rows], _MORE_STEPS)
         better = other[2] < error[rows]
         rotation[rows[better]], translation[rows[better]] = other[0][better], other[1][better]
     return problem.camera(rotation, translation)
@@ -114,7 +114,7 @@ def _misfit(local: Array, d: Array, seen: Mask) -> _Misfit:
     return _Misfit(form + mixed @ pull, pull)
 
 
-def _best(
+def _best_turn(
     candidates: Array, misfit: _Misfit, local: Array, d: Array, steps: int
 ) -> tuple[Array, Array, Array]:
     """Polish candidates (S, C, 3, 3) and return the best turn, its translation and its error.
@@ -149,7 +149,8 @@ def _polish(rotation: Array, form: Array, steps: int) -> Array:
         hessian[..., range(3), range(3)] += damping[..., None]
         step = -np.linalg.solve(hessian, image @ _columns(rotation)[..., None])[..., 0]
         size = np.linalg.norm(step, axis=-1, keepdims=True)
-        rotation = rotation_from_vector(step * (_LONGEST / np.maximum(size, _LONGEST))) @ rotation
+        part = _MAX_TURN / np.maximum(size, _MAX_TURN)
+        rotation = rotation_from_vector(step * part) @ rotation
     return rotation
 
 

@@ -22,7 +22,8 @@ Arrays = tuple[Array, ...]
 
 _RIDGE = 2e-14  # beyond rounding, and less than what counts as determined
 _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data's weight
-_REST = 1e-6  # of the cost: what a step promises where derivatives that are not exact end
+# Of the cost: what a step promises where derivatives that are not exact end
+_STALL_TOLERANCE = 1e-6
 
 
 class Problem(Protocol):
@@ -41,7 +42,7 @@ class Problem(Protocol):
         """Apply a step to the states."""
 
 
-class Solved(NamedTuple):
+class Minimum(NamedTuple):
     """state; cost (S,): sum of squared whitened residuals; converged (S,); iterations (S,).
 
     normal: the normal equations there, as of the last step but one.
@@ -56,7 +57,7 @@ class Solved(NamedTuple):
 
 def levenberg_marquardt(
     problem: Problem, start: Arrays, max_iterations: int = MAX_ITERATIONS
-) -> Solved:
+) -> Minimum:
     """Minimise every system from its own start, with a damping of its own.
 
     Its rules are those of `optics.engines.marquardt`.  A step that leaves the domain of the lens
@@ -65,7 +66,7 @@ def levenberg_marquardt(
     systems = start[0].shape[0]
     active: Index = np.arange(systems)
     total, normal = problem.linearise(start, active)
-    found = Solved(
+    found = Minimum(
         tuple(array.copy() for array in start), total, np.zeros(systems, dtype=np.bool_),
         np.zeros(systems, dtype=np.int64), normal,
     )
@@ -76,15 +77,15 @@ def levenberg_marquardt(
         if not active.size:
             break
         found.iterations[active] += 1
-        step, moved = problem.step(_at(found.normal, active), damping[active])
-        trial = problem.retract(_at(found.state, active), step)
+        step, moved = problem.step(_rows(found.normal, active), damping[active])
+        trial = problem.retract(_rows(found.state, active), step)
         before = total[active]
         done = is_last(moved, moved_before[active], before, damping[active])
         if done.any():
             last, on = active[done], ~done
             found.converged[last] = True
             total[last] = np.maximum(before - moved, 0.0)[done]
-            found = found._replace(state=_written(found.state, last, trial, done))
+            found = found._replace(state=_with_rows(found.state, last, trial, done))
             active, before, moved = active[on], before[on], moved[on]
             trial = tuple(array[on] for array in trial)
             if not active.size:
@@ -94,8 +95,8 @@ def levenberg_marquardt(
         accepted = active[better]
         total[accepted], moved_before[accepted] = cost[better], moved[better]
         found = found._replace(
-            state=_written(found.state, accepted, trial, better),
-            normal=_written(found.normal, accepted, fresh, better),
+            state=_with_rows(found.state, accepted, trial, better),
+            normal=_with_rows(found.normal, accepted, fresh, better),
         )
         damping[active], growth[active] = adjusted(
             damping[active], growth[active], better, before - cost, moved
@@ -104,8 +105,8 @@ def levenberg_marquardt(
     rest = np.flatnonzero(~found.converged & np.isfinite(total))
     if rest.size:
         # Some effects have derivatives that are not exact: no step keeps what it promises.
-        _, moved = problem.step(_at(found.normal, rest), np.zeros(len(rest)))
-        found.converged[rest] = moved <= _REST * total[rest]
+        _, moved = problem.step(_rows(found.normal, rest), np.zeros(len(rest)))
+        found.converged[rest] = moved <= _STALL_TOLERANCE * total[rest]
     return found
 
 
@@ -151,14 +152,14 @@ def dense_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
     return (step,), moved
 
 
-def _at(arrays: Arrays, index: Index) -> Arrays:
+def _rows(arrays: Arrays, index: Index) -> Arrays:
     """Return the rows at ascending places; all of them are not copied."""
     if len(index) == len(arrays[0]):
         return arrays
     return tuple(array[index] for array in arrays)
 
 
-def _written(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> Arrays:
+def _with_rows(arrays: Arrays, index: Index, new: Arrays, mask: Mask) -> Arrays:
     """Return arrays with the masked ones of the new rows, which go to `index`."""
     if len(index) == len(arrays[0]):
         return new

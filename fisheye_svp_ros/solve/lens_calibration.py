@@ -20,18 +20,19 @@ from fisheye_svp_ros.optics.lens import (
     check_lens,
     field_of_view,
     monotone_limit,
+    parameter_values,
 )
 from fisheye_svp_ros.optics.ports import Port
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views
+from fisheye_svp_ros.solve.bundle_adjustment import AdjustedLens, adjust_lens, adjust_lens_from
 from fisheye_svp_ros.solve.initial_pose import initial_poses
-from fisheye_svp_ros.solve.lens_adjustment import Adjusted, adjust, adjust_batch, parameter_values
-from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, thinned
+from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, select_points
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured import posable_views, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 
-OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
+MAX_OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
 _CANDIDATES = 4
 _START_ITERATIONS = 40
@@ -48,7 +49,7 @@ class Calibration(NamedTuple):
     incidence angle of an observation, rad, past which the curve is extrapolated.
     """
 
-    adjusted: Adjusted
+    adjusted: AdjustedLens
     sigma: float | None
     views: Views
     left_out: tuple[int, ...]
@@ -84,14 +85,14 @@ def calibrate(
     views, left_out = posable_views(observations)
     _check_rows(observations.source, views, names)
     try:
-        return _finished(observations, _from_nothing(start, views, names), views, left_out)
+        return _as_calibration(observations, _fit_lens(start, views, names), views, left_out)
     except GeometryError:
-        lost = lost_views(start.svp(), thinned(views, len(views.frame)))
+        lost = lost_views(start.svp(), select_points(views, len(views.frame)))
         if not lost.any():
             raise
     views = views.take(np.flatnonzero(~lost))
     _check_rows(observations.source, views, names)
-    return _finished(observations, _from_nothing(start, views, names), views, left_out)
+    return _as_calibration(observations, _fit_lens(start, views, names), views, left_out)
 
 
 def calibrate_port(
@@ -108,8 +109,8 @@ def calibrate_port(
     _check_known(lens, names)
     views, left_out = posable_views(observations)
     _check_rows(observations.source, views, names)
-    adjusted = _from_places(lens, thinned(views), views, names)
-    return _finished(observations, adjusted, views, left_out)
+    adjusted = _fit_port(lens, select_points(views), views, names)
+    return _as_calibration(observations, adjusted, views, left_out)
 
 
 def placed_names(lens: Lens) -> tuple[str, ...]:
@@ -130,8 +131,8 @@ def _counts(views: Views, names: Sequence[str]) -> tuple[int, int]:
     return 2 * int(views.used.sum()), 6 * len(views.frame) + len(names)
 
 
-def _finished(
-    observations: Observations, adjusted: Adjusted, views: Views, left_out: tuple[int, ...]
+def _as_calibration(
+    observations: Observations, adjusted: AdjustedLens, views: Views, left_out: tuple[int, ...]
 ) -> Calibration:
     """Return the calibration with its covariances, field and figures."""
     rows, unknowns = _counts(views, adjusted.names)
@@ -190,14 +191,14 @@ def _check_known(lens: Lens, names: tuple[str, ...]) -> None:
 
 def _check_inside(observations: Observations, image_size: tuple[int, int]) -> None:
     outside = np.maximum(-observations.uv, observations.uv - image_size).max(axis=0) / image_size
-    if outside.max() > OUTSIDE:
+    if outside.max() > MAX_OUTSIDE:
         raise ObservationError(
             f'{observations.source}: image points lie far outside an image of '
             f'{image_size[0]}x{image_size[1]}; check the image size'
         )
 
 
-def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
+def _fit_lens(start: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Scan the focal length, adjust the best candidates to few points, then to everything."""
     shift = start.viewpoint_shift
     svp_names = names
@@ -205,55 +206,51 @@ def _from_nothing(start: Lens, views: Views, names: tuple[str, ...]) -> Adjusted
         svp_names = tuple(name for name in names if name not in shift.coefficient_names)
     port_names = tuple(name for name in names if name in start.port_names)
     svp_names = tuple(name for name in svp_names if name not in port_names)
-    few = thinned(views)
+    few = select_points(views)
     focals, pose = focal_candidates(start.svp(), few, _CANDIDATES)
     values = np.tile(parameter_values(start, svp_names), (len(focals), 1))
     values[:, [name in ('f', 'fx', 'fy') for name in svp_names]] = focals[:, None]
-    adjusted = _settled(_best_start(start.svp(), few, pose, values, svp_names), views, svp_names)
+    best = adjust_lens_from(start.svp(), few, pose, values, svp_names, _START_ITERATIONS)
+    adjusted = _adjust_until_stable(best, views, svp_names)
     if start.port is not None:
-        adjusted = _behind_port(start, adjusted, few, views, (*svp_names, *port_names))
+        adjusted = _fit_behind_port(start, adjusted, few, views, (*svp_names, *port_names))
     if shift is None:
         return adjusted
     lens = _with_corner(replace(adjusted.lens, viewpoint_shift=shift))
-    return adjust(lens, views, adjusted.pose, names)
+    return adjust_lens(lens, views, adjusted.pose, names)
 
 
-def _best_start(lens: Lens, few: Views, pose: Pose, values: Array, names: tuple[str, ...]) -> Lens:
-    """Return the lens that fits best of those adjusted from starts (S, V) and (S, K)."""
-    solved = adjust_batch(lens, few, pose, values, names, _START_ITERATIONS)
-    return lens.with_parameters(names, solved.state[2][np.argmin(solved.cost)].tolist())
-
-
-def _behind_port(
-    start: Lens, central: Adjusted, few: Views, views: Views, names: tuple[str, ...]
-) -> Adjusted:
+def _fit_behind_port(
+    start: Lens, central: AdjustedLens, few: Views, views: Views, names: tuple[str, ...]
+) -> AdjustedLens:
     """Adjust lens and port from a fit that knows of no port, and from several places of it."""
     assert start.port is not None
     air, larger = central.lens, start.port.magnification
     if larger > 1:
         # What a port does to the focal length is known, the rest of the curve is begun anew.
         air = replace(air, fx=air.fx / larger, fy=air.fy / larger, image_height=start.image_height)
-    return _from_places(replace(air, port=start.port), few, views, names)
+    return _fit_port(replace(air, port=start.port), few, views, names)
 
 
-def _from_places(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> Adjusted:
+def _fit_port(lens: Lens, few: Views, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Adjust a lens from several places of its port."""
     assert lens.port is not None
     lenses = [replace(lens, port=port) for port in lens.port.starts()]
-    pose = Pose.stack([_posed(one, few).pose for one in lenses])
+    pose = Pose.stack([_localize_views(one, few).pose for one in lenses])
     values = np.array([parameter_values(one, names) for one in lenses])
-    return _settled(_best_start(lens, few, pose, values, names), views, names)
+    best = adjust_lens_from(lens, few, pose, values, names, _START_ITERATIONS)
+    return _adjust_until_stable(best, views, names)
 
 
-def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
+def _adjust_until_stable(lens: Lens, views: Views, names: tuple[str, ...]) -> AdjustedLens:
     """Pose every view and adjust, until no view fits better when it is posed afresh."""
-    pose = _posed(lens, views).pose
+    pose = _localize_views(lens, views).pose
     for _ in range(_ROUNDS):
-        adjusted = adjust(lens, views, pose, names)
+        adjusted = adjust_lens(lens, views, pose, names)
         lens, pose = adjusted.lens, adjusted.pose
         if not adjusted.converged:
             break
-        fresh = _posed(lens, views)
+        fresh = _localize_views(lens, views)
         better = fresh.cost < adjusted.cost * (1 - 1e-6)
         if not better.any():
             break
@@ -261,7 +258,7 @@ def _settled(lens: Lens, views: Views, names: tuple[str, ...]) -> Adjusted:
     return adjusted
 
 
-def _posed(lens: Lens, views: Views) -> Localization:
+def _localize_views(lens: Lens, views: Views) -> Localization:
     """Pose every view from what lies inside the field of view, however little that is."""
     lens = _with_corner(lens)
     rays = back_project(lens, views.uv)
@@ -273,7 +270,7 @@ def _with_corner(lens: Lens) -> Lens:
     return replace(lens, max_incidence=field_of_view(lens))
 
 
-def _with_field(adjusted: Adjusted, theta: Array) -> Lens:
+def _with_field(adjusted: AdjustedLens, theta: Array) -> Lens:
     """Return the lens with its `max_incidence`; theta: of the observations, rad."""
     held = set(adjusted.names) <= set(adjusted.lens.port_names)
     lens = adjusted.lens if held else _with_corner(adjusted.lens)
@@ -281,7 +278,7 @@ def _with_field(adjusted: Adjusted, theta: Array) -> Lens:
     return replace(lens, max_incidence=max(lens.max_incidence, seen))
 
 
-def _check_focal(adjusted: Adjusted, source: str) -> None:
+def _check_focal(adjusted: AdjustedLens, source: str) -> None:
     for i, name in enumerate(adjusted.names):
         if name in ('f', 'fx', 'fy'):
             relative = float(np.sqrt(adjusted.covariance[i, i])) / adjusted.lens.fx

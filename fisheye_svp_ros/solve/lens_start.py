@@ -64,7 +64,7 @@ def _scan(lens: Lens, views: Views) -> tuple[Array, Pose, Array]:
     return focals, pose, rms
 
 
-def thinned(views: Views, most: int = _VIEWS) -> Views:
+def select_points(views: Views, most: int = _VIEWS) -> Views:
     """Return the views that spread widest in the image, with a few evenly spread points each."""
     used = views.used[..., None]
     count = used.sum(axis=(1, 2))

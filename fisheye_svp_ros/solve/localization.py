@@ -23,7 +23,7 @@ from fisheye_svp_ros.solve.least_squares import (
 
 MIN_POINTS, FEW_POINTS = 4, 6
 _MOTIONS = 3  # times that velocities and poses follow from each other
-_UNDETERMINED = 1e-13  # relative eigenvalue of the information; rounding leaves about 1e-15
+_UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 
 
 def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Localization:
@@ -56,11 +56,11 @@ def _localize(model: ForwardModel, views: Views, start: Pose | None) -> Localiza
     if start is None:
         check_views(views, MIN_POINTS)
         start = start_poses(model, views)
-    found, some_flat = _localized(model, views, start)
+    found, some_flat = _solve_from(model, views, start)
     if some_flat:
         flat, centre, normal = _flat_targets(views)
         if flat.size:
-            reflected = _reflected(found.pose.take(flat), centre, normal)
+            reflected = _mirror_image(found.pose.take(flat), centre, normal)
             _improve(model, views, found, flat, reflected.reshape(len(flat), 1))
     if anywhere:
         few = np.flatnonzero((views.weight > 0).sum(axis=1) < FEW_POINTS)
@@ -77,14 +77,14 @@ def _improve(
 ) -> None:
     """Write what fits better from further starts (R, C) of some views (R,), in place."""
     repeated = np.repeat(rows, start.shape[1])
-    other, _ = _localized(model, views.take(repeated), start.reshape(-1))
+    other, _ = _solve_from(model, views.take(repeated), start.reshape(-1))
     cost = np.where(other.converged, other.cost, np.inf).reshape(start.shape)
     best = np.argmin(cost, axis=1) + start.shape[1] * np.arange(len(rows))
     better = other.cost[best] < found.cost[rows]
     found.put(rows[better], other.take(best[better]))
 
 
-def _localized(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
+def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
     """Solve from these starts alone; return also whether any target may be flat."""
     quick = None
     if model.plain:
@@ -152,7 +152,7 @@ def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
     return flat, centre[flat, 0], axes[flat, :, 0]
 
 
-def _reflected(pose: Pose, centre: Array, normal: Array) -> Pose:
+def _mirror_image(pose: Pose, centre: Array, normal: Array) -> Pose:
     """Reflect the target, flat across `normal` (S, 3), by the plane across its line of sight."""
     sight = pose.inverse().transform(centre)
     along = sight / np.maximum(np.linalg.norm(sight, axis=-1, keepdims=True), 1e-12)
@@ -184,7 +184,7 @@ def _covariance(hessian: Array) -> tuple[Array, Mask]:
     # The trace of the inverse is the reciprocal of the smallest eigenvalue, up to a factor of 6.
     spread = np.trace(inverse, axis1=-2, axis2=-1)
     outer = scale[..., :, None] * scale[..., None, :]
-    return inverse / outer, (spread > 0) & (spread < 1 / _UNDETERMINED)
+    return inverse / outer, (spread > 0) & (spread < 1 / _UNDETERMINED_EIGENVALUE)
 
 
 class _Localization:

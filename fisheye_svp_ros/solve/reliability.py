@@ -20,24 +20,24 @@ from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize, residuals
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 
-_ALARM = 1e-4  # probability that a clean view fails the test of its misfit
-_STANDS_OUT = 3.8  # a residual beside the root mean square of all, which starts a search
+_FALSE_ALARM = 1e-4  # probability that a clean view fails the test of its misfit
+_MAX_RESIDUAL_RATIO = 3.8  # a residual beside the root mean square of all, which starts a search
 _GROSS = 5.0  # standard deviations
-_AGREE = 0.6  # of the points must agree on a pose
-_SPARE = 3  # points beyond a minimal set that must agree as well
+_MIN_AGREEMENT = 0.6  # of the points must agree on a pose
+_SPARE_POINTS = 3  # points beyond a minimal set that must agree as well
 _SUBSETS, _SUBSET, _FEW_SUBSETS, _KEPT, _ROUNDS = 120, 6, 30, 6, 8
 _FADE = 2.0  # standard deviations at which a point's weight falls to about half
 _MEDIAN = 1.1774  # median length of a plane Gaussian vector of unit deviation
-_NOWHERE = 1e6  # standard deviations: what is more is as good as infinite
-_FARTHEST = 100.0  # m, a range at which landmarks are probably not in metres
+_INFINITE = 1e6  # standard deviations: what is more is as good as infinite
+_MAX_RANGE = 100.0  # m, a range at which landmarks are probably not in metres
 _NOISIEST = 2.0  # px, that a detector leaves
 # Where sigma is unknown: a view may misfit this many times as much as most do; how many views
 # can be held against each other; and px below which residuals are rounding.
 _TOLERANCE, _OTHERS, _EXACT = 2.0, 4, 1e-6
-_NAMED = 5
+_MAX_NAMES = 5
 
 
-class Examined(NamedTuple):
+class Examination(NamedTuple):
     """Solved poses of S views, examined.
 
     result: covariances for what the residuals show where that is more than sigma; gross (S, N):
@@ -55,7 +55,7 @@ class Examined(NamedTuple):
 def examine(
     model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True,
     searched: bool = True,
-) -> Examined:
+) -> Examination:
     """Test the poses that `localize` found, and look for gross errors where they fail.
 
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
@@ -64,12 +64,12 @@ def examine(
     """
     model = model.seeing(views)
     if sigma_known:
-        return _examined(model, views, found, 1.0, 1.0, searched)
+        return _examine(model, views, found, 1.0, 1.0, searched)
     freedom = np.maximum(2 * (views.weight > 0).sum(axis=1) - 6, 1)
     usual = float(np.sqrt(np.median(found.cost / freedom)))
     if len(freedom) < _OTHERS:
-        usual = min(usual, float(_spread_of(views, found).max()))
-    checked = _examined(model, views, found, max(usual, _EXACT), _TOLERANCE)
+        usual = min(usual, float(_noise_from_median(views, found).max()))
+    checked = _examine(model, views, found, max(usual, _EXACT), _TOLERANCE)
     result, passed = checked.result, np.array([not reason for reason in checked.reasons])
     passed &= result.converged
     some = passed if passed.any() else result.converged
@@ -77,15 +77,15 @@ def examine(
     sigma = noise_sigma(result.cost[some].sum(), int(rows), 6 * int(some.sum()))
     reasons = checked.reasons
     if sigma > _NOISIEST:
-        reasons = tuple(_joined(_noisy_reason(sigma), reason) for reason in reasons)
-    return Examined(result._replace(covariance=result.covariance * sigma**2), checked.gross,
+        reasons = tuple(_join_reasons(_noisy_reason(sigma), reason) for reason in reasons)
+    return Examination(result._replace(covariance=result.covariance * sigma**2), checked.gross,
                     reasons, sigma)
 
 
-def _examined(
+def _examine(
     model: ForwardModel, views: Views, found: Localization, sigma: float, tolerance: float,
     searched: bool = True,
-) -> Examined:
+) -> Examination:
     """Examine with a sigma in units of 1 / weight; tolerance: of the misfit, as a factor."""
     freedom = 2 * (views.weight > 0).sum(axis=1) - 6
     allowed = (tolerance * sigma) ** 2
@@ -93,23 +93,26 @@ def _examined(
     result, reasons = found, _far_reasons(views, found)
     gross = np.zeros(views.used.shape, dtype=bool)
     if not suspect.any():
-        return Examined(result, gross, tuple(reasons), None)
+        return Examination(result, gross, tuple(reasons), None)
     result = Localization.concatenate([found])  # a copy
     for i in np.flatnonzero(suspect):
         view = views.take([i])
-        other = _agreed(model, view, found.take([i]), sigma, tolerance) if searched else None
+        other = None
+        if searched:
+            other = _consensus_pose(model, view, found.take([i]), sigma, tolerance)
         if other is not None:
             result.put([i], other)
             gross[i] = (view.weight[0] > 0) & np.isnan(other.residual[0, :, 0])
             result.residual[i] = residuals(model, other.pose, view)[0]
-            reasons[i] = _joined(_gross_reason(view, gross[i], result.residual[i]), reasons[i])
+            why = _gross_reason(view, gross[i], result.residual[i])
+            reasons[i] = _join_reasons(why, reasons[i])
         elif result.converged[i] and misfit_fails(result.cost[i] / allowed, freedom[i]):
             excess = float(result.cost[i]) / max(freedom[i], 1) / sigma**2
             result.covariance[i] *= excess
-            reasons[i] = _joined(
+            reasons[i] = _join_reasons(
                 f'{misfit_reason(excess, int(freedom[i]))}; the covariance is scaled by it',
                 reasons[i])
-    return Examined(result, gross, tuple(reasons), None)
+    return Examination(result, gross, tuple(reasons), None)
 
 
 def doubt_of_pairs(
@@ -123,7 +126,7 @@ def doubt_of_pairs(
     """
     best = triangulate_optimally(*models, rig, *uv, sigma)
     behind = int((~best.valid).sum())
-    if behind > (1 - _AGREE) * len(landmark):
+    if behind > (1 - _MIN_AGREEMENT) * len(landmark):
         return (f'the rays of {behind} of {len(landmark)} landmarks do not meet in front of both '
                 'cameras: left and right, rig or ids may be wrong')
     cost = np.square(np.stack([best.left_residual, best.right_residual])).sum(axis=(0, -1))
@@ -133,9 +136,10 @@ def doubt_of_pairs(
     if not gross.any() and not fails:
         return ''
     rest = cost[~gross]
-    if len(rest) >= _AGREE * len(cost) and not misfit_fails(rest.sum(), np.asarray(len(rest))):
+    agreeing = len(rest) >= _MIN_AGREEMENT * len(cost)
+    if agreeing and not misfit_fails(rest.sum(), np.asarray(len(rest))):
         off = np.sqrt(cost[gross]) * sigma
-        return f'pairs that do not match: {_named(ids[gross], off)}'
+        return f'pairs that do not match: {_landmark_names(ids[gross], off)}'
     return misfit_reason(float(cost.sum()) / len(cost), len(cost))
 
 
@@ -143,7 +147,7 @@ def misfit_fails(cost: Array, freedom: Array) -> Mask:
     """Say whether whitened sums of squares are more than degrees of freedom allow."""
     from scipy.special import chdtri  # takes a third of the time that `--help` may take
 
-    return np.asarray(cost > chdtri(np.maximum(freedom, 1), _ALARM))
+    return np.asarray(cost > chdtri(np.maximum(freedom, 1), _FALSE_ALARM))
 
 
 def misfit_reason(excess: float, freedom: int) -> str:
@@ -160,12 +164,12 @@ def noise_sigma(cost: float, rows: int, unknowns: int) -> float:
     return float(np.sqrt(cost / max(rows - unknowns, 1)))
 
 
-def _agreed(
+def _consensus_pose(
     model: ForwardModel, view: Views, found: Localization, sigma: float, tolerance: float
 ) -> Localization | None:
     """Return the pose that most points of one view (1,) agree on, residuals NaN for the others."""
     used = view.weight > 0
-    enough = max(MIN_POINTS + _SPARE, _AGREE * used.sum())
+    enough = max(MIN_POINTS + _SPARE_POINTS, _MIN_AGREEMENT * used.sum())
     if (used & model.back_project(view.uv).valid).sum() < enough:
         return None
     start = _consensus(model, view, found, sigma)
@@ -194,7 +198,7 @@ def _suspect(views: Views, found: Localization, freedom: Array, allowed: float) 
         largest = np.fmax.reduce(np.where(
             views.weight > 0, (found.residual**2).sum(axis=-1) * views.weight**2, 0.0), axis=1)
         mean = found.cost / np.maximum(freedom, 1)
-        stands_out = largest > 2 * _STANDS_OUT**2 * mean
+        stands_out = largest > 2 * _MAX_RESIDUAL_RATIO**2 * mean
         return np.asarray(misfit_fails(found.cost / allowed, freedom) | stands_out)
 
 
@@ -205,7 +209,7 @@ def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: flo
     if len(usable) < MIN_POINTS:
         return found.pose
     # Six points fix a pose without a search among turns, which four of few need.
-    enough = len(usable) >= _SUBSET + _SPARE
+    enough = len(usable) >= _SUBSET + _SPARE_POINTS
     many, size = (_SUBSETS, _SUBSET) if enough else (_FEW_SUBSETS, MIN_POINTS)
     draws = np.random.default_rng(len(usable)).uniform(size=(many, len(usable)))
     subset = usable[np.argsort(draws, axis=1)[:, :size]]
@@ -217,7 +221,7 @@ def _consensus(model: ForwardModel, view: Views, found: Localization, sigma: flo
     best = np.argsort(off, kind='stable')[:_KEPT]
     pose, views = pose.take(best), views.take(best)
     for _ in range(_ROUNDS):
-        off = np.minimum(_lengths(model, pose, views), _NOWHERE)
+        off = np.minimum(_lengths(model, pose, views), _INFINITE)
         scale = np.maximum(sigma, _median(off, views) / _MEDIAN)[:, None]
         fading = 1 / (1 + (off / (_FADE * scale)) ** 2)
         pose = localize(model, views._replace(weight=views.weight * fading), pose).pose
@@ -241,11 +245,11 @@ def _score(length: Array, views: Views, sigma: float) -> Array:
 def _median(length: Array, views: Views) -> Array:
     """Return medians (S,) of the points that have a weight; finite."""
     middle = (views.weight > 0).sum(axis=1, keepdims=True) // 2
-    median = np.take_along_axis(np.sort(np.minimum(length, _NOWHERE), axis=1), middle, axis=1)
+    median = np.take_along_axis(np.sort(np.minimum(length, _INFINITE), axis=1), middle, axis=1)
     return np.asarray(median[:, 0])
 
 
-def _spread_of(views: Views, found: Localization) -> Array:
+def _noise_from_median(views: Views, found: Localization) -> Array:
     """Return the noise (S,) that the median residuals speak of; they hide some of it."""
     length = np.where(views.weight > 0, np.linalg.norm(found.residual, axis=-1), np.inf)
     count = (views.weight > 0).sum(axis=1)
@@ -259,14 +263,14 @@ def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
     worst = np.argsort(-size, kind='stable')[:gross.sum()]
     if not len(worst):
         return ''
-    return f'gross errors left out: {_named(view.landmark[0, worst], size[worst])}'
+    return f'gross errors left out: {_landmark_names(view.landmark[0, worst], size[worst])}'
 
 
-def _named(landmark: Index, size: Array) -> str:
+def _landmark_names(landmark: Index, size: Array) -> str:
     """Return landmarks by name, each with its residual, px; the first of many."""
     names = ', '.join(f'{one} ({px:.3g} px)'
-                      for one, px in zip(landmark[:_NAMED], size[:_NAMED], strict=True))
-    more = f' and {len(landmark) - _NAMED} more' if len(landmark) > _NAMED else ''
+                      for one, px in zip(landmark[:_MAX_NAMES], size[:_MAX_NAMES], strict=True))
+    more = f' and {len(landmark) - _MAX_NAMES} more' if len(landmark) > _MAX_NAMES else ''
     return f'landmark{"s" if len(landmark) > 1 else ""} {names}{more}'
 
 
@@ -279,8 +283,8 @@ def _far_reasons(views: Views, found: Localization) -> list[str]:
     away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
     why = f'landmarks lie up to {farthest.max():.0f} m away: are they in metres?'
-    return [why if far > _FARTHEST else '' for far in farthest]
+    return [why if far > _MAX_RANGE else '' for far in farthest]
 
 
-def _joined(*reasons: str) -> str:
+def _join_reasons(*reasons: str) -> str:
     return '; '.join(filter(None, reasons))

@@ -13,14 +13,14 @@ from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.pose import Pose, cross_matrix, identity
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import arrow_covariance, arrow_of_views, arrow_step
-from fisheye_svp_ros.solve.least_squares import Arrays, Solved, levenberg_marquardt
+from fisheye_svp_ros.solve.least_squares import Arrays, Minimum, levenberg_marquardt
 from fisheye_svp_ros.solve.localization import MIN_POINTS, localize, pose_equations, residuals
 
 _MEAN_ROUNDS = 6
 
 
 class StereoCalibration(NamedTuple):
-    """Solved rigs of S systems with V views each.
+    """Minimum rigs of S systems with V views each.
 
     rig (S,): left camera in the right one; pose (S, V): right camera in the world; their
     covariances (S, 6, 6) and (S, V, 6, 6), m and rad, of the change in `Pose.retract`, NaN where
@@ -59,7 +59,7 @@ def calibrate_stereo(
     """
     left, right = left.seeing(left_views), right.seeing(right_views)
     pose, rig = start or _starts(left, right, left_views, right_views, systems)
-    solved = _solved((left, right), (left_views, right_views), (*pose, *rig))
+    solved = _solve_rigs((left, right), (left_views, right_views), (*pose, *rig))
     pose, rig = Pose(*solved.state[:2]), Pose(*solved.state[2:])
     covariance = arrow_covariance(solved.normal)
     lost = ~solved.converged
@@ -73,9 +73,9 @@ def calibrate_stereo(
     )
 
 
-def _solved(
+def _solve_rigs(
     models: tuple[ForwardModel, ForwardModel], views: tuple[Views, Views], start: Arrays
-) -> Solved:
+) -> Minimum:
     left, right = models
     quick = None
     if left.plain and right.plain:
@@ -83,7 +83,7 @@ def _solved(
     if quick is None:
         return levenberg_marquardt(_Rigs(models, views, len(start[-1])), start)
     everyone = np.ones(len(start[-1]), dtype=bool)
-    return Solved(quick.state, quick.cost, everyone, quick.iterations, quick.normal)
+    return Minimum(quick.state, quick.cost, everyone, quick.iterations, quick.normal)
 
 
 class _Rigs:
@@ -146,8 +146,8 @@ def _starts(
     left: ForwardModel, right: ForwardModel, left_views: Views, right_views: Views, systems: int
 ) -> tuple[Pose, Pose]:
     """Return poses (S, V) of the right camera and rigs (S,) from views localized one by one."""
-    left_pose, left_posed = _posed(left, left_views)
-    right_pose, right_posed = _posed(right, right_views)
+    left_pose, left_posed = _localize_posable(left, left_views)
+    right_pose, right_posed = _localize_posable(right, right_views)
     lost = np.flatnonzero(~(left_posed | right_posed))
     if lost.size:
         raise GeometryError(
@@ -166,7 +166,7 @@ def _starts(
     return own.where(right_posed.reshape(systems, -1), from_left), rig
 
 
-def _posed(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
+def _localize_posable(model: ForwardModel, views: Views) -> tuple[Pose, Mask]:
     """Localize the views (S,) that have enough points; return also which of them have a pose."""
     inside = model.back_project(views.uv).valid & (views.weight > 0)
     posed: Mask = inside.sum(axis=1) >= MIN_POINTS

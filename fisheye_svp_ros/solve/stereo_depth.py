@@ -155,12 +155,12 @@ def triangulate_optimally(
     hessian[~fixed] = np.eye(3)
     valid[valid] = fixed
 
-    def filled(field: Array) -> Array:
+    def place_valid(field: Array) -> Array:
         return placed(valid.reshape(pairs.shape), field[fixed])
 
     return OptimalPoints(
-        filled(solved.state[0]), filled(np.asarray(np.linalg.inv(hessian), dtype=float)),
-        filled(solved_pairs.left - uv[:, 0]), filled(solved_pairs.right - uv[:, 1]),
+        place_valid(solved.state[0]), place_valid(np.asarray(np.linalg.inv(hessian), dtype=float)),
+        place_valid(solved_pairs.left - uv[:, 0]), place_valid(solved_pairs.right - uv[:, 1]),
         valid.reshape(pairs.shape),
     )
 

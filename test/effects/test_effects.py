@@ -11,6 +11,7 @@ from fisheye_svp_ros.effects.base import Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE, load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.of_cameras import of_cameras
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project
@@ -226,3 +227,18 @@ def test_steps_are_asked_for_after_pauses_and_every_few_frames_of_a_long_recordi
     starts = [form.starts[0] for form in CATALOGUE['session_step'].candidates(looked)]
     assert len(starts) < 70 and np.abs(np.array(starts) - t[157]).min() < 1e-6
     assert max(np.diff(starts)) < 31.5
+
+
+def test_every_effect_says_where_it_stands_in_the_budget_and_what_it_is():
+    stages = {name: kind.budget_stage() for name, kind in CATALOGUE.items()}
+    assert {name for name, stage in stages.items() if stage == 'frame'} == {
+        'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
+        'dot_centroid', 'detector_bias'}
+    assert {name for name, stage in stages.items() if stage == 'target'} == {
+        'landmark_survey', 'landmark_scale', 'target_shape', 'board_pose'}
+    assert {name for name, stage in stages.items() if stage == 'noise'} == {
+        'wrong_ids', 'quantisation', 'noise_vs_angle'}
+    for name, kind in CATALOGUE.items():
+        assert of_cameras(kind).budget_stage() == stages[name]
+        assert kind.summary().endswith('.') and kind.to_separate and kind.signature
+    assert 'along the axis' in CATALOGUE['viewpoint_shift'].summary()

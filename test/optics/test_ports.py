@@ -13,10 +13,10 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.curves import FlatPort, Gennery
 from fisheye_svp_ros.optics.engines import ported
+from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
-from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.localization import localize
 
 AIR = replace(load_lens(lens_path('fish180')), viewpoint_shift=Gennery(0.001, 0.004, 0.001))

@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, FlatPort, Gennery, Kann
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.simulation import simulate
-from fisheye_svp_ros.solve.lens_adjustment import adjust
+from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured import localize_measured, posable_views, rms_px
@@ -133,7 +133,7 @@ def test_covariances_hold():
             truth, uv=truth.uv + rng.normal(0, 0.2, truth.uv.shape),
             sigma=np.full(len(truth), 0.2),
         )
-        fit = adjust(lens, group_views(noisy), poses, names)
+        fit = adjust_lens(lens, group_views(noisy), poses, names)
         off = parameters(fit.lens, names) - true_values
         lens_nees.append(off @ np.linalg.solve(fit.covariance, off))
         moved = fit.pose.difference(poses)

@@ -13,7 +13,7 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
 from fisheye_svp_ros.solve.initial_pose import (
-    _best,
+    _best_turn,
     _cube_turns,
     _misfit,
     _problem,
@@ -166,8 +166,8 @@ def test_a_landmark_behind_its_ray_is_as_far_off_as_it_can_be():
     direction = ahead / np.linalg.norm(ahead, axis=-1, keepdims=True)
     local, d = _problem(points, direction, np.ones((1, 5)))[:2]
     misfit = _misfit(local, d, np.ones((1, 5), dtype=bool))
-    true, _, least = _best(_cube_turns()[None], misfit, local, d, 10)
-    _, _, error = _best((true @ np.diag([-1.0, -1, 1]))[:, None], misfit, local, d, 0)
+    true, _, least = _best_turn(_cube_turns()[None], misfit, local, d, 10)
+    _, _, error = _best_turn((true @ np.diag([-1.0, -1, 1]))[:, None], misfit, local, d, 0)
     assert least < 1e-9 and error == 1
 
 

@@ -1,0 +1,321 @@
+"""Bundle adjustment: poses, rig, intrinsics and effects together, by least squares.
+
+Any of them may have a Gaussian prior, or be held.  The frames are the blocks of one arrow
+(`solve.arrow`), so that the time grows as their number does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.arrow import (
+    ArrowEquations,
+    arrow_covariance,
+    arrow_information,
+    arrow_step,
+)
+from fisheye_svp_ros.solve.least_squares import Arrays, Minimum, levenberg_marquardt
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
+
+MAX_LENS_ITERATIONS = 200
+_UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
+_STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
+_MAX_RISE = 1.5  # of the sum of squares in a Gauss-Newton step: random effects may take up as much
+_GAUSS_NEWTON_STEPS = 4
+
+
+class PosePrior(NamedTuple):
+    """What is known before of poses (P,): mean, root (P, R, 6).
+
+    root: times the change from the mean (`Pose.difference`) it is of unit covariance.
+    """
+
+    mean: Pose
+    root: Array
+
+
+class Prior(NamedTuple):
+    """What is known before of a state: a Gaussian of any of its parts.
+
+    mean (K,), root (R, K): of free intrinsics and effect values, root times what is off the mean
+    being of unit covariance; pose: of the frames (F,); rig: of the cameras (C - 1,) in the first.
+    """
+
+    mean: Array | None = None
+    root: Array | None = None
+    pose: PosePrior | None = None
+    rig: PosePrior | None = None
+
+
+def adjust(
+    data: RigViews, state: RigState, free: Sequence[str], prior: Prior | None = None,
+    held: Collection[str] = (),
+) -> RigState:
+    """Fit poses, rig, free intrinsics and effect values together, from a state on.
+
+    held: effects whose values stay what they are.
+    """
+    problem = _Adjustment(data, state, free, held, prior)
+    return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
+
+
+def adjust_poses(data: RigViews, state: RigState) -> RigState:
+    """Fit the poses of the frames alone."""
+    problem = _Adjustment(data, state, (), held=None)
+    return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
+
+
+def gauss_newton(
+    linear: Linearization, solve: Callable[[Array], tuple[Array, Array]], tolerance: float
+) -> RigState:
+    """Fit as `adjust` does, under a covariance of the residuals that the caller knows.
+
+    solve: returns the step of poses (F, 6) and of what is shared (K,) from residuals (F, M),
+    by the columns of this linearization, which change little.  tolerance: of what a step moves
+    predictions by, root mean square, whitened.
+    """
+    data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
+    limit = _MAX_RISE * float((residual**2).sum())
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        frame, shared = solve(residual)
+        change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
+        after = partial(_after_part, state, free, frame, shared)
+        state, residual = shorten_step(data, free, after, limit)
+        if np.sqrt((change**2).mean()) < tolerance:
+            break
+    return state
+
+
+def _after_part(
+    state: RigState, free: Sequence[str], frame: Array, shared: Array, part: float
+) -> RigState:
+    return state.retract(free, part * frame, part * shared)
+
+
+def shorten_step(
+    data: RigViews, free: Sequence[str], after: Callable[[float], RigState],
+    limit: float = np.inf,
+) -> tuple[RigState, Array]:
+    """Return the state after so much of a step that all points are seen, and its residual (F, M).
+
+    A step far beyond where the columns hold may take points out of sight, or lead away from them.
+    after: makes a state of a fraction of the step; limit: of the sum of squares.
+    """
+    for part in _STEP_FRACTIONS:
+        state = after(part)
+        residual = Linearization(data, state, free).residual
+        squares = float((residual**2).sum())
+        if np.isfinite(squares) and squares <= limit:
+            break
+    return state, residual
+
+
+class AdjustedLens(NamedTuple):
+    """A lens and its V views after adjustment.
+
+    covariance (K, K) of the parameters `names`; pose: camera in the target frame (V,), with
+    pose_covariance (V, 6, 6) of the change in `Pose.retract`; both for noise of 1 / weight;
+    residual (V, N, 2), px, measured minus predicted, NaN for padding; cost (V,): whitened sums of
+    squares; converged.
+    """
+
+    lens: Lens
+    names: tuple[str, ...]
+    covariance: Array
+    pose: Pose
+    pose_covariance: Array
+    residual: Array
+    cost: Array
+    converged: bool
+
+
+def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> AdjustedLens:
+    """Adjust named parameters of a lens and the poses (V,) of its views together.
+
+    Raises GeometryError where a start lies outside the domain of the lens or the views do not
+    determine the parameters.
+    """
+    data, state = RigViews.of_one_camera(views), RigState(pose, identity(1), lens, None)
+    problem = _Adjustment(data, state, names)
+    solved = levenberg_marquardt(problem, problem.pack([state]), MAX_LENS_ITERATIONS)
+    if not np.isfinite(solved.cost[0]):
+        raise GeometryError(
+            f'lens {lens.name!r} cannot image all landmarks from the start poses; check that '
+            'landmarks, image points and image size belong together'
+        )
+    fitted = problem.unpack(solved.state)
+    linear = Linearization(data, fitted, names)
+    _, arrow = _equations(linear, linear.shared_columns)
+    _check_determined(arrow, names)
+    covariance = arrow_covariance(arrow)
+    residual = np.where(views.used[..., None], views.uv - linear.linear.uv, np.nan)
+    return AdjustedLens(
+        fitted.lens, tuple(names), covariance.shared[0], fitted.pose, covariance.blocks[0],
+        residual, (linear.residual**2).sum(axis=1), bool(solved.converged[0]),
+    )
+
+
+def adjust_lens_from(
+    lens: Lens, views: Views, pose: Pose, values: Array, names: Sequence[str],
+    max_iterations: int,
+) -> Lens:
+    """Return the lens that fits best of those adjusted from S starts: pose (S, V), values (S, K).
+
+    names: of the K parameters; a start outside the lens's domain is left as it is.
+    """
+    states = [RigState(pose.take(i), identity(1), lens.with_parameters(names, one.tolist()), None)
+              for i, one in enumerate(values)]
+    problem = _Adjustment(RigViews.of_one_camera(views), states[0], names)
+    solved: Minimum = levenberg_marquardt(problem, problem.pack(states), max_iterations)
+    return problem.unpack(solved.state, int(np.argmin(solved.cost))).lens
+
+
+class _Adjustment:
+    """S arrow systems, see least_squares.Problem: frames are blocks, all else is shared."""
+
+    step = staticmethod(arrow_step)
+
+    def __init__(
+        self, data: RigViews, template: RigState, free: Sequence[str],
+        held: Collection[str] | None = (), prior: Prior | None = None,
+    ) -> None:
+        """Take what to fit; held: effects that stay as they are, None for all but the poses."""
+        self._data, self._template, self._free = data, template, tuple(free)
+        self._prior = prior or Prior()
+        moving = [np.full(6 * (data.cameras - 1) + len(self._free), held is not None)]
+        moving += [np.full(len(values), held is not None and effect.name not in held)
+                   for effect, values in template.terms or () if is_shared(effect)]
+        self._moving = np.concatenate(moving)
+
+    def pack(self, states: Sequence[RigState]) -> Arrays:
+        """Return the states as rotations and positions of poses and rig, and shared values."""
+        parts = [(*one.pose, *one.rig, one.shared_values(self._free)) for one in states]
+        return tuple(np.stack(arrays) for arrays in zip(*parts, strict=True))
+
+    def unpack(self, packed: Arrays, system: int = 0) -> RigState:
+        """Return one of the states."""
+        rotation, position, rig_rotation, rig_position, values = (a[system] for a in packed)
+        state = replace(self._template, pose=Pose(rotation, position),
+                        rig=Pose(rig_rotation, rig_position))
+        return state.with_shared_values(self._free, values)
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        if not len(index):
+            return np.zeros(0), ()
+        costs, systems = zip(*(self._system(self.unpack(state, i)) for i in range(len(index))),
+                             strict=True)
+        return (np.concatenate(costs),
+                tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)))
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        frame, shared = step
+        rotation, position, rig_rotation, rig_position, values = state
+        cameras = 6 * (self._data.cameras - 1)
+        move = np.zeros((len(shared), self._data.cameras, 6))
+        move[:, 1:] = shared[:, :cameras].reshape(len(shared), -1, 6)
+        return (
+            *Pose(rotation, position).retract(frame),
+            *Pose(rig_rotation, rig_position).retract(move),
+            values + shared[:, cameras:],
+        )
+
+    def _system(self, state: RigState) -> tuple[Array, Arrays]:
+        """Return cost (1,) and normal equations of one state, infinite for an impossible lens."""
+        if any(lens.check() for lens in state.lenses):
+            return np.array([np.inf]), self._empty_equations()
+        linear = Linearization(self._data, state, self._free)
+        if self._moving.any():
+            # A column of zeros leaves its parameter where it is.
+            shared = linear.shared_columns * self._moving
+        else:
+            shared = np.zeros((*linear.residual.shape, len(self._moving)))
+        return self._with_prior(state, *_equations(linear, shared))
+
+    def _empty_equations(self) -> Arrays:
+        frames, count = self._data.frames, len(self._moving)
+        return tuple(np.zeros((1, *shape)) for shape in (
+            (frames, 6, 6), (frames, 6, count), (count, count), (frames, 6), (count,)))
+
+    def _with_prior(
+        self, state: RigState, cost: Array, normal: Arrays
+    ) -> tuple[Array, Arrays]:
+        blocks, _, shared, block_gradient, shared_gradient = (array[0] for array in normal)
+        prior, cameras = self._prior, 6 * (self._data.cameras - 1)
+        if prior.mean is not None and prior.root is not None:
+            off = prior.root @ (state.shared_values(self._free) - prior.mean)
+            cost = cost + off @ off
+            shared[cameras:, cameras:] += prior.root.T @ prior.root
+            shared_gradient[cameras:] += prior.root.T @ off
+        if prior.pose is not None:
+            off, columns = _pose_rows(prior.pose, state.pose)
+            cost = cost + (off**2).sum()
+            blocks += np.swapaxes(columns, -1, -2) @ columns
+            block_gradient += (off[:, None] @ columns)[:, 0]
+        if prior.rig is not None:
+            off, columns = _pose_rows(prior.rig, state.rig.take(np.s_[1:]))
+            cost = cost + (off**2).sum()
+            for i, (one, row) in enumerate(zip(columns, off, strict=True)):
+                mine = slice(6 * i, 6 * i + 6)
+                shared[mine, mine] += one.T @ one
+                shared_gradient[mine] += row @ one
+        return cost, normal
+
+
+def _pose_rows(prior: PosePrior, pose: Pose) -> tuple[Array, Array]:
+    """Return residuals (P, R) of poses (P,) and their derivatives (P, R, 6) by `retract`."""
+    change = pose.difference(prior.mean)
+    columns = prior.root.copy()
+    columns[..., 3:] = prior.root[..., 3:] @ _log_derivative(change[..., 3:])
+    return (prior.root @ change[..., None])[..., 0], columns
+
+
+def _log_derivative(vector: Array) -> Array:
+    """Return d log(exp(e) exp(v)) / de (..., 3, 3) of rotation vectors v (..., 3), at e = 0.
+
+    The inverse of the left Jacobian of SO(3): Barfoot, State Estimation for Robotics, (7.76).
+    """
+    half = np.maximum(np.linalg.norm(vector, axis=-1) / 2, 1e-6)[..., None, None]
+    k = cross_matrix(vector)
+    return np.asarray(np.eye(3) - k / 2 + (1 - half / np.tan(half)) / (4 * half**2) * (k @ k))
+
+
+def _equations(linear: Linearization, shared: Array) -> tuple[Array, Arrays]:
+    """Return cost (1,) and arrow of a linearization with shared columns (F, M, K)."""
+    residual, block = linear.residual, linear.frame_columns
+    cost = float((residual**2).sum())
+    if not np.isfinite(cost):
+        residual, block, shared = (np.zeros_like(a) for a in (residual, block, shared))
+        cost = np.inf
+    flat = shared.reshape(residual.size, shared.shape[-1])
+    transposed = np.ascontiguousarray(np.swapaxes(block, -1, -2))
+    equations = ArrowEquations(
+        (transposed @ block)[None],
+        (transposed @ shared)[None],
+        (flat.T @ flat)[None],
+        -(transposed @ residual[..., None])[None, ..., 0],
+        -(flat.T @ residual.ravel())[None],
+    )
+    return np.array([cost]), tuple(equations)
+
+
+def _check_determined(normal: Arrays, names: Sequence[str]) -> None:
+    diagonal = np.diagonal(ArrowEquations(*normal).shared[0])
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    relative = arrow_information(normal)[0] / (scale[:, None] * scale)
+    values, vectors = np.linalg.eigh(relative - np.diag(diagonal == 0))
+    if len(names) and values[0] < _UNDETERMINED_EIGENVALUE:
+        name = names[int(np.argmax(np.abs(vectors[:, 0])))]
+        raise GeometryError(
+            f'{name} cannot be told from the poses in these views; fix it, or add views in which '
+            'the target is tilted and covers the image'
+        )
