@@ -31,6 +31,8 @@ _HOMES = {
     'sweep': 'library',
     'diagnose': 'library',
     'budget': 'library',
+    'undistort_maps': 'library',
+    'rectify_maps': 'library',
 }
 __all__ = [*_HOMES]
 

@@ -12,10 +12,12 @@ from fisheye_svp_ros.library import diagnose as diagnose
 from fisheye_svp_ros.library import load_lens as load_lens
 from fisheye_svp_ros.library import localize as localize
 from fisheye_svp_ros.library import project as project
+from fisheye_svp_ros.library import rectify_maps as rectify_maps
 from fisheye_svp_ros.library import save_lens as save_lens
 from fisheye_svp_ros.library import simulate_scenario as simulate_scenario
 from fisheye_svp_ros.library import stereo_depth as stereo_depth
 from fisheye_svp_ros.library import sweep as sweep
+from fisheye_svp_ros.library import undistort_maps as undistort_maps
 from fisheye_svp_ros.optics.lens import Lens as Lens
 from fisheye_svp_ros.pose import Pose as Pose
 from fisheye_svp_ros.scene.observations import Observations as Observations

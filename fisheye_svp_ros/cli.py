@@ -36,6 +36,7 @@ COMMANDS = {
     'run': 'one node, as `ros2 run` starts it',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
     'table': 'a recording to a table, one row an input stamp',
+    'undistort': 'photographs and stereo pairs as ideal cameras take them; maps for cv2.remap',
     'watch': 'the results of running nodes, live, in the terminal',
 }
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')

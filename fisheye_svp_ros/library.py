@@ -25,6 +25,9 @@ from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rectify.cameras import camera_for
+from fisheye_svp_ros.rectify.maps import RANGE, Rectification
+from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
 from fisheye_svp_ros.scene.observations import Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
@@ -402,6 +405,38 @@ def budget(
     """
     setup = budgets.Setup(load_lens(lens), rig(style, baseline), noise_px)
     return Budgeted(*budgets.make_budget(setup))
+
+
+def undistort_maps(
+    lens: AnyLens, projection: str = 'pinhole', *, size: tuple[int, int] | None = None,
+    field_of_view: float | None = None, range_m: float = RANGE,
+) -> Rectification:
+    """Return what maps photographs to an ideal camera: `maps` for cv2.remap, `k`, `p`, `remap`.
+
+    projection: pinhole, cylindrical, equirectangular or fisheye (equidistant); size: width,
+    height, px; field_of_view: over the width, rad; range_m: where the maps are exact, if the
+    viewpoint of the lens moves.
+    Raises ParameterError for what no such camera has.
+    """
+    lens = load_lens(lens)
+    return Rectification(lens, camera_for([lens], projection, size, field_of_view), range_m)
+
+
+def rectify_maps(
+    left: AnyLens, right: AnyLens, rig: Pose, projection: str = 'pinhole', *,
+    size: tuple[int, int] | None = None, field_of_view: float | None = None,
+    range_m: float = RANGE,
+) -> RectifiedPair:
+    """Return what maps both photographs of a rig (the left camera in the right one) to rows.
+
+    Its `left` and `right` are as of `undistort_maps`; a point at range_m, from the middle of the
+    baseline, is in the same row of both.
+    Raises ParameterError as `undistort_maps` does, GeometryError for cameras that do not stand
+    side by side.
+    """
+    lenses = load_lens(left), load_lens(right)
+    camera = camera_for(lenses, projection, size, field_of_view, along_baseline=True)
+    return rectify_pair(*lenses, rig, camera, range_m)
 
 
 def _check_names(node: str, values: Mapping[str, Any]) -> None:

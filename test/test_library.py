@@ -60,13 +60,14 @@ def test_names_are_there_and_typed_and_no_modules() -> None:
         _ = fsvp.nonsense
 
 
-@pytest.mark.parametrize(('page', 'blocks'), [('library.md', 6), ('conventions.md', 1)])
+@pytest.mark.parametrize(('page', 'blocks'), [
+    ('reference/library.md', 6), ('reference/conventions.md', 1), ('how_to/undistort.md', 1)])
 def test_a_page_runs_as_printed(
     page: str, blocks: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    found = _BLOCK.findall((ROOT / 'docs' / 'reference' / page).read_text())
+    found = _BLOCK.findall((ROOT / 'docs' / page).read_text())
     assert len(found) == blocks
     for code, expected in found:
         printed = io.StringIO()

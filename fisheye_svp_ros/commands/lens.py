@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,9 @@ from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, wri
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import PORT, Lens
+from fisheye_svp_ros.rectify.maps import MAX_RANGE
+from fisheye_svp_ros.rectify.svp import nearest_svp_lens
+from fisheye_svp_ros.reporting.tables import print_table, range_text
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
 _AROUND = np.radians(np.arange(0, 360, 15))  # the axis
@@ -32,12 +36,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
                         help='form of the file to write; by default a lens file of this package')
+    parser.add_argument('--range', type=float, metavar='M', dest='range_m',
+                        help='of a lens whose viewpoint moves: fit the curve of the form, which '
+                        'has one viewpoint, to points at this range, m, or inf')
 
 
 def run(args: argparse.Namespace) -> None:
     """Show the lens, write it, say what the form cannot hold."""
     if args.format and not args.output:
         raise ParameterError(f'--format {args.format}: name the file to write, -o FILE')
+    if args.range_m is not None and not args.format:
+        raise ParameterError(f'--range {args.range_m:g}: name the form to write, --format ros')
     path = lens_path(args.lens)
     foreign = read_lens_file(path)
     if foreign is not None and not foreign.lenses and not args.format:
@@ -63,13 +72,24 @@ def run(args: argparse.Namespace) -> None:
                       'at worst')
         _rigs(foreign)
     if args.output and args.format:
-        text = write_foreign(lens, args.format)
-        write_text(args.output, text)
-        written = read_foreign(args.output, text)
-        if written is not None:
-            _lost(lens, next(iter(written.lenses.values())))
+        _convert(lens, args)
     elif args.output:
         save_lens(lens, args.output)
+
+
+def _convert(lens: Lens, args: argparse.Namespace) -> None:
+    """Write another tool's form of the lens, or of the nearest SVP lens; say what that loses."""
+    given, ranges = lens, _RANGES
+    if args.range_m is not None:
+        given, worst = nearest_svp_lens(lens, args.range_m)
+        ranges = tuple(sorted({*_RANGES, args.range_m}))
+        print(f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off at '
+              'worst there')
+    text = write_foreign(given, args.format)
+    write_text(args.output, text)
+    written = read_foreign(args.output, text)
+    if written is not None:
+        _lost(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
 
 
 def _rigs(foreign: Foreign) -> None:
@@ -78,10 +98,8 @@ def _rigs(foreign: Foreign) -> None:
               + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
 
 
-def _lost(lens: Lens, written: Lens) -> None:
-    """Say what the form does not hold, px, by angle and range."""
-    from fisheye_svp_ros.reporting.tables import print_table
-
+def _lost(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool) -> None:
+    """Say what the form does not hold, px, by angle and range; or how that could be less."""
     port = () if lens.port is None else (PORT,)
     own = [name for name in lens.corrections if name not in written.corrections]
     named = [name for name in (*port, *own, *lens.target) if name != LANDMARKS]
@@ -93,11 +111,14 @@ def _lost(lens: Lens, written: Lens) -> None:
     theta = np.radians(angles)[:, None]
     around = np.stack(np.broadcast_arrays(
         np.sin(theta) * np.cos(_AROUND), np.sin(theta) * np.sin(_AROUND), np.cos(theta)), axis=-1)
-    points = np.array(_RANGES)[:, None, None] * around[:, None]
+    distance = np.minimum(ranges, MAX_RANGE)
+    points = distance[:, None, None] * around[:, None]
     off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
     worst = np.fmax.reduce(off, axis=-1)
     if np.fmax.reduce(worst, axis=None) > _SEEN:
         print_table('without it image points are off by up to, px',
-                    ('deg', *(f'{distance:g} m' for distance in _RANGES)),
+                    ('deg', *map(range_text, ranges)),
                     [(str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
                      for angle, row in zip(angles, worst, strict=True)])
+        if as_it_stands and 'the viewpoint shift' in named:
+            print('  --range M fits the curve to points at a range, and leaves nothing there')

@@ -49,14 +49,17 @@ class Photograph:
     t: float
     data: Path | bytes | Pixels
 
-    def pixels(self) -> Pixels:
-        """Return the image in grey; raise ObservationError, one line, where there is none."""
+    def pixels(self, color: bool = False) -> Pixels:
+        """Return the image in grey; raise ObservationError, one line, where there is none.
+
+        color: of a colored image file blue, green and red, (H, W, 3).
+        """
         if isinstance(self.data, np.ndarray):
             return self.data
         data = self.data
         if isinstance(data, Path):
             data = read_bytes(data, ObservationError)
-        return decoded(data, self.name)
+        return decoded(data, self.name, color)
 
 
 def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
@@ -118,12 +121,15 @@ def is_photographs(path: Path) -> bool:
     return path.suffix.lower() in (*IMAGES, *VIDEOS)
 
 
-def decoded(data: bytes, name: str) -> Pixels:
+def decoded(data: bytes, name: str, color: bool = False) -> Pixels:
     """Return an image file in grey, at its own depth and as its sensor lay: unturned.
+
+    color: of a colored one blue, green and red, (H, W, 3).
 
     Raises ObservationError where it is none, or only part of one.
     """
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    kind = cv2.IMREAD_ANYCOLOR if color else cv2.IMREAD_GRAYSCALE
+    flags = kind | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
         raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
     if data[:2] == b'\xff\xd8' and data.count(b'\xff\xda') > _MOST_SCANS:

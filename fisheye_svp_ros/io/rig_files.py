@@ -8,7 +8,7 @@ from pathlib import Path
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
-from fisheye_svp_ros.io.lens_files import LARGEST
+from fisheye_svp_ros.io.lens_files import LARGEST, read_lens_file
 from fisheye_svp_ros.io.lens_formats import read_foreign
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
@@ -34,3 +34,15 @@ def load_rig(path: str | Path) -> Pose:
     if not foreign.rigs:
         raise LensError(f'{path}: it holds one camera, or no transform between two')
     return foreign.rigs[0]
+
+
+def rig_of_lenses(path: str | Path) -> Pose | None:
+    """Return the rig that a file or folder of two lenses holds, None where it holds none.
+
+    The first camera in the second one.  Raises LensError for a file that cannot be read.
+    """
+    if Path(path).is_dir():
+        file = Path(path) / 'rig.yaml'
+        return load_rig(file) if file.exists() else None
+    foreign = read_lens_file(path)
+    return foreign.rigs[0] if foreign and len(foreign.rigs) == 1 else None

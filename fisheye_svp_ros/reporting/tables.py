@@ -73,6 +73,11 @@ def with_error(value: float, standard_error: float) -> tuple[str, str]:
     return f'{value:.{decimals}f}', f'{standard_error:.{decimals}f}'
 
 
+def range_text(range_m: float) -> str:
+    """Return a range for people, to three digits."""
+    return f'{range_m:.3g} m' if math.isfinite(range_m) else 'infinity'
+
+
 def interval(low: float, high: float) -> str:
     """Return an interval as text, to two digits of its width."""
     width = 0.1 * (high - low)

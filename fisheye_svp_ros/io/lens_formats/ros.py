@@ -7,12 +7,14 @@ capitals).
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError, ObservationError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
@@ -117,15 +119,22 @@ def _lens_of(
 def write(lens: Lens) -> str:
     """Return the lens in this form."""
     near = radial.nearest(lens)
+    k = np.array([[near.fx, skew_of(near), near.cx], [0.0, near.fy, near.cy], [0.0, 0.0, 1.0]])
+    return camera_info_text(near.name, (near.width, near.height), k, 'equidistant',
+                            radial.coefficients(near), np.column_stack([k, np.zeros(3)]))
 
-    def matrix(rows: int, columns: int, data: list[float]) -> dict[str, Any]:
-        return {'rows': rows, 'cols': columns, 'data': data}
 
-    k = [near.fx, skew_of(near), near.cx, 0.0, near.fy, near.cy, 0.0, 0.0, 1.0]
+def camera_info_text(
+    name: str, size: tuple[int, int], k: Array, model: str, d: Sequence[float], p: Array
+) -> str:
+    """Return a camera_info as camera_calibration writes it: k (3, 3), p (3, 4), px and px m."""
+    def matrix(values: Array) -> dict[str, Any]:
+        rows, columns = values.shape
+        return {'rows': rows, 'cols': columns, 'data': values.ravel().tolist()}
+
     return dump_yaml({
-        'image_width': near.width, 'image_height': near.height, 'camera_name': near.name,
-        'camera_matrix': matrix(3, 3, k), 'distortion_model': 'equidistant',
-        'distortion_coefficients': matrix(1, 4, radial.coefficients(near)),
-        'rectification_matrix': matrix(3, 3, [1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0]),
-        'projection_matrix': matrix(3, 4, [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]),
+        'image_width': size[0], 'image_height': size[1], 'camera_name': name,
+        'camera_matrix': matrix(k), 'distortion_model': model,
+        'distortion_coefficients': matrix(np.array([d], dtype=float)),
+        'rectification_matrix': matrix(np.eye(3)), 'projection_matrix': matrix(p),
     }, default_flow_style=None)

@@ -1,0 +1,220 @@
+"""`fisheye-svp undistort`: photographs, and maps for cv2.remap, of ideal cameras; stereo pairs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
+from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.photographs import image_size
+from fisheye_svp_ros.detect.photographs import (
+    Photograph,
+    count_photographs,
+    doubtful_folders,
+    find_photographs,
+)
+from fisheye_svp_ros.errors import ObservationError, ParameterError
+from fisheye_svp_ros.io.files import together, write_bytes, write_json, write_text
+from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
+from fisheye_svp_ros.io.map_files import save_maps
+from fisheye_svp_ros.io.rig_files import load_rig, rig_of_lenses
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.rectify.cameras import PROJECTIONS, camera_for
+from fisheye_svp_ros.rectify.maps import RANGE, Rectification
+from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
+from fisheye_svp_ros.reporting.progress import progress
+from fisheye_svp_ros.reporting.tables import range_text
+from fisheye_svp_ros.reporting.undistort_report import (
+    Remaining,
+    draw_pair,
+    draw_remaining,
+    print_remaining,
+    remaining_document,
+    rows_left,
+    shift_left,
+    tolerated_text,
+)
+
+# What camera_info calls the rectified cameras that it can describe, and its coefficients
+_CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('inputs', nargs='+', metavar='LENS PHOTOS',
+                        help='a lens file, also of other tools, or the name of one that comes '
+                        'with the package; a file or folder with both lenses and the rig of a '
+                        'stereo pair; then photographs: files, folders (left/ and right/ for a '
+                        'rig), videos, recordings; none: maps alone')
+    parser.add_argument('--lens', action='append', metavar='CAMERA=LENS',
+                        help='left=LENS and right=LENS, in place of LENS')
+    parser.add_argument('--rig', metavar='FILE',
+                        help='the rig, where the lens files do not hold it: the left camera in '
+                        'the right one')
+    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+                        help='folder for the photographs, maps.npz and maps.yml (map1 and map2 '
+                        'for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, pictures of '
+                        'what is left, undistort.json; of a rig one for each camera in it')
+    parser.add_argument('--as', choices=PROJECTIONS, default=PROJECTIONS[0], dest='projection',
+                        help='the rectified camera (pinhole); fisheye: equidistant')
+    parser.add_argument('--fov', type=float, metavar='DEG',
+                        help='its field of view over the width; default: 90 of a pinhole, '
+                        'otherwise that of the lens')
+    parser.add_argument('--size', type=image_size, metavar='WxH',
+                        help='size of the rectified images, px; default: that of the photographs')
+    parser.add_argument('--range', type=float, default=RANGE, metavar='M', dest='range_m',
+                        help='range at which the maps are exact where the viewpoint of the lens '
+                        f'moves, m, or inf ({RANGE:g}); of a pair from the middle of the baseline')
+
+
+def run(args: argparse.Namespace) -> None:
+    """Map the photographs, write maps and cameras, say what is left at other ranges."""
+    sides, pair, paths = _rectifications(args)
+    with together(), progress('undistorting', count_photographs(paths)) as done:
+        counts = _write_photographs(sides, pair, paths, args.output, done)
+        left = {name: shift_left(side) for name, side in sides.items() if _has_shift(side.lens)}
+        rows = rows_left(pair) if pair and left else None
+        document: dict[str, Any] = {
+            'as': args.projection, 'range_m': args.range_m,
+            'cameras': {name or side.lens.name: _write_camera(
+                side, name, left.get(name), args.output / name) | {'photographs': counts[name]}
+                for name, side in sides.items()}}
+        if pair:
+            document |= {'baseline_m': pair.baseline,
+                         'rows': remaining_document(rows) if rows else None}
+        if pair and rows:
+            draw_remaining(args.output / 'rows.png', pair.left, rows, 'difference of rows')
+        write_json(args.output / 'undistort.json', document)
+    for name, side in sides.items():
+        _print_camera(side, name, left.get(name))
+    if pair and rows:
+        print_remaining(f'baseline {1000 * pair.baseline:.2f} mm; rows of left and right differ '
+                        'by', rows)
+        print(f'  {tolerated_text(rows)}')
+    print(f'{args.output}: {sum(counts.values())} photographs, maps for cv2.remap')
+
+
+def _has_shift(lens: Lens) -> bool:
+    return lens.viewpoint_shift is not None or lens.port is not None
+
+
+def _rectifications(
+    args: argparse.Namespace
+) -> tuple[dict[str, Rectification], RectifiedPair | None, list[str]]:
+    """Return the rectifications by camera, of a rig also as a pair, and the photographs."""
+    paths = list(args.inputs) if args.lens else args.inputs[1:]
+    lenses = load_lenses(args.lens or args.inputs[:1])
+    for line in doubtful_folders(paths):
+        say(line)
+    photographed = tuple(dict.fromkeys(one.camera for one in find_photographs(paths)))
+    by_camera = _by_camera(photographed, lenses)
+    rig = _rig(args, by_camera)
+    field = None if args.fov is None else float(np.radians(args.fov))
+    wanted = args.projection, args.size, field
+    if rig is None:
+        sides = {name: Rectification(lens, camera_for([lens], *wanted), args.range_m)
+                 for name, lens in by_camera.items()}
+        return sides, None, paths
+    left, right = by_camera.values()
+    camera = camera_for([left, right], *wanted, along_baseline=True)
+    pair = rectify_pair(left, right, rig, camera, args.range_m)
+    return dict(zip(by_camera, (pair.left, pair.right), strict=True)), pair, paths
+
+
+def _by_camera(photographed: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
+    """Return lenses by camera: as the photographs call them, or else as the lenses are called."""
+    names = lenses.names or tuple(lenses)
+    cameras = names if set(photographed) <= set(names) else tuple(sorted(photographed))
+    return lenses_of(cameras, lenses)
+
+
+def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
+    if args.rig:
+        if len(lenses) != 2:
+            raise ParameterError(f'--rig {args.rig}: it is of two cameras, and there are lenses '
+                                 f'of {len(lenses)}; give --lens left=LENS --lens right=LENS')
+        return load_rig(args.rig)
+    if args.lens or len(lenses) != 2:
+        return None
+    return rig_of_lenses(lens_path(args.inputs[0]))
+
+
+def _write_photographs(
+    sides: dict[str, Rectification], pair: RectifiedPair | None, paths: Sequence[str],
+    folder: Path, done: Any,
+) -> dict[str, int]:
+    """Write the rectified photographs, and a picture of the first pair; return how many."""
+    counts = dict.fromkeys(sides, 0)
+    written: set[Path] = set()
+    first: dict[str, tuple[str, Any]] = {}
+    for photograph in find_photographs(paths):
+        try:
+            pixels = photograph.pixels(color=True)
+        except ObservationError as error:
+            say(str(error))
+            continue
+        image = _remap(sides[photograph.camera], photograph, pixels)
+        path = folder / photograph.camera / f'{photograph.key}.png'
+        if path in written:
+            raise ParameterError(f'{photograph.name}: another photograph is called '
+                                 f'{photograph.key}, too; give one folder at a time')
+        written.add(path)
+        write_bytes(path, cv2.imencode('.png', image)[1].tobytes())
+        counts[photograph.camera] += 1
+        first.setdefault(photograph.camera, (photograph.key, image))
+        done()
+    if pair and len(first) == 2:
+        left, right = (first[name] for name in sides)
+        if left[0] == right[0]:
+            draw_pair(folder / 'pair.png', left[1], right[1])
+    return counts
+
+
+def _remap(side: Rectification, photograph: Photograph, pixels: Any) -> Any:
+    try:
+        return side.remap(pixels)
+    except ParameterError as error:
+        raise ParameterError(f'{photograph.name}: {error}') from error
+
+
+def _write_camera(
+    side: Rectification, name: str, left: Remaining | None, folder: Path
+) -> dict[str, Any]:
+    """Write maps, camera and picture of one camera; return its part of undistort.json."""
+    camera, maps = side.camera, side.maps
+    size = camera.width, camera.height
+    save_maps(folder, *maps, side.k, side.rotation, side.p)
+    write_bytes(folder / 'mask.png',
+                cv2.imencode('.png', 255 * maps.mask.astype(np.uint8))[1].tobytes())
+    if camera.projection in _CAMERA_INFO:
+        model, count = _CAMERA_INFO[camera.projection]
+        write_text(folder / 'camera_info.yaml', camera_info_text(
+            name or side.lens.name, size, side.k, model, [0.0] * count, side.p))
+    if left:
+        draw_remaining(folder / 'shift.png', side, left, 'error of image points')
+    return {
+        'lens': side.lens.name, 'size': list(size), 'k': side.k.tolist(),
+        'r': side.rotation.tolist(), 'p': side.p.tolist(),
+        'fov_deg': float(np.degrees(camera.field_of_view)), 'reached': float(maps.mask.mean()),
+        'shift': remaining_document(left) if left else None}
+
+
+def _print_camera(side: Rectification, name: str, left: Remaining | None) -> None:
+    camera = side.camera
+    print(f'{name or side.lens.name}: {camera.projection} {camera.width}x{camera.height} px, '
+          f'f {camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
+          f'{100 * side.maps.mask.mean():.1f} % of the pixels are reached')
+    if left is None:
+        print('  the lens has one viewpoint: the maps hold at every range')
+        return
+    print_remaining(f'{f"{name}: " * bool(name)}the maps hold at {range_text(side.range)}; '
+                    'elsewhere the shift leaves', left)
+    print(f'  {tolerated_text(left)}')

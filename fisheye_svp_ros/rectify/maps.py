@@ -1,0 +1,163 @@
+"""Maps for cv2.remap: where each pixel of a rectified image lies in the photograph.
+
+A pixel's ray starts at the lens's origin.  Where it is `range` away from the center of the
+sphere (the origin itself, or the middle of a baseline), its point goes through the projection of
+the lens, with the viewpoint shift and all corrections: for points at that range the rectified
+image is that of a camera with a single viewpoint, exactly.  Elsewhere the shift leaves an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics import camera
+from fisheye_svp_ros.optics.camera import Image, unique_range
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.rectify.cameras import RectifiedCamera
+
+RANGE = 2.0  # m, where the user names none
+MAX_RANGE = 1e6  # m, as far as any range
+_OUTSIDE_PX = -16.0  # px: further out than the widest interpolation of cv2.remap reaches
+_BLOCK = 20_000  # points at once, whose arrays stay in a processor's cache
+
+Map = NDArray[np.float32]
+
+
+class Maps(NamedTuple):
+    """u, v (H, W), px, of the photograph, for cv2.remap; mask (H, W): a ray reaches the pixel.
+
+    Where none does, u and v lie outside the photograph.
+    """
+
+    u: Map
+    v: Map
+    mask: Mask
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """A lens and the rectified camera to which its photographs are mapped at a range, m.
+
+    rotation (3, 3): from the frame of the lens to the rectified one; offset: of the lens
+    from the center of the sphere of that range, along the rectified x axis, m; baseline: m, to the
+    left camera (of the right one of a pair).
+    Raises ParameterError for a range at which the lens has no image.
+    """
+
+    lens: Lens
+    camera: RectifiedCamera
+    range: float = RANGE
+    rotation: Array = field(default_factory=lambda: np.eye(3))
+    offset: float = 0.0
+    baseline: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not self.range > self.min_range:
+            raise ParameterError(f'range is {self.range:g} m; lens {self.lens.name!r} needs more '
+                                 f'than {self.min_range:.3g} m')
+
+    @property
+    def min_range(self) -> float:
+        """The range, m, beyond which every point has at most one image."""
+        return unique_range(self.lens) + abs(self.offset)
+
+    @property
+    def k(self) -> Array:
+        """The camera matrix (3, 3) of the rectified camera, px."""
+        return self.camera.k
+
+    @property
+    def p(self) -> Array:
+        """The projection matrix (3, 4), px and px m; that of a right camera has -f baseline."""
+        p = np.column_stack([self.k, np.zeros(3)])
+        p[0, 3] = -self.camera.f * self.baseline + 0.0
+        return p
+
+    @cached_property
+    def maps(self) -> Maps:
+        """The maps of the whole rectified image."""
+        width, height = self.camera.width, self.camera.height
+        image = np.empty((2, height, width), np.float32)
+        mask = np.empty((height, width), np.bool_)
+        columns, rows = np.arange(width, dtype=float), np.arange(height, dtype=float)[:, None]
+        step = max(_BLOCK // width, 1)
+        for start in range(0, height, step):
+            part = slice(start, start + step)
+            uv, seen = self.image_points(self.camera.directions(columns, rows[part]), self.range)
+            uv[~seen] = _OUTSIDE_PX
+            image[:, part] = np.moveaxis(uv, -1, 0)
+            mask[part] = (
+                (uv[..., 0] >= 0) & (uv[..., 0] <= self.lens.width - 1)
+                & (uv[..., 1] >= 0) & (uv[..., 1] <= self.lens.height - 1))
+        return Maps(image[0], image[1], mask)
+
+    def remap(self, pixels: NDArray[Any], interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
+        """Return the rectified image of a photograph (H, W) or (H, W, C); 0 where no ray reaches.
+
+        Raises ParameterError for a photograph of another size than that of the lens.
+        """
+        height, width = pixels.shape[:2]
+        if (width, height) != (self.lens.width, self.lens.height):
+            raise ParameterError(
+                f'image of {width}x{height} px, and lens {self.lens.name!r} is of '
+                f'{self.lens.width}x{self.lens.height} px; give the lens of this camera at this '
+                'size')
+        found = cv2.remap(pixels, self.maps.u, self.maps.v, interpolation)
+        return np.asarray(found)
+
+    def image_points(self, directions: Array, range_m: float) -> Image:
+        """Project points at a range in rectified directions (..., 3) through the lens."""
+        return self.project(self.scene_points(directions, range_m))
+
+    def scene_points(self, directions: Array, range_m: float) -> Array:
+        """Return points (..., 3), m, in the frame of the lens, at a range in rectified directions.
+
+        The range is the distance from the center of the sphere.
+        """
+        return meet_sphere(np.zeros(3), directions, self._center, range_m) @ self.rotation
+
+    @cached_property
+    def project(self) -> Callable[[Array], Image]:
+        """The projection of points (..., 3), m, in the frame of the lens, with its corrections."""
+        model = self._model
+        return partial(camera.project, model.lens) if model.plain else model.project
+
+    def rectified_points(self, uv: Array) -> Array:
+        """Return rectified pixels (..., 2) of image points (..., 2), px, where the maps have them.
+
+        NaN where the lens has no ray.
+        """
+        rays = self._model.back_project(uv.reshape(1, -1, 2)).shaped(uv.shape[:-1])
+        turn = self.rotation.T
+        places = meet_sphere(rays.origin @ turn, rays.direction @ turn, self._center, self.range)
+        return self.camera.project(places)
+
+    @cached_property
+    def _model(self) -> ForwardModel:
+        # Corrections of a target are of no scene; rows are exposed together in a still camera.
+        return ForwardModel(replace(self.lens, target={})).still()
+
+    @property
+    def _center(self) -> Array:
+        return np.array([-self.offset, 0.0, 0.0])
+
+
+def meet_sphere(origin: Array, direction: Array, center: Array, radius: float) -> Array:
+    """Return where rays (..., 3) from inside a sphere leave it; direction: unit; m."""
+    radius = min(radius, MAX_RANGE)
+    apart = origin - center
+    if not apart.any():
+        return np.asarray(origin + radius * direction)
+    toward = np.sum(apart * direction, axis=-1)
+    reach = np.sqrt(toward**2 + radius**2 - np.sum(apart * apart, axis=-1)) - toward
+    return np.asarray(origin + reach[..., None] * direction)

@@ -1,0 +1,154 @@
+"""What undistortion leaves of errors at other ranges: tables, pictures, undistort.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.io.files import write_bytes
+from fisheye_svp_ros.rectify.errors import (
+    LIMIT,
+    ImageError,
+    PairError,
+    image_error,
+    pair_error,
+    quantiles,
+    search_ranges,
+    table_ranges,
+    tolerated_ranges,
+)
+from fisheye_svp_ros.rectify.maps import Rectification
+from fisheye_svp_ros.rectify.stereo import RectifiedPair
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
+from fisheye_svp_ros.reporting.tables import print_table, range_text
+
+_LINES = 16  # across a drawn pair
+_MAX_SIZE = 1600  # px, of a drawn pair
+_ORANGE = (40, 123, 224)  # BGR
+
+
+class Remaining(NamedTuple):
+    """Errors that are left at ranges: those of a table (R,), m, and of a curve (S,), m.
+
+    table (R, 3), curve (S, 3), px: median, 95 % and largest; tolerated (2,), m: the ranges about
+    that of the maps with errors of up to LIMIT; depth (R, 3): of a pair, relative; map_range, m:
+    that of errors map_px (N,) at pixels map_uv (N, 2).
+    """
+
+    ranges: Array
+    table: Array
+    curve_ranges: Array
+    curve: Array
+    tolerated: Array
+    map_range: float
+    map_uv: Array
+    map_px: Array
+    depth: Array | None = None
+
+
+def shift_left(side: Rectification) -> Remaining:
+    """Return what the viewpoint shift leaves at other ranges than that of the maps."""
+    error = image_error(side, table_ranges(side))
+    curve = image_error(side, search_ranges(side))
+    return _remaining(side, error, error.px, curve.ranges, curve.px)
+
+
+def rows_left(pair: RectifiedPair) -> Remaining:
+    """Return how rows of both images differ at other ranges than that of the maps."""
+    error = pair_error(pair, table_ranges(pair.left))
+    curve = pair_error(pair, search_ranges(pair.left))
+    left = _remaining(pair.left, error, error.row, curve.ranges, curve.row)
+    return left._replace(depth=quantiles(error.depth))
+
+
+def _remaining(
+    side: Rectification, error: ImageError | PairError, px: Array, curve_ranges: Array,
+    curve_px: Array,
+) -> Remaining:
+    table = quantiles(px)
+    worst = int(np.nanargmax(table[:, 2]))
+    return Remaining(
+        error.ranges, table, curve_ranges, quantiles(curve_px),
+        tolerated_ranges(curve_ranges, curve_px, side.range), float(error.ranges[worst]),
+        error.pixels, np.abs(px[worst]))
+
+
+def print_remaining(title: str, left: Remaining) -> None:
+    """Print the errors by range."""
+    header = ['range', 'median, px', '95 %, px', 'worst, px']
+    rows = [[range_text(r), *(_number(value, 3) for value in row)]
+            for r, row in zip(left.ranges, left.table, strict=True)]
+    if left.depth is not None:
+        header += ['depth error, median, %', '95 %, %']
+        for row, depth in zip(rows, left.depth, strict=True):
+            row += [_number(100 * value, 2) for value in depth[:2]]
+    print_table(title, header, rows)
+
+
+def tolerated_text(left: Remaining) -> str:
+    """Say at which ranges the errors stay below the limit."""
+    near, far = left.tolerated
+    return f'below {LIMIT:g} px from {range_text(near)} to {range_text(far)}'
+
+
+def remaining_document(left: Remaining) -> dict[str, Any]:
+    """Return the mapping of one part of undistort.json; null is infinity among ranges."""
+    names = ('median_px', 'p95_px', 'worst_px')
+    document = {'ranges_m': left.ranges.tolist(),
+                **{name: left.table[:, i].tolist() for i, name in enumerate(names)},
+                'below_px': LIMIT, 'below_m': left.tolerated.tolist()}
+    if left.depth is not None:
+        document |= {'depth_median': left.depth[:, 0].tolist(),
+                     'depth_p95': left.depth[:, 1].tolist()}
+    return document
+
+
+def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) -> None:
+    """Draw the errors over the range, and over the image where the table has the largest."""
+    with picture(path, 10.0, 4.0) as figure:
+        curve, image = figure.subplots(1, 2)
+        near = np.isfinite(left.curve_ranges)
+        for i, (name, color) in enumerate((('median', FAINT), ('95 %', OURS),
+                                           ('worst', PUBLISHED))):
+            curve.plot(left.curve_ranges[near], left.curve[near, i], color=color, label=name)
+        curve.axhline(LIMIT, color='#404850', linestyle='--', linewidth=0.9)
+        if np.isfinite(side.range):
+            curve.axvline(side.range, color='#404850', linestyle=':', linewidth=0.9)
+        top = np.fmax.reduce(left.table[:, 2])
+        curve.set(xscale='log', xlabel='range, m', ylabel=f'{what}, px', ylim=(0, 1.1 * top),
+                  title=tolerated_text(left))
+        curve.xaxis.set_major_formatter('{x:g}')
+        curve.legend()
+        seen = np.isfinite(left.map_px)
+        shown = image.scatter(*left.map_uv[seen].T, c=left.map_px[seen], s=14, marker='s',
+                              cmap='Blues', vmin=0.0)
+        figure.colorbar(shown, ax=image, label=f'{what}, px')
+        image.set(xlim=(-0.5, side.camera.width - 0.5), ylim=(side.camera.height - 0.5, -0.5),
+                  aspect='equal', xlabel='u, px', ylabel='v, px',
+                  title=f'over the image, at {range_text(left.map_range)}')
+        image.grid(visible=False)
+
+
+def draw_pair(path: Path, left: NDArray[Any], right: NDArray[Any]) -> None:
+    """Draw two rectified images side by side, with rows across both."""
+    both = np.concatenate([_in_color(left), _in_color(right)], axis=1)
+    zoom = min(_MAX_SIZE / both.shape[1], 1.0)
+    both = cv2.resize(both, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
+    for row in np.linspace(0, both.shape[0] - 1, _LINES + 2)[1:-1].round().astype(int).tolist():
+        cv2.line(both, (0, row), (both.shape[1] - 1, row), _ORANGE, 1)
+    write_bytes(path, cv2.imencode('.png', both)[1].tobytes())
+
+
+def _in_color(image: NDArray[Any]) -> NDArray[np.uint8]:
+    if image.dtype != np.uint8:
+        image = cv2.convertScaleAbs(image, alpha=255 / max(float(image.max()), 1.0))
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if image.ndim == 2 else image)
+
+
+def _number(value: float, decimals: int) -> str:
+    return f'{value:.{decimals}f}' if np.isfinite(value) else '-'
