@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, note_left_out, say
+from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
     image_sizes,
     measured,
+    search_options,
     sizes_beside,
 )
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
@@ -26,21 +29,14 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
+from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
 from fisheye_svp_ros.reporting.progress import progress, stages
-from fisheye_svp_ros.reporting.tables import UNITS, interval, noise_text, print_table, with_error
+from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
 from fisheye_svp_ros.scene.photograph_names import list_frames
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
 from fisheye_svp_ros.solve.measured import rms_px, sigma_known
 from fisheye_svp_ros.study.solutions import calibrated
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.calibration import Trust
-
-_POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
-
-_ASIDE = 0.1  # of the image, by which a principal point is seldom off its centre
-_MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -63,8 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='the same camera calibrated in air: with --medium or --port the '
                         'place of the port alone is fitted')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
-                        help='lens file to write; covariances go beside it as .calibrate.json; '
-                        'for the cameras left and right a folder, for a lens of each and rig.yaml')
+                        help='lens file to write; covariances go beside it as .calibrate.json, '
+                        'the report as calibration.html; for the cameras left and right a folder, '
+                        'for a lens of each and rig.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -83,32 +80,51 @@ def run(args: argparse.Namespace) -> None:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
         raise ParameterError(f'{args.observations}: the size of the images is not known; add '
                              f'--image-size {head}1280x800')
-    results: dict[str, Calibration] = {}
-    trusts: dict[str, Trust] = {}
-    tables: dict[str, Observations] = {}
+    found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
         size = sizes.get(camera) or sizes['']
-        results[camera], tables[camera], trusts[camera] = _calibrated(table, args, size, name)
+        found[camera] = _calibrated(table, args, size, name)
     # Written before a word is printed: nobody may be reading.
     if args.output:
+        from fisheye_svp_ros.reporting.calibration_report import write_calibration_report
+
         with together():
-            for camera, result in results.items():
-                alone = not camera or (len(results) == 1 and args.output.suffix)
-                path = args.output if alone else args.output / f'{camera}.yaml'
-                _write(result, trusts[camera], path)
-    for camera, result in results.items():
-        _report(result, trusts[camera], args.model, tables[camera])
+            paths = {}
+            for camera, one in found.items():
+                alone = not camera or (len(found) == 1 and args.output.suffix)
+                paths[camera] = args.output if alone else args.output / f'{camera}.yaml'
+                _write(one, paths[camera])
+            report = next(iter(paths.values())).parent / 'calibration.html'
+            write_calibration_report(report, found, _next_command(args, paths))
+    for one in found.values():
+        _print(one)
+        for warning in one.warnings:
+            say(warning)
     if pair := rig_cameras(observations.cameras):
-        _rig(observations, results, pair, args.output)
+        lenses = {camera: one.lens for camera, one in found.items()}
+        _rig(observations, lenses, pair, args.output)
+
+
+def _next_command(args: argparse.Namespace, paths: Mapping[str, Path]) -> str:
+    """Return the command that says what is wrong with the lenses, as a shell takes it."""
+    lenses = [word for camera, path in paths.items()
+              for word in ('--lens', f'{camera}={path}' if len(paths) > 1 else str(path))]
+    search = search_options(args) if args.board else ()
+    return shlex.join(['fisheye-svp', 'diagnose', args.observations, *search, *lenses,
+                       '-o', 'diagnosis'])
 
 
 def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
-) -> tuple[Calibration, Observations, Trust]:
-    """Return the lens, the rows that it is of, without gross errors, and what may be trusted."""
-    from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
+) -> CalibratedCamera:
+    """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
+    from fisheye_svp_ros.diagnosis.calibration import (
+        calibrated_without_gross_errors,
+        trust,
+        with_stderr,
+    )
 
     port = port_of(args)
     note_huge(table)
@@ -124,64 +140,29 @@ def _calibrated(
     note_gross_errors(table, gross)
     try:
         with stages('how far it may be trusted'):
-            return result, kept, trust(kept, result.adjusted.lens, result.adjusted.names)
+            trusted = trust(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
         raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
                             f'({cause}); is what the camera looked through another?') from cause
+    lens = with_stderr(result.adjusted.lens, trusted)
+    return CalibratedCamera(lens, result, trusted, kept, args.model)
 
 
-def _report(result: Calibration, trust: Trust, model: str, table: Observations) -> None:
-    """Print the lens, and what there is to say against it; table: what it was fitted to."""
-    _print(result, trust)
-    for name, range_ in trust.doubtful_shift.items():
-        low, high = 1e3 * range_.low, 1e3 * range_.high
-        say(f'{name} is not settled: from {low:.2f} to {high:.2f} mm over all targets that '
-            'these data admit, whose shape can explain it; ask `fisheye-svp diagnose`')
-    note_left_out(table, result.left_out)
-    if not result.adjusted.converged:
-        say('the adjustment has not converged; take the lens for a rough one')
-    rms, sigma = (result.adjusted.lens.calibration or {})['rms_px'], float(np.median(table.sigma))
-    if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
-        say(f'{model} leaves {rms:.1f} px: it does not fit this lens, or image points and '
-            'landmarks do not belong together (order, units, axes, image size)')
-    if result.beyond:
-        say(f'{result.beyond} observations lie beyond max_incidence_deg, where the fitted curve '
-            'turns back; another model may suit this lens')
-    _report_image(result)
-
-
-def _report_image(result: Calibration) -> None:
-    """Say where the image of the lens lies askew, or was not covered."""
-    lens, views = result.adjusted.lens, result.views
-    off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
-    if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:
-        say(f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the centre of the image: '
-            'was it cropped, or is the image size another one?')
-    out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
-    edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
-    if out < _MIDDLE * edge:
-        say(f'image points lie within {out:.0f} px of the centre, the nearest edge is at '
-            f'{edge:.0f} px: past {np.degrees(result.reached):.0f} deg nothing holds the curve; '
-            'photograph the target near the edges of the image, too')
-
-
-def _write(result: Calibration, trust: Trust, path: Path) -> None:
-    from fisheye_svp_ros.diagnosis.calibration import with_stderr
-
-    save_lens(with_stderr(result.adjusted.lens, trust), path)
-    write_json(path.with_suffix('.calibrate.json'), _document(result, trust))
+def _write(found: CalibratedCamera, path: Path) -> None:
+    save_lens(found.lens, path)
+    write_json(path.with_suffix('.calibrate.json'), _document(found))
 
 
 def _rig(
-    observations: Observations, results: dict[str, Calibration], names: tuple[str, str],
+    observations: Observations, lenses: Mapping[str, Lens], names: tuple[str, str],
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
     from fisheye_svp_ros.diagnosis.moments import FEWEST, LOOSE
 
-    left, right = (ForwardModel(results[name].adjusted.lens) for name in names)
+    left, right = (ForwardModel(lenses[name]) for name in names)
     try:
-        both = _of_both(observations, {name: results[name].adjusted.lens for name in names})
+        both = _of_both(observations, {name: lenses[name] for name in names})
     except ObservationError as cause:
         say(f'rig: {cause}')
         return
@@ -191,7 +172,7 @@ def _rig(
         say(f'rig: {reason}')
     frames, rms = len(both.frames), rms_px(np.concatenate(
         [residual.reshape(-1, 2) for residual in (fitted.left_residual, fitted.right_residual)]))
-    own = max((results[name].adjusted.lens.calibration or {})['rms_px'] for name in names)
+    own = max((lenses[name].calibration or {})['rms_px'] for name in names)
     if rms > LOOSE * own:
         say(f'rig: with it {rms:.2f} px are left, where the cameras alone leave {own:.2f} px at '
             'most: they moved, were not photographed at the same moments, or a lens is wrong')
@@ -242,46 +223,36 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
     return shared(both.take(~np.isin(np.arange(len(both)), gross.rows)))
 
 
-def _print(result: Calibration, trust: Trust) -> None:
-    lens = result.adjusted.lens
-    figures = lens.calibration or {}
-    errors, ranges = dict(trust.stderr), dict(trust.admissible)
-    if 'f' in errors:
-        errors['fx'] = errors['fy'] = errors['f']
-        ranges['fx'] = ranges['fy'] = ranges['f']
-    open_ones = {name: interval(one.low, one.high) for name, one in ranges.items()
-                 if not one.settled}
+def _print(found: CalibratedCamera) -> None:
+    lens, figures = found.lens, found.lens.calibration or {}
+    open_ones = any(row[3] for row in found.parameter_rows())
     print_table(
         f'{lens.name}: {figures["observations"]} points in {figures["frames"]} frames, '
         f'rms {figures["rms_px"]:.4f} px',
         ('parameter', 'value', 'std. error', *(['with any target'] if open_ones else []), 'unit'),
-        [
-            (name, *with_error(value, errors.get(name, 0.0)),
-             *([open_ones.get(name, '')] if open_ones else []), UNITS.get(name, '1'))
-            for name, value in lens.parameters.items()
-        ],
+        [(name, value, error, *([range_] if open_ones else []), unit)
+         for name, value, error, range_, unit in found.parameter_rows()],
     )
     if open_ones:
         print('  with any target: 95 %, its shape, scale and boards as the data have them and as '
               'they are said to be')
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
-          f'{np.degrees(result.reached):.2f}; {noise_text(result.sigma)}')
+          f'{np.degrees(found.result.reached):.2f}; {noise_text(found.result.sigma)}')
 
 
-def _document(result: Calibration, trust: Trust) -> dict[str, Any]:
-    """Return what scripts may want beside the lens itself."""
-    adjusted = result.adjusted
+def _document(found: CalibratedCamera) -> dict[str, Any]:
+    """Return what scripts may want beside the lens itself; its errors are those of the lens."""
+    adjusted = found.result.adjusted
     return {
-        **(adjusted.lens.calibration or {}),
-        'left_out': result.left_out,
-        'beyond': result.beyond,
-        'sigma_px': result.sigma,
+        **(found.lens.calibration or {}),
+        'left_out': found.result.left_out,
+        'beyond': found.result.beyond,
+        'sigma_px': found.result.sigma,
         'parameters': dict(
             zip(adjusted.names, parameter_values(adjusted.lens, adjusted.names), strict=True)
         ),
-        'covariance': adjusted.covariance.tolist(),
-        'stderr': trust.stderr,
-        'admissible': {name: asdict(range_) for name, range_ in trust.admissible.items()},
+        'admissible': {name: asdict(range_) for name, range_ in found.trust.admissible.items()},
+        'warnings': list(found.warnings),
     }
 
 

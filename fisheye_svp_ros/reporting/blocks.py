@@ -72,5 +72,10 @@ def page(template: str, **values: Any) -> str:
 
 
 def data_uri(path: Path) -> str:
-    """Return a picture as part of a page."""
-    return 'data:image/png;base64,' + base64.b64encode(written(path).read_bytes()).decode('ascii')
+    """Return a picture file as part of a page."""
+    return png_uri(written(path).read_bytes())
+
+
+def png_uri(data: bytes) -> str:
+    """Return a PNG picture as part of a page."""
+    return 'data:image/png;base64,' + base64.b64encode(data).decode('ascii')

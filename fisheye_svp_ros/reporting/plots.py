@@ -36,6 +36,15 @@ _LEGEND_COLUMNS = 4
 @contextmanager
 def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
     """Yield a figure of a size in inches; write it whole when the block succeeds."""
+    drawn = BytesIO()
+    with drawing(drawn, width, height, path.suffix[1:]) as figure:
+        yield figure
+    write_bytes(path, drawn.getvalue())
+
+
+@contextmanager
+def drawing(file: BytesIO, width: float, height: float, form: str = 'png') -> Iterator[Figure]:
+    """Yield a figure of a size in inches; draw it into memory when the block succeeds."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width, height), dpi=150, layout='constrained')
         FigureCanvasAgg(figure)
@@ -45,9 +54,7 @@ def picture(path: Path, width: float, height: float) -> Iterator[Figure]:
         assert engine is not None
         engine.execute(figure)
         figure.set_layout_engine(None)
-        drawn = BytesIO()
-        figure.savefig(drawn, format=path.suffix[1:])
-        write_bytes(path, drawn.getvalue())
+        figure.savefig(file, format=form)
 
 
 def round_number(value: float) -> float:

@@ -1,7 +1,10 @@
 """The command line as a user meets it: results, exit codes, one line of error."""
 
+import html
 import json
 import os
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -20,6 +23,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
+from fisheye_svp_ros.library import calibrate
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
@@ -188,11 +192,13 @@ class TestLocalize:
         assert 'cannot be written' in capsys.readouterr().err
 
 
-def test_frames_that_are_doubtful_alike_are_one_line(capsys):
-    note_doubtful(range(7), ['off by 2 px', '', 'far', *(f'off by {i} px' for i in range(4))])
+def test_frames_that_are_doubtful_alike_are_one_line(scene, capsys):
+    _, _, table = scene
+    reasons = ['off by 2 px', '', 'far', *(f'off by {i} px' for i in range(4))]
+    note_doubtful(table, range(7), reasons)
     said = capsys.readouterr().err.splitlines()
     assert [line.partition('note: ')[2] for line in said] == [
-        'frame 0: off by 2 px', 'frames 3, 4, 5, 6: likewise', 'frame 2: far']
+        'frame 0: off by 2 px', 'frames 3, 4, 5 and 6: likewise', 'frame 2: far']
 
 
 def test_views_that_are_set_aside_as_a_whole_are_named(scene, capsys):
@@ -235,6 +241,30 @@ class TestCalibrate:
         assert list(document['parameters']) == ['f', 'cx', 'cy']
         off = found - (LENS.fx, LENS.cx, LENS.cy)
         assert off @ np.linalg.solve(document['covariance'], off) < 30
+        # One set of standard errors: printed, in the lens, in the JSON, in the library.
+        assert document['stderr'] == pytest.approx(stderr)
+        np.testing.assert_allclose(document['covariance'], covariance)
+        for name, error in stderr.items():
+            printed = re.search(rf'^ *{"fx" if name == "f" else name} +\S+ +(\S+)', shown, re.M)
+            assert float(printed[1]) == pytest.approx(error, rel=0.06)
+        same = calibrate(table, 'equidistant', (1280, 960), ('f', 'cx', 'cy'))
+        np.testing.assert_allclose(np.sqrt(np.diag(same.covariance)), [*stderr.values()], rtol=1e-4)
+
+    def test_the_report_says_what_comes_next_and_that_runs(
+        self, scene, capsys, tmp_path, monkeypatch
+    ):
+        folder, _, _ = scene
+        observations = str(folder / 'observations.csv')
+        assert cli.main(['calibrate', observations, '--model', 'equidistant', '--image-size',
+                         '1280x960', '--free', 'f,cx,cy', '-o', str(tmp_path / 'mine.yaml')]) == 0
+        page = (tmp_path / 'calibration.html').read_text()
+        for heading in ('Parameters', 'Coverage', 'Residuals', 'Uncertainty'):
+            assert f'<h2>{heading}</h2>' in page
+        assert page.count('data:image/png;base64,') == 4 and '<script' not in page
+        command = html.unescape(re.search('<pre>(.*)</pre>', page)[1])
+        monkeypatch.chdir(tmp_path)
+        assert cli.main([*shlex.split(command)[1:], '--quick']) == 0
+        assert (tmp_path / 'diagnosis' / 'report.html').exists()
 
     def test_a_lens_of_the_middle_of_the_image_is_called_so(self, scene, capsys, tmp_path):
         folder, _, table = scene

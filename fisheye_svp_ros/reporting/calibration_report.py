@@ -1,0 +1,144 @@
+"""The report of a calibration: coverage, residuals, uncertainty and warnings on one page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.ray_errors import RANGES, RayModel, ray_model, typical_points
+from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.optics.lens import Lens, parameter_values
+from fisheye_svp_ros.reporting.blocks import page, png_uri
+from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
+from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
+from fisheye_svp_ros.scene.photograph_names import frame_name
+
+_WIDTH = 9.2  # in
+_ARROWS, _TICKS = 2500, 60
+_LONG = 0.03  # of the image, the typical residual
+
+
+def write_calibration_report(
+    path: Path, cameras: Mapping[str, CalibratedCamera], command: str
+) -> None:
+    """Write the page; cameras: by name, '' where there is one alone; command: to go on with.
+
+    Raises OutputError where it cannot be written.
+    """
+    write_text(path, page('calibration.html', command=command, cameras=[
+        _camera(name, one) for name, one in cameras.items()]))
+
+
+def _camera(name: str, one: CalibratedCamera) -> dict[str, Any]:
+    rays = _rays(one)
+    figures = one.lens.calibration or {}
+    return {
+        'name': name, 'lens': one.lens.name, 'source': one.table.source,
+        'points': figures['observations'], 'frames': figures['frames'],
+        'photographs': bool(one.table.photographs), 'rms': figures['rms_px'],
+        'noise': one.result.sigma, 'warnings': one.warnings, 'rows': one.parameter_rows(),
+        'ranged': any(row[3] for row in one.parameter_rows()),
+        'reached': float(np.degrees(one.result.reached)),
+        'errors': [(f'{e.range_m:g}', f'{1e3 * e.value:.2g}', f'{1e3 * e.low:.2g}',
+                    f'{1e3 * e.high:.2g}') for e in rays[1].errors()],
+        'coverage': _drawn(_coverage, one), 'residuals': _drawn(_residuals, one),
+        'frames_picture': _drawn(_frames, one), 'uncertainty': _drawn(_uncertainty, one, *rays),
+    }
+
+
+def _rays(one: CalibratedCamera) -> tuple[Array, RayModel]:
+    """Return image points (G, 2) and how the fitted parameters move their rays."""
+    names = one.result.adjusted.names
+    values = parameter_values(one.lens, names)
+
+    def changed(step: Array) -> Lens:
+        return one.lens.with_parameters(names, [*np.add(values, step).tolist()])
+
+    views = one.result.views
+    uv = typical_points(views.uv[views.used])
+    model, there = ray_model(changed, one.trust.covariance, uv)
+    return uv[there], model
+
+
+def _drawn(draw: Any, *arguments: Any) -> str:
+    drawn = BytesIO()
+    with drawing(drawn, _WIDTH, 3.6) as figure:
+        draw(figure, *arguments)
+    return png_uri(drawn.getvalue())
+
+
+def _image(axis: Any, lens: Lens) -> None:
+    axis.set(xlim=(-0.5, lens.width - 0.5), ylim=(lens.height - 0.5, -0.5), aspect='equal',
+             xlabel='u / px', ylabel='v / px')
+
+
+def _coverage(figure: Any, one: CalibratedCamera) -> None:
+    image, field = figure.subplots(1, 2)
+    views = one.result.views
+    image.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
+    _image(image, one.lens)
+    image.set_title('where image points are')
+    points = one.result.adjusted.pose.into_body(views.points)[views.used]
+    distance = np.linalg.norm(points, axis=-1)
+    field.plot(np.degrees(np.arccos(points[:, 2] / distance)), distance, '.', color=OURS, ms=2)
+    field.axvline(np.degrees(one.lens.max_incidence), color=PUBLISHED, lw=1)
+    field.set(xlabel='incidence angle / deg', ylabel='distance / m', xlim=(0, None),
+              ylim=(0, None), title='angles and distances (line: limit of the lens)')
+
+
+def _residuals(figure: Any, one: CalibratedCamera) -> None:
+    image, angles = figure.subplots(1, 2)
+    views, lens = one.result.views, one.lens
+    uv, residual = views.uv[views.used], one.result.adjusted.residual[views.used]
+    step = max(1, len(uv) // _ARROWS)
+    size = np.linalg.norm(residual, axis=1)
+    typical = max(float(np.quantile(size, 0.9)), 1e-9)
+    key = image.quiver(*uv[::step].T, *residual[::step].T, angles='xy', scale_units='xy',
+                       scale=typical / (_LONG * lens.width), color=OURS, width=0.002)
+    length = round_number(typical)
+    image.quiverkey(key, 0.8, 1.04, length, f'{length:g} px', labelpos='E')
+    _image(image, lens)
+    arm = uv - (lens.cx, lens.cy)
+    radial = (residual * arm).sum(axis=1) / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)
+    points = one.result.adjusted.pose.into_body(views.points)[views.used]
+    theta = np.degrees(np.arccos(points[:, 2] / np.linalg.norm(points, axis=-1)))
+    angles.plot(theta, radial, '.', color=OURS, ms=2, alpha=0.4)
+    parts = np.array_split(np.argsort(theta), max(1, min(16, len(theta) // 8)))
+    angles.plot([theta[p].mean() for p in parts], [radial[p].mean() for p in parts], 'o-',
+                color=PUBLISHED, ms=4, label='means')
+    angles.set(xlabel='incidence angle / deg', ylabel='radial residual / px')
+    angles.legend(loc='upper right')
+
+
+def _frames(figure: Any, one: CalibratedCamera) -> None:
+    axis, views = figure.subplots(), one.result.views
+    squares = np.where(views.used, (one.result.adjusted.residual**2).sum(axis=-1), 0.0)
+    rms = np.sqrt(squares.sum(axis=1) / views.used.sum(axis=1))
+    place = np.arange(len(rms))
+    axis.bar(place, rms, color=OURS)
+    axis.axhline(float(np.median(rms)), color=PUBLISHED, lw=1, label='median')
+    step = -(-len(rms) // _TICKS)
+    names = [frame_name(one.table, frame).removeprefix('frame ')
+             for frame in views.frame[::step].tolist()]
+    axis.set_xticks(place[::step], names, rotation=90, fontsize=7)
+    axis.set(ylabel='rms residual / px', xlabel='' if one.table.photographs else 'frame')
+    axis.legend(loc='upper right')
+
+
+def _uncertainty(figure: Any, one: CalibratedCamera, uv: Array, rays: RayModel) -> None:
+    image, angles = figure.subplots(1, 2)
+    shown = image.scatter(*uv.T, c=1e3 * rays.sd[-1], s=9, cmap='viridis')
+    figure.colorbar(shown, ax=image, label=f'of a ray at {RANGES[-1]:g} m / mrad')
+    _image(image, one.lens)
+    axis = rays.points[-1] / np.linalg.norm(rays.points[-1], axis=-1, keepdims=True)
+    theta = np.degrees(np.arccos(np.clip(axis[:, 2], -1, 1)))
+    for sd, range_m, color in zip(rays.sd, RANGES, (PUBLISHED, FAINT, OURS), strict=True):
+        angles.plot(theta, 1e3 * sd, '.', ms=3, color=color, label=f'at {range_m:g} m')
+    angles.set(xlabel='incidence angle / deg', ylabel='standard error of a ray / mrad',
+               ylim=(0, None))
+    angles.legend()

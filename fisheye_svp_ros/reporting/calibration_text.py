@@ -1,0 +1,98 @@
+"""A calibrated lens in words: its parameters as rows, and what there is to say against it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.tables import UNITS, interval, with_error
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import list_frames
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.diagnosis.calibration import Trust
+    from fisheye_svp_ros.solve.lens_calibration import Calibration
+
+_POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
+_ABOVE = 2.0  # times the noise, from which residuals show a model error
+_ASIDE = 0.1  # of the image, by which a principal point is seldom off its centre
+_MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
+
+
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """One camera's lens with its errors, the fit, its trust, and the table it was fitted to."""
+
+    lens: Lens
+    result: Calibration
+    trust: Trust
+    table: Observations
+    model: str
+
+    def parameter_rows(self) -> list[tuple[str, str, str, str, str]]:
+        """Return name, value, standard error, range over targets ('': settled) and unit.
+
+        Standard errors are those that the lens file holds.
+        """
+        errors = dict((self.lens.calibration or {}).get('stderr', {}))
+        ranges = {name: interval(one.low, one.high)
+                  for name, one in self.trust.admissible.items() if not one.settled}
+        for known in (errors, ranges):
+            if 'f' in known:
+                known['fx'] = known['fy'] = known['f']
+        return [(name, *with_error(value, errors.get(name, 0.0)), ranges.get(name, ''),
+                 UNITS.get(name, '1')) for name, value in self.lens.parameters.items()]
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What there is to say against the lens, a sentence each."""
+        return (*self._of_shift(), *self._of_fit(), *self._of_image())
+
+    def _of_shift(self) -> list[str]:
+        return [
+            f'{name} is not settled: from {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm '
+            'over all targets that these data admit, whose shape can explain it; ask '
+            '`fisheye-svp diagnose`'
+            for name, range_ in self.trust.doubtful_shift.items()]
+
+    def _of_fit(self) -> list[str]:
+        found, result = [], self.result
+        if result.left_out:
+            found.append('left out, since their points do not fix a pose (all near one line, or '
+                         f'of another lens?): {list_frames(self.table, result.left_out)}')
+        if not result.adjusted.converged:
+            found.append('the adjustment has not converged; take the lens for a rough one')
+        rms, sigma = (self.lens.calibration or {})['rms_px'], float(np.median(self.table.sigma))
+        if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
+            found.append(f'{self.model} leaves {rms:.1f} px: it does not fit this lens, or image '
+                         'points and landmarks do not belong together (order, units, axes, image '
+                         'size)')
+        elif np.isfinite(sigma) and rms > _ABOVE * 2**0.5 * sigma:
+            found.append(f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of '
+                         'image points: lens or target has a model error; ask '
+                         '`fisheye-svp diagnose`')
+        if result.beyond:
+            found.append(f'{result.beyond} observations lie beyond max_incidence_deg, where the '
+                         'fitted curve turns back; another model may suit this lens')
+        return found
+
+    def _of_image(self) -> list[str]:
+        """Say where the image of the lens lies askew, or was not covered."""
+        lens, views, found = self.lens, self.result.views, []
+        off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
+        if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:
+            found.append(
+                f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the centre of the '
+                'image: was it cropped, or is the image size another one?')
+        out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
+        edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
+        if out < _MIDDLE * edge:
+            found.append(
+                f'image points lie within {out:.0f} px of the centre, the nearest edge is at '
+                f'{edge:.0f} px: past {np.degrees(self.result.reached):.0f} deg nothing holds the '
+                'curve; photograph the target near the edges of the image, too')
+        return found
