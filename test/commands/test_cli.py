@@ -245,11 +245,12 @@ class TestCalibrate:
         assert document['stderr'] == pytest.approx(stderr)
         np.testing.assert_allclose(document['covariance'], covariance)
         for name, error in stderr.items():
-            printed = re.search(rf'^ *{"fx" if name == "f" else name} +\S+ +(\S+)', shown, re.M)
-            assert float(printed[1]) == pytest.approx(error, rel=0.06)
-        same = calibrate(table, 'equidistant', (1280, 960), ('f', 'cx', 'cy'))
             head = 'fx' if name == 'f' else name
             printed = re.search(rf'^ *{head} +\S+ +(\S+)', shown, re.M)
+            assert float(printed[1]) == pytest.approx(error, rel=0.06)
+        same = calibrate(table, 'equidistant', (1280, 960), ('f', 'cx', 'cy'))
+        errors = np.sqrt(np.diag(same.covariance))
+        np.testing.assert_allclose(errors, [*stderr.values()], rtol=1e-4)
 
     def test_the_report_says_what_comes_next_and_that_runs(
         self, scene, capsys, tmp_path, monkeypatch
