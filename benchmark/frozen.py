@@ -170,8 +170,10 @@ def _content(path: Path, folders: Sequence[str]) -> Any:
             text = text.replace(folder, '')
         return _numbers(_PICTURE.sub(' ', text))
     if path.suffix == '.csv':
-        rows = np.genfromtxt(path, delimiter=',', skip_header=1, dtype=float)
-        return {'rows': len(rows), 'squares': np.nansum(rows**2, axis=0).tolist()}
+        rows = np.genfromtxt(path, delimiter=',', names=True, dtype=None, encoding='utf-8')
+        numbers = [name for name in rows.dtype.names if rows.dtype[name].kind in 'if']
+        return {'rows': len(rows),
+                'squares': {name: float(np.nansum(rows[name] ** 2.0)) for name in numbers}}
     return None
 
 
@@ -180,10 +182,12 @@ def _numbers(text: str) -> list[str]:
 
 
 def differences(before: Any, after: Any, place: str = '') -> Iterator[tuple[str, str]]:
-    """Yield kind (`value` or `words`) and description of what is not the same."""
+    """Yield kind (`value`, `words`, `new`) and description of what is not the same."""
     if isinstance(before, dict) and isinstance(after, dict):
-        for key in [*before, *(key for key in after if key not in before)]:
-            yield from differences(before.get(key), after.get(key), f'{place}/{key}')
+        for key in before:
+            yield from differences(before[key], after.get(key), f'{place}/{key}')
+        yield from (('new', f'{place}/{key}: {str(after[key])[:200]}')
+                    for key in after if key not in before)
     elif isinstance(before, list) and isinstance(after, list) and len(before) == len(after):
         for number, both in enumerate(zip(before, after, strict=True)):
             yield from differences(*both, f'{place}/{number}')
@@ -240,8 +244,9 @@ def compare(folder: Path, names: Sequence[str], workers: int) -> int:
         found = list(differences(before['written'], json.loads(json.dumps(one['written']))))
         values = [text for kind, text in found if kind == 'value']
         count += len(values)
-        words = len(found) - len(values)
-        print(f'{one["name"]}: {len(values)} values differ, {words} sentences')
+        kinds = [kind for kind, _ in found]
+        print(f'{one["name"]}: {len(values)} values differ, {kinds.count("words")} sentences, '
+              f'{kinds.count("new")} are new')
         for kind, text in found:
             print(f'  {kind} {text}')
     print(f'{len(cases)} runs, {count} values differ; {seconds[0]:.0f} s of processors before, '

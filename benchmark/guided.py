@@ -148,7 +148,7 @@ def camera(number: int, picture: Path | None = None) -> dict[str, Any]:
                 raise stand
             guide.adopt(stand)
             stands.append(stand)
-        if guide.finished:
+        if guide.is_finished:
             break
         if moved and not np.isfinite(project(lens, hand.camera.into_body(rim)).uv).all():
             seen, moved = None, False  # a board that leaves the field is not found

@@ -235,12 +235,12 @@ class Guide:
     @property
     def outline(self) -> Array | None:
         """The points of the wanted view (N, 2), px; None while there is none."""
-        if self.stand is None or self.thinking or self.finished:
+        if self.stand is None or self.thinking or self.is_finished:
             return None
         return self.stand.outline[self.place]
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether no further photograph is wanted."""
         return self.stand is not None and (
             self.stand.settled or len(self.session.taken) >= MAX_PHOTOGRAPHS)

@@ -233,29 +233,29 @@ class Design:
         """Return places of chosen shots, best first, and the answer with each one more."""
         chosen: list[int] = []
         for _ in range(count):
-            chosen.append(self._best(question, chosen))
+            chosen.append(self._best_view(question, chosen))
         for _ in range(_EXCHANGES):
             before = list(chosen)
             for i in range(count):
-                chosen[i] = self._best(question, chosen[:i] + chosen[i + 1:])
+                chosen[i] = self._best_view(question, chosen[:i] + chosen[i + 1:])
             if chosen == before:
                 break
         ordered: list[int] = []
         for _ in range(count):
             remaining = [i for i in chosen if i not in ordered]
-            known = self._with(ordered)
+            known = self._information_with(ordered)
             merit = question.merit(known + self.added[remaining])
             ordered.append(remaining[int(np.argmax(merit))])
         return np.array(ordered), [
-            question.answer(self._with(ordered[:i])) for i in range(count + 1)
+            question.answer(self._information_with(ordered[:i])) for i in range(count + 1)
         ]
 
-    def _best(self, question: Criterion, taken: Sequence[int]) -> int:
-        merit = question.merit(self._with(taken) + self.added)
+    def _best_view(self, question: Criterion, taken: Sequence[int]) -> int:
+        merit = question.merit(self._information_with(taken) + self.added)
         merit[list(taken)] = -np.inf
         return int(np.argmax(merit))
 
-    def _with(self, taken: Sequence[int]) -> Array:
+    def _information_with(self, taken: Sequence[int]) -> Array:
         return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
 
 

@@ -95,7 +95,7 @@ def next_photographs(
     seen = pose.into_body(views.points)[views.used]
     reached = float(np.arccos((seen[:, 2] / np.linalg.norm(seen, axis=-1)).min()))
     room = room._replace(field=min(room.field, max_view_angle(after.state.lens, reached)))
-    asked, others, effects = _asked(after, causes, number)
+    asked, others, effects = _choose_question(after, causes, number)
     shots = candidate_shots(after.state, board, room, np.random.default_rng(0))
     design = Design(after, effects, board, shots, noise)
     others = tuple(o for o in others if any(o == n.partition('.')[0] for n in design.names))
@@ -123,7 +123,7 @@ def lens_criterion(design: Design) -> Criterion:
     return Criterion(interest, np.setdiff1d(np.arange(len(design.names)), interest))
 
 
-def _asked(
+def _choose_question(
     after: Linearised, causes: Sequence[Cause], number: str | None
 ) -> tuple[str, tuple[str, ...], list[Effect]]:
     """Return what is asked for, what it may be mistaken for, and effects to take in."""

@@ -33,7 +33,7 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
         if stand.alike:
             names += f', or {" or ".join(stand.alike)}: photographs cannot tell'
         return 'settled', f'diagnosis: {names}', taken
-    if guide.finished:
+    if guide.is_finished:
         return 'not settled', 'so many photographs do not settle it', taken
     if guide.thinking:
         return 'one moment', 'choosing the next photograph', taken

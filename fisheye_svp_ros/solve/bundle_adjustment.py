@@ -89,14 +89,14 @@ def gauss_newton(
     for _ in range(_GAUSS_NEWTON_STEPS):
         frame, shared = solve(residual)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
-        after = partial(_after_part, state, free, frame, shared)
+        after = partial(_partial_step, state, free, frame, shared)
         state, residual = shorten_step(data, free, after, limit)
         if np.sqrt((change**2).mean()) < tolerance:
             break
     return state
 
 
-def _after_part(
+def _partial_step(
     state: RigState, free: Sequence[str], frame: Array, shared: Array, part: float
 ) -> RigState:
     return state.retract(free, part * frame, part * shared)

@@ -105,10 +105,10 @@ def _best_rig(model: ForwardModel, views: Views, body: Pose, rigs: Pose) -> int:
         return float(np.median(np.nanmedian(prediction_distances(model, pose, views), axis=1)))
 
     # A far view says little of where its camera stands: among the middle ones images decide.
-    return int(min(_from_middle(rigs)[:_MAX_RIGS].tolist(), key=distance))
+    return int(min(_sort_by_centrality(rigs)[:_MAX_RIGS].tolist(), key=distance))
 
 
-def _from_middle(poses: Pose) -> Index:
+def _sort_by_centrality(poses: Pose) -> Index:
     """Return poses in the order of how near each is to most others."""
     count = len(poses.position)
     far = np.zeros((count, count))

@@ -189,7 +189,7 @@ class Linearization:
         with np.errstate(invalid='ignore'):
             offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
         self.residual = data.blocks(offset * self.weight[..., None])
-        self._d_pose = self._measured(self.linear.d_pose)
+        self._d_pose = self._through_corrections(self.linear.d_pose)
         self.frame_columns = self.whiten(self._frame_columns(pose))
 
     @cached_property
@@ -208,7 +208,7 @@ class Linearization:
         return self.data.blocks(self.weight[..., None] * np.ones(2))
 
     @property
-    def observed(self) -> Mask:
+    def is_observation(self) -> Mask:
         """Which rows (F, M) are observations and not padding."""
         return self.row_weight > 0
 
@@ -221,7 +221,7 @@ class Linearization:
         """Whitened columns (F, M, P) by the parameters of one more effect."""
         return self.whiten(self.model.effect_columns(effect, self.scene, self.linear))
 
-    def _measured(self, columns: Array) -> Array:
+    def _through_corrections(self, columns: Array) -> Array:
         """Return columns (S, N, 2, P) of measured points from those of ideal ones."""
         if self.state.terms is not None:
             return columns
@@ -248,7 +248,7 @@ class Linearization:
         # Corrections of the image plane go with its centre and focal lengths.
         inner = [name.rpartition('.')[2] not in ('f', *INTRINSICS) for name in self.free]
         if any(inner):
-            columns[..., inner] = self._measured(columns[..., inner])
+            columns[..., inner] = self._through_corrections(columns[..., inner])
         return columns
 
 

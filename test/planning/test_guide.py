@@ -150,7 +150,7 @@ def test_of_a_board_seen_in_part_the_whole_is_wanted(first):
 def test_from_a_data_sheet_to_a_settled_shift(first):
     """Somebody presents the wanted views, a little off; the shift is 3 mm, the goal 0.3 mm."""
     guide, rng = guided(first), np.random.default_rng(5)
-    while not guide.finished:
+    while not guide.is_finished:
         assert len(guide.session.taken) < 12
         seen = present(LENS, guide.stand, rng)
         guide.session = replace(guide.session, taken=(*guide.session.taken, seen))
@@ -195,4 +195,4 @@ def test_what_fails_is_left_out(first, monkeypatch):
     assert isinstance(evaluate_session(nowhere), GeometryError)
     monkeypatch.setattr(module, 'MAX_PHOTOGRAPHS', 1)
     guide.adopt(first)
-    assert guide.finished and guide.outline is None
+    assert guide.is_finished and guide.outline is None
