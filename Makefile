@@ -13,7 +13,7 @@ PYTEST ?=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors bench compare kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -36,6 +36,10 @@ paper: $(VENV)/ready
 paper-search: $(VENV)/ready
 	$(BIN)/python -m benchmark.paper search
 	$(BIN)/python -m benchmark.paper stopping
+
+# The site, with the Python API and a search, into out/site; needs no network.
+docs: $(VENV)/ready
+	$(BIN)/sphinx-build -W --keep-going -q docs $(OUT)/site
 
 # All blind tests of the diagnosis; takes long.
 blind: $(VENV)/ready
@@ -121,7 +125,7 @@ $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(QUIETLY) $(BIN)/pip install --quiet -e '.[fast,parquet,dask,test,lint$(ROS)]'
+	$(QUIETLY) $(BIN)/pip install --quiet -e '.[fast,parquet,dask,test,lint,docs$(ROS)]'
 	touch $@
 
 clean:

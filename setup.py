@@ -65,8 +65,9 @@ setup(
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
-            'hypothesis>=6.80', 'pytest-cov>=4.1',
+            'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10',
         ],
+        'docs': ['sphinx>=7.2', 'myst-parser>=2.0', 'furo'],
         'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.0', 'types-PyYAML', 'scipy-stubs'],
     },
     zip_safe=True,

@@ -1,13 +1,19 @@
-"""Links and anchors of the documentation have targets, without building the site."""
+"""Links and anchors of the documentation have targets; the site is built without a warning."""
 
 from __future__ import annotations
 
+import json
 import re
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
 from helpers.nodes import ROOT
+
+import fisheye_svp_ros as fsvp
+from fisheye_svp_ros.cli import COMMANDS
 
 PAGES = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').rglob('*.md')])
 _CODE = re.compile(r'^```.*?^```|`[^`\n]*`', re.DOTALL | re.MULTILINE)
@@ -36,3 +42,31 @@ def test_links_have_targets(page: Path) -> None:
         assert path.exists(), link
         if anchor:
             assert anchor in anchors(path.resolve()), link
+
+
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    for module in ('sphinx', 'myst_parser', 'furo'):
+        pytest.importorskip(module, reason='needs the extra `docs`')
+    done = subprocess.run([sys.executable, '-m', 'sphinx', '-W', '--keep-going', '-q',
+                           str(ROOT / 'docs'), str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for page in (ROOT / 'docs').rglob('*.md'):
+        assert (tmp_path / page.relative_to(ROOT / 'docs')).with_suffix('.html').is_file()
+    api = (tmp_path / 'reference' / 'python_api.html').read_text(encoding='utf-8')
+    for name in fsvp.__all__:
+        assert f'.{name}"' in api, name
+    commands = (tmp_path / 'reference' / 'commands.html').read_text(encoding='utf-8')
+    for name in COMMANDS:
+        assert f'id="{name}"' in commands, name
+
+
+def test_a_diagnosis_is_what_its_schema_says() -> None:
+    jsonschema = pytest.importorskip('jsonschema', reason='needs the extra `test`')
+    path = ROOT / 'docs' / 'reference' / 'diagnosis.schema.json'
+    scene = fsvp.simulate_scenario(lens='fish214', radius=0.5, noise_px=0.2,
+                                   poses_file='calibration')
+    document = fsvp.diagnose(scene.observations, scene.lens.svp()).document
+    validator = jsonschema.Draft202012Validator(json.loads(path.read_text(encoding='utf-8')))
+    assert document['causes']
+    validator.validate(json.loads(json.dumps(document)))
+    assert not validator.is_valid({**document, 'verdict': 'good'})

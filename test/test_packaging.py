@@ -21,7 +21,7 @@ ROSDEP = {
     'setuptools': 'python3-setuptools', 'pyarrow': None, 'mcap': None,
     'threadpoolctl': None,
     'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
-    'pytest-cov': 'python3-pytest-cov',
+    'pytest-cov': 'python3-pytest-cov', 'jsonschema': 'python3-jsonschema',
     'hypothesis': 'python3-hypothesis', 'psutil': 'python3-psutil', 'mpmath': None,
 }
 
