@@ -10,18 +10,30 @@ BIN := $(VENV)/bin
 OUT ?= out
 # Further arguments of pytest, for example PYTEST='-k lens'.
 PYTEST ?=
+# Rooms whose tests start no process, nor diagnose whole sets.
+QUICK := $(patsubst %,test/%,optics scene effects io simulate solve rectify detect study reporting) \
+	$(patsubst %,test/test_%.py,documents library pose registry)
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo test lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
 
 # One thread each for NumPy, since the tests are spread over all cores.
-test test-oldest: export OMP_NUM_THREADS := 1
+check test coverage test-oldest: export OMP_NUM_THREADS := 1
 test: $(VENV)/ready lint
 	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+
+# For every save: lint, and the tests that take under two minutes on two cores.
+check: $(VENV)/ready lint
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m 'not slow' $(QUICK) $(PYTEST)
+
+# All tests, and which lines of the package they run.
+coverage: $(VENV)/ready
+	$(BIN)/python -m pytest -n auto --dist loadgroup --cov=fisheye_svp_ros \
+		--cov-report=term:skip-covered $(PYTEST)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

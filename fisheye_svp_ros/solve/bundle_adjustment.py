@@ -145,7 +145,7 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     Raises GeometryError where a start lies outside the domain of the lens or the views do not
     determine the parameters.
     """
-    data, state = RigViews.of_one_camera(views), RigState(pose, identity(1), lens, None)
+    data, state = RigViews.of_one_camera(views), RigState(pose, identity(1), lens, (), corrected=True)
     problem = _Adjustment(data, state, names)
     solved = levenberg_marquardt(problem, problem.pack([state]), MAX_LENS_ITERATIONS)
     if not np.isfinite(solved.cost[0]):
@@ -173,8 +173,8 @@ def adjust_lens_from(
 
     names: of the K parameters; a start outside the lens's domain is left as it is.
     """
-    states = [RigState(pose.take(i), identity(1), lens.with_parameters(names, one.tolist()), None)
-              for i, one in enumerate(values)]
+    states = [RigState(pose.take(i), identity(1), lens.with_parameters(names, one.tolist()), (),
+                       corrected=True) for i, one in enumerate(values)]
     problem = _Adjustment(RigViews.of_one_camera(views), states[0], names)
     solved: Minimum = levenberg_marquardt(problem, problem.pack(states), max_iterations)
     return problem.unpack(solved.state, int(np.argmin(solved.cost))).lens
@@ -194,7 +194,7 @@ class _Adjustment:
         self._prior = prior or Prior()
         moving = [np.full(6 * (data.cameras - 1) + len(self._free), held is not None)]
         moving += [np.full(len(values), held is not None and effect.name not in held)
-                   for effect, values in template.terms or () if is_shared(effect)]
+                   for effect, values in template.terms if is_shared(effect)]
         self._moving = np.concatenate(moving)
 
     def pack(self, states: Sequence[RigState]) -> Arrays:

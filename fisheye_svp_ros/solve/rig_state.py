@@ -95,15 +95,16 @@ class RigState:
 
     others: the lenses of the further cameras of a rig, by whose names (`labels`) parameters and
     effects are told apart; without them every camera has the same lens.  terms: the effects and
-    their values; None for the corrections of the lens and its target, which stay what they are.
+    their values; corrected: whether the lens's own corrections act in place of them, unchanged.
     """
 
     pose: Pose
     rig: Pose
     lens: Lens
-    terms: tuple[Term, ...] | None
+    terms: tuple[Term, ...]
     others: tuple[Lens, ...] = ()
     labels: tuple[str, ...] = ('',)
+    corrected: bool = False
 
     @property
     def lenses(self) -> tuple[Lens, ...]:
@@ -113,7 +114,7 @@ class RigState:
     @property
     def model(self) -> ForwardModel:
         """The forward model of all cameras."""
-        return ForwardModel(self.lenses, self.terms)
+        return ForwardModel(self.lenses, None if self.corrected else self.terms)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -135,7 +136,7 @@ class RigState:
         lens = [parameter_values(one, names)
                 for one, names in zip(self.lenses, self.lens_names(free), strict=True)]
         return np.concatenate([*map(np.array, lens), *(values for effect, values in self.terms
-                                                       or () if is_shared(effect))])
+                                                       if is_shared(effect))])
 
     def with_shared_values(self, free: Sequence[str], values: Array) -> RigState:
         """Return the state with other free intrinsics and values of effects, (K,)."""
@@ -143,12 +144,12 @@ class RigState:
         for lens, names in zip(self.lenses, self.lens_names(free), strict=True):
             lenses.append(lens.with_parameters(names, values[: len(names)].tolist()))
             values = values[len(names) :]
-        for effect, known in self.terms or ():
+        for effect, known in self.terms:
             if is_shared(effect):
                 known, values = values[: len(known)], values[len(known) :]
             terms.append((effect, known))
         return replace(self, lens=lenses[0], others=tuple(lenses[1:]),
-                       terms=None if self.terms is None else tuple(terms))
+                       terms=tuple(terms))
 
     def retract(self, free: Sequence[str], frame: Array, shared: Array) -> RigState:
         """Return the state after a step of poses (F, 6) and of what all frames share.
@@ -163,7 +164,7 @@ class RigState:
 
     def without_effects(self, names: Collection[str]) -> RigState:
         """Return the state without some effects."""
-        return replace(self, terms=tuple(t for t in self.terms or () if t[0].name not in names))
+        return replace(self, terms=tuple(t for t in self.terms if t[0].name not in names))
 
     def view_poses(self, data: RigViews) -> Pose:
         """Return the camera's pose in each view (S,)."""
@@ -185,7 +186,7 @@ class Linearization:
         pose = state.view_poses(data)
         self.linear: LinearViews = self.model.linearise(pose, data.views)
         self.scene: Scene = self.model.scene(pose, data.views, self.linear)
-        self.weight = data.views.weight * noise_weight(state.terms or (), self.scene)
+        self.weight = data.views.weight * noise_weight(state.terms, self.scene)
         with np.errstate(invalid='ignore'):
             offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
         self.residual = data.blocks(offset * self.weight[..., None])
@@ -198,7 +199,7 @@ class Linearization:
         shared = [self._rig_columns(), self._lens_columns()]
         shared += [
             self.model.effect_columns(effect, self.scene, self.linear)
-            for effect, _ in self.state.terms or () if is_shared(effect)
+            for effect, _ in self.state.terms if is_shared(effect)
         ]
         return self.whiten(np.concatenate(shared, axis=-1))
 
@@ -223,7 +224,7 @@ class Linearization:
 
     def _through_corrections(self, columns: Array) -> Array:
         """Return columns (S, N, 2, P) of measured points from those of ideal ones."""
-        if self.state.terms is not None:
+        if not self.state.corrected:
             return columns
         return self.model.through(self.linear, self.data.views, columns)
 
