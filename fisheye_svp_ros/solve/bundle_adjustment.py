@@ -145,7 +145,8 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     Raises GeometryError where a start lies outside the domain of the lens or the views do not
     determine the parameters.
     """
-    data, state = RigViews.of_one_camera(views), RigState(pose, identity(1), lens, (), corrected=True)
+    data = RigViews.of_one_camera(views)
+    state = RigState(pose, identity(1), lens, (), corrected=True)
     problem = _Adjustment(data, state, names)
     solved = levenberg_marquardt(problem, problem.pack([state]), MAX_LENS_ITERATIONS)
     if not np.isfinite(solved.cost[0]):
