@@ -10,6 +10,7 @@ nodes = (
     'synthetic_camera',
     'measured_camera',
     'detector',
+    'rectifier',
     'localizer',
     'stereo_calibrator',
     'stereo_depth',

@@ -59,8 +59,8 @@ NODES = {
     'record': ('record', '-o', '{out}/recording'),
     'watch': ('watch',),
     **{f'run {node}': ('run', node) for node in (
-        'synthetic_camera', 'detector', 'localizer', 'stereo_calibrator', 'stereo_depth',
-        'model_critic')},
+        'synthetic_camera', 'detector', 'rectifier', 'localizer', 'stereo_calibrator',
+        'stereo_depth', 'model_critic')},
     'run measured_camera': ('run', 'measured_camera', '--ros-args', '-p',
                             'observations:={obs}'),
 }

@@ -22,7 +22,7 @@ from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 _NUMBERS = (0.0, -0.0, 1e308, -1e308, 5e-324, 1e12, np.inf, -np.inf, np.nan, 1e-9, 1e9)
 _GOOD_EVERY = 25  # hostile inputs
 _NAMES = ('localizer', 'stereo_calibrator', 'stereo_depth', 'model_critic', 'detector',
-          'synthetic_camera', 'measured_camera')
+          'synthetic_camera', 'measured_camera', 'rectifier')
 _SOLVING = ('lens:=fish214', 'svp:=true', 'patience:=0.0')
 
 

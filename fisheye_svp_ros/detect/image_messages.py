@@ -1,4 +1,4 @@
-"""The raw images of sensor_msgs in grey, whatever their encoding."""
+"""The raw images of sensor_msgs in grey or in color, whatever their encoding."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ from fisheye_svp_ros.errors import ObservationError
 class _Encoding(NamedTuple):
     """Numbers of a pixel, what makes grey of them, and the bytes of the planes behind them.
 
-    planes: bytes that follow for each byte of the grey plane.
+    planes: bytes that follow for each byte of the grey plane; bgr: what makes colors of samples
+    that are none by themselves.
     """
 
     kind: type
     channels: int
     grey: int | None = None
     planes: float = 0.0
+    bgr: int | None = None
 
 
 def _encodings() -> dict[str, _Encoding]:
@@ -36,13 +38,17 @@ def _encodings() -> dict[str, _Encoding]:
                   f'rgba{name}': _Encoding(kind, 4, cv2.COLOR_RGBA2GRAY),
                   f'bgra{name}': _Encoding(kind, 4, cv2.COLOR_BGRA2GRAY)}
         # OpenCV calls a pattern by its second row.
-        for pattern, grey in (('rggb', cv2.COLOR_BayerBG2GRAY), ('bggr', cv2.COLOR_BayerRG2GRAY),
-                              ('gbrg', cv2.COLOR_BayerGR2GRAY), ('grbg', cv2.COLOR_BayerGB2GRAY)):
-            known[f'bayer_{pattern}{name}'] = _Encoding(kind, 1, grey)
-    known |= {name: _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY) for name in ('yuv422', 'uyvy')}
-    known |= {name: _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2)
-              for name in ('yuv422_yuy2', 'yuyv')}
-    return known
+        for pattern, grey, bgr in (
+            ('rggb', cv2.COLOR_BayerBG2GRAY, cv2.COLOR_BayerBG2BGR),
+            ('bggr', cv2.COLOR_BayerRG2GRAY, cv2.COLOR_BayerRG2BGR),
+            ('gbrg', cv2.COLOR_BayerGR2GRAY, cv2.COLOR_BayerGR2BGR),
+            ('grbg', cv2.COLOR_BayerGB2GRAY, cv2.COLOR_BayerGB2BGR),
+        ):
+            known[f'bayer_{pattern}{name}'] = _Encoding(kind, 1, grey, bgr=bgr)
+    uyvy = _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_UYVY, bgr=cv2.COLOR_YUV2BGR_UYVY)
+    yuyv = _Encoding(np.uint8, 2, cv2.COLOR_YUV2GRAY_YUY2, bgr=cv2.COLOR_YUV2BGR_YUY2)
+    return known | dict.fromkeys(('yuv422', 'uyvy'), uyvy) | dict.fromkeys(
+        ('yuv422_yuy2', 'yuyv'), yuyv)
 
 
 _ENCODINGS = _encodings()
@@ -55,6 +61,25 @@ def image_pixels(message: Any, name: str) -> NDArray[Any]:
 
     Raises ObservationError for an encoding without brightness, or data that are too short.
     """
+    encoding, samples = _samples(message, name)
+    return samples if encoding.grey is None else np.asarray(cv2.cvtColor(samples, encoding.grey))
+
+
+def color_image(message: Any, name: str) -> tuple[NDArray[Any], str]:
+    """Return a sensor_msgs Image (H, W) or (H, W, C) that can be interpolated, and its encoding.
+
+    Colors stay as they are; of Bayer patterns and YUV 4:2:2 bgr8 or bgr16 is made, of NV12, NV21
+    and NV24 mono8.  Raises ObservationError as `image_pixels` does.
+    """
+    encoding, samples = _samples(message, name)
+    depth = '8' if encoding.kind is np.uint8 else '16'
+    if encoding.bgr is not None:
+        return np.asarray(cv2.cvtColor(samples, encoding.bgr)), f'bgr{depth}'
+    return samples, f'mono{depth}' if encoding.planes else message.encoding
+
+
+def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
+    """Return the encoding of an Image and its numbers, (H, W) or (H, W, C)."""
     encoding = _ENCODINGS.get(message.encoding)
     if encoding is None:
         raise ObservationError(f'{name}: encoding {_why_not(message.encoding)}')
@@ -67,11 +92,9 @@ def image_pixels(message: Any, name: str) -> NDArray[Any]:
     rows = np.frombuffer(data, np.uint8)[:step * height]
     rows = np.ascontiguousarray(rows.reshape(height, step)[:, :width])
     pixels: NDArray[Any] = rows.view(dtype).astype(encoding.kind, copy=False)
-    if encoding.grey is None:
-        return pixels
     if encoding.channels > 1:
         pixels = pixels.reshape(height, message.width, encoding.channels)
-    return np.asarray(cv2.cvtColor(pixels, encoding.grey))
+    return encoding, pixels
 
 
 def _why_not(encoding: str) -> str:

@@ -4,6 +4,7 @@ NODES = (
     'synthetic_camera',
     'measured_camera',
     'detector',
+    'rectifier',
     'localizer',
     'stereo_calibrator',
     'stereo_depth',

@@ -37,6 +37,7 @@ from fisheye_svp_ros.io.clouds import (
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
+from fisheye_svp_ros.rectify.maps import Rectification
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
 _NS = 10**9
@@ -89,11 +90,11 @@ def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> 
     return cloud_message(structured(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
 
 
-def image_message(pixels: NDArray[np.uint8], stamp: int, frame: str) -> Any:
-    """Return sensor_msgs/Image, mono8 of a grey image (H, W) or bgr8 of (H, W, 3)."""
-    height, width, *coloured = pixels.shape
+def image_message(pixels: NDArray[Any], stamp: int, frame: str, encoding: str = '') -> Any:
+    """Return sensor_msgs/Image; without an encoding mono8 of (H, W) or bgr8 of (H, W, 3)."""
+    height, width, *colored = pixels.shape
     return Image(header=header(stamp, frame), height=height, width=width,
-                 encoding='bgr8' if coloured else 'mono8', is_bigendian=0,
+                 encoding=encoding or ('bgr8' if colored else 'mono8'), is_bigendian=0,
                  step=pixels.strides[0], data=array('B', pixels.tobytes()))
 
 
@@ -107,6 +108,17 @@ def camera_info_message(lens: Lens, stamp: int, frame: str) -> Any:
     message.k = k
     message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
     message.p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return message
+
+
+def rectified_info_message(side: Rectification, stamp: int, frame: str) -> Any:
+    """Return CameraInfo of a rectified pinhole camera: no distortion; P has the baseline."""
+    message = CameraInfo(header=header(stamp, frame), width=side.camera.width,
+                         height=side.camera.height, distortion_model='plumb_bob')
+    message.d = [0.0] * 5
+    message.k = side.k.ravel().tolist()
+    message.r = np.eye(3).ravel().tolist()
+    message.p = side.p.ravel().tolist()
     return message
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from fisheye_svp_ros.detect.image_messages import color_image
 from fisheye_svp_ros.detect.photographs import message_pixels
 from fisheye_svp_ros.errors import ObservationError
 
@@ -116,6 +117,22 @@ def test_a_bayer_pattern_begins_where_its_name_says(
     message = SimpleNamespace(height=8, width=8, encoding=f'bayer_{pattern}{bits}', step=bits,
                               is_bigendian=0, data=mosaic.tobytes())
     assert np.abs(pixels(message)[2:-2, 2:-2].astype(int) - 0.299 * 200).max() <= 1
+    color, encoding = color_image(message, 'one')
+    assert encoding == f'bgr{bits}' and color.dtype == mosaic.dtype
+    assert (color[2:-2, 2:-2] == [0, 0, 200]).all()
+
+
+@pytest.mark.parametrize('encoding', [name for name in NAMED if name not in REFUSED])
+def test_colors_stay_or_become_bgr_where_pixels_have_none_of_their_own(encoding: str) -> None:
+    message = image(encoding)
+    found, stated = color_image(message, 'one')
+    mixed = encoding.startswith(('bayer', 'uyvy', 'yuv', 'yuyv'))
+    wide = '16' in encoding
+    assert stated == (f'bgr{16 if wide else 8}' if mixed else
+                      'mono8' if encoding.startswith('nv') else encoding)
+    assert found.dtype == (np.uint16 if wide else np.uint8)
+    grey = found if found.ndim == 2 else found[..., 0]
+    assert np.abs(grey / (256 if wide else 1) - GREY).max() <= (15 if mixed else 0)
 
 
 def test_big_endian_numbers() -> None:
