@@ -110,10 +110,8 @@ class Victim:
         if exactly:
             given += [*_SOLVING] if self._kind.cameras else []
             for topic in self.topics:
-                for end in ('subscription', 'subscription_volatile'):
-                    if end == 'subscription' or topic == 'landmarks':
-                        at = f'qos_overrides.{self._space}/{topic}.{end}'
-                        given += [f'{at}.history:=keep_all', f'{at}.reliability:=reliable']
+                at = f'qos_overrides.{self._space}/{topic}.subscription'
+                given += [f'{at}.history:=keep_all', f'{at}.reliability:=reliable']
         self._log = folder / f'{self.name}_{exactly}.log'
         with self._log.open('ab') as log:
             self._process = subprocess.Popen(

@@ -45,7 +45,7 @@ class Probe:
         from sensor_msgs.msg import PointCloud2
 
         from fisheye_svp_ros.nodes import messages
-        from fisheye_svp_ros.nodes.base import LATCHED, RELIABLE
+        from fisheye_svp_ros.nodes.quality import LATCHED, RELIABLE
 
         rclpy.init(args=[])
         self._node = Node('probe')

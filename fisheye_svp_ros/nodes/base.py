@@ -3,46 +3,28 @@
 from __future__ import annotations
 
 import functools
-import math
-import signal
-import sys
-import time
 import traceback
-from collections.abc import Callable, Mapping
-from copy import copy
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import changed, rows
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.declaration import declare
-from fisheye_svp_ros.nodes.inputs import Count, Unread, twins
+from fisheye_svp_ros.nodes.declaration import declare, unknown_parameters
+from fisheye_svp_ros.nodes.inputs import Unread
+from fisheye_svp_ros.nodes.quality import INPUT, RELIABLE, create_with_qos
+from fisheye_svp_ros.nodes.silence import LIMIT, explain_silence, silent_inputs
+from fisheye_svp_ros.nodes.subscriptions import Input
 from fisheye_svp_ros.nodes.timers import every
 from fisheye_svp_ros.study.settings import Settings
 
-# All topics are reliable; inputs are deep enough for what comes while a solver is busy.
-RELIABLE = QoSProfile(depth=100)
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-INPUT = QoSProfile(depth=1000)
-SENSOR = SENSOR_INPUT = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
-LATCHED_INPUT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-HEARD_LATER = QoSProfile(depth=100)
-
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
-_OVERRIDDEN = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY,
-               QoSPolicyKind.DURABILITY)
-_TWICE = 1.0  # s between two interrupts that are one
 _KINDS_OF_ERRORS = 100  # that are told from each other
 
 T = TypeVar('T')
@@ -66,9 +48,11 @@ class BaseNode(Node):  # type: ignore[misc]
     NAME: ClassVar[str]
     SETTINGS: ClassVar[type[Settings]]
 
-    def __init__(self) -> None:
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        """Create the node; options: as those of rclpy.node.Node, such as its namespace."""
         try:
-            super().__init__(self.NAME, automatically_declare_parameters_from_overrides=True)
+            super().__init__(node_name or self.NAME,
+                             automatically_declare_parameters_from_overrides=True, **options)
         except NameValidationException:  # a ValueError, too
             raise
         except ValueError as cause:  # an empty list has no type, and rclpy does not say which
@@ -79,8 +63,9 @@ class BaseNode(Node):  # type: ignore[misc]
                       if name not in _OF_ROS}
         for name in self.given:
             self.undeclare_parameter(name)
-        self.settings = declare(self, self.SETTINGS)
-        self._inputs: dict[str, Count] = {}
+        self.settings = declare(self, self.SETTINGS, self.given)
+        self._inputs: dict[str, Input] = {}
+        self._silences: set[str] = set()
         self._complaint = ''
         self._unforeseen: set[tuple[object, ...]] = set()
         self._failures = 0
@@ -95,7 +80,7 @@ class BaseNode(Node):  # type: ignore[misc]
         Raises FisheyeSvpError where they cannot be used.
         """
         self.take_up()
-        self.warn_of_unknown_parameters()
+        self.introduce()
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self.guarded(self._adopt))
 
@@ -150,7 +135,7 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""
-        publisher = self._with_qos(self.create_publisher, kind, topic, qos=qos)
+        publisher = create_with_qos(self, self.create_publisher, kind, topic, qos=qos)
         if wait:
             self._waited_for.append(publisher)
         return publisher
@@ -167,12 +152,15 @@ class BaseNode(Node):  # type: ignore[misc]
         read: Callable[[Any, str], T],
         use: Callable[[int, T], None],
         qos: Any = INPUT,
+        latched: bool = False,
     ) -> None:
         """Subscribe: `read` decodes a message, `use` gets its stamp (ns) and what was read.
 
-        A message that either of them refuses is logged, dropped and counted.
+        A message that either of them refuses is logged, dropped and counted.  latched: what was
+        published before counts as well.
         """
-        self.collect(kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), qos)
+        self.collect(
+            kind, topic, read, lambda stamp, unread: use(stamp, unread.read()), qos, latched)
 
     def collect(
         self,
@@ -181,15 +169,15 @@ class BaseNode(Node):  # type: ignore[misc]
         read: Callable[[Any, str], Any],
         use: Callable[[int, Unread], None],
         qos: Any = INPUT,
-        volatile_qos: Any = HEARD_LATER,
+        latched: bool = False,
+        name: str = '',
     ) -> None:
         """Subscribe, as `listen` does, but leave it to `use` whether a message is decoded.
 
-        volatile_qos: of the second subscription of what is latched.
+        name: of the topic where it is not what the node calls it.
         """
-        count = self._inputs[topic] = Count()
-
         def receive(data: bytes) -> None:
+            count = self._inputs[topic].count
             count.received += 1
             try:
                 unread = Unread(topic, kind, bytes(data), read, count)
@@ -202,49 +190,35 @@ class BaseNode(Node):  # type: ignore[misc]
                 count.dropped += 1
                 self.unforeseen(error)
 
-        create = functools.partial(self._with_qos, self.create_subscription, kind, topic)
-        if qos.durability != DurabilityPolicy.TRANSIENT_LOCAL:
-            self.subscribe(functools.partial(create, receive, qos=qos, raw=True))
-            return
-        # Only what is latched comes late; only a volatile subscription hears what is not.
-        latched, volatile = twins(receive)
-        # The other one warns of whom neither hears.
-        silent = SubscriptionEventCallbacks(use_default_callbacks=False)
-        self.subscribe(functools.partial(
-            create, latched, qos=qos, raw=True, event_callbacks=silent))
-        self.subscribe(functools.partial(
-            create, volatile, qos=volatile_qos, entity='volatile', raw=True))
+        self._inputs[topic] = Input(self, kind, name or topic, receive, qos, latched)
+        if self.listening:
+            self._inputs[topic].subscribe()
 
-    def subscribe(self, create: Callable[[], Any]) -> None:
-        """Create a subscription."""
-        create()
+    @property
+    def listening(self) -> bool:
+        """Whether the node listens to its inputs now."""
+        return True
 
     def listens_to(self, topic: str) -> bool:
         """Say whether there is a subscription of a topic."""
         return topic in self._inputs
 
-    def _with_qos(
-        self, create: Callable[..., Any], *arguments: Any, qos: Any, entity: str | None = None,
-        **more: Any,
-    ) -> Any:
-        """Create a publisher or subscription of which parameters may override the QoS."""
-        options = QoSOverridingOptions(_OVERRIDDEN, entity_id=entity)
-        try:
-            # A copy, because rclpy changes the profile that it is given.
-            return create(*arguments, copy(qos), qos_overriding_options=options, **more)
-        except RuntimeError as cause:
-            if not self.context.ok():
-                raise
-            raise ParameterError(f'{arguments[1]}: {cause}') from cause
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which there is nothing to do: one of each group."""
+        return [(topic,) for topic in self._inputs]
 
     def drop(self, topic: str, error: Exception) -> None:
         """Count and log an input that cannot be used."""
-        self._inputs[topic].dropped += 1
+        self._inputs[topic].count.dropped += 1
         self._complain(error)
 
+    def warn(self, text: str) -> None:
+        """Log a warning, and say it in the next report on /diagnostics."""
+        self._complaint = text
+        self.get_logger().warning(text, throttle_duration_sec=1.0)
+
     def _complain(self, error: Exception) -> None:
-        self._complaint = str(error)
-        self.get_logger().warning(f'dropped: {error}', throttle_duration_sec=1.0)
+        self.warn(f'dropped: {error}')
 
     def _consider(self, parameters: list[Any]) -> Any:
         self._candidate = None
@@ -270,15 +244,14 @@ class BaseNode(Node):  # type: ignore[misc]
             self._candidate = None
             self.configure(prepared)
 
-    def warn_of_unknown_parameters(self) -> None:
-        """Warn of what was given and means nothing to this node and its topics."""
-        known = ', '.join(row.name for row in rows(self.SETTINGS))
-        for name in self.given:
-            # Those topics come and go with what there is to tell.
-            if not self.has_parameter(name) and '/metrics/' not in name:
-                self.get_logger().warning(
-                    f'parameter {name!r} means nothing to this node; it knows {known}'
-                )
+    def introduce(self) -> None:
+        """Say what the node listens to; warn of what was given and means nothing to it."""
+        if self._inputs:
+            topics = sorted(one.resolved for one in self._inputs.values())
+            self.get_logger().info(f'listening to {", ".join(topics)}')
+        names = [row.name for row in rows(self.SETTINGS)]
+        for text in unknown_parameters(self, self.given, names):
+            self.get_logger().warning(text)
 
     def report(self) -> tuple[Mapping[str, object], str]:
         """Return what else there is to count, and what is wrong right now."""
@@ -286,87 +259,31 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def _publish_diagnostics(self) -> None:
         counts: dict[str, object] = {}
-        for topic, count in self._inputs.items():
-            counts |= {f'{topic}: received': count.received, f'{topic}: read': count.read,
-                       f'{topic}: dropped': count.dropped}
+        for topic, one in self._inputs.items():
+            counts |= {f'{topic}: received': one.count.received, f'{topic}: read': one.count.read,
+                       f'{topic}: dropped': one.count.dropped}
+            one.adapt()
         more, trouble = self.report()
         now = self.get_clock().now().nanoseconds
-        trouble = trouble or ('' if now else 'use_sim_time is true, but /clock has no time yet')
-        text = trouble or self._complaint
+        clock = '' if now else 'use_sim_time is true, but /clock has no time yet'
+        troubles = [trouble, clock, self._complaint, self._explain_silence()]
+        self._complaint = ''  # what it was is in the counts
+        text = '; '.join(filter(None, troubles))
         level = DiagnosticStatus.WARN if text else DiagnosticStatus.OK
-        text, self._complaint = text or 'all inputs usable', ''  # what it was is in the counts
+        text = text or 'all inputs usable'
         if self._failures:
             level, text = DiagnosticStatus.ERROR, f'{self._failures} internal errors; {text}'
         name = f'{self.get_fully_qualified_name()}: inputs'
         self._diagnostics.publish(messages.key_values_message(
             name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
 
-
-def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
-    """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
-    signal.signal(signal.SIGINT, _interrupting_without_echo())
-    try:
-        try:
-            rclpy.init(args=args)
-        except Exception as error:
-            return _refuse(kind, f'ROS arguments or environment: {error}')
-        return _run(kind)
-    except KeyboardInterrupt:
-        return 0
-
-
-def _interrupting_without_echo() -> Callable[..., None]:
-    """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
-
-    The second one would end what the first one has begun to put away.  A later one counts again:
-    the first is lost where C code calls Python and drops its exceptions.
-    """
-    last = -math.inf
-
-    def interrupt(*_: Any) -> None:
-        nonlocal last
-        before, last = last, time.monotonic()
-        if last - before > _TWICE:
-            raise KeyboardInterrupt
-
-    return interrupt
-
-
-def _run(kind: type[BaseNode]) -> int:
-    node = None
-    try:
-        node = kind()
-        _spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Failed as error:
-        return _refuse(kind, error)
-    except Finished:
-        pass
-    except (FisheyeSvpError, ParameterException, NameValidationException) as error:
-        return _refuse(kind, error)
-    except Exception:
-        # A signal ends the context between any two calls; what fails then is no failure.
-        if rclpy.ok():
-            raise
-    finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
-            node.destroy_node()
-        rclpy.try_shutdown()
-    return 0
-
-
-def _spin(node: BaseNode) -> None:
-    while rclpy.ok():
-        try:
-            rclpy.spin(node)
-        except (ExternalShutdownException, Finished):
-            raise
-        except Exception as error:  # of the client library, about what came over the wire
-            node.unforeseen(error)
-
-
-def _refuse(kind: type[BaseNode], error: Exception | str) -> int:
-    print(f'{kind.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
-    return 2
+    def _explain_silence(self) -> str:
+        """Say what does not come, if that has been so for a while; log it once."""
+        silent = [ones for ones in silent_inputs(self.needed_inputs(), self._inputs)
+                  if ones[0].silent_for() > LIMIT]
+        texts = [explain_silence(self, ones) for ones in silent]
+        for text in texts:
+            if text not in self._silences:
+                self._silences.add(text)
+                self.get_logger().warning(text)
+        return '; '.join(texts)

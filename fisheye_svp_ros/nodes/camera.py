@@ -18,7 +18,8 @@ from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, SENSOR, BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -74,8 +75,8 @@ class CameraNode(BaseNode):
     settings: CameraSettings
     photographs = False  # in place of landmarks and image points
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._landmarks = (
             None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED))
         self._scenario = self.announce(DiagnosticArray, 'scenario')

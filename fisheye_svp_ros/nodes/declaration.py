@@ -2,26 +2,65 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from difflib import get_close_matches
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.parameter_files import read_parameter_file
 from fisheye_svp_ros.io.parameters import Row, changed, rows
 from fisheye_svp_ros.study.settings import Settings
 
 S = TypeVar('S', bound=Settings)
 
 
-def declare(node: Any, kind: type[S]) -> S:
+def declare(node: Any, kind: type[S], given: Mapping[str, Any]) -> S:
     """Declare every row of a table on a node, and return the values it starts with.
 
-    Raises ParameterError for a value that is not allowed; rclpy's own errors for a wrong type.
+    given: values by name, which may be whole numbers where others are asked for.
+    Raises ParameterError for a value that is not allowed.
     """
-    values = {}
+    settings = changed(kind(), given)
     for row in rows(kind):
-        default = list(row.default) if isinstance(row.default, tuple) else row.default
-        values[row.name] = node.declare_parameter(row.name, default, descriptor(row)).value
-    return changed(kind(), values)
+        value = getattr(settings, row.name)
+        node.declare_parameter(
+            row.name, list(value) if isinstance(value, tuple) else value, descriptor(row),
+            ignore_override=True)
+    return settings
+
+
+def unknown_parameters(node: Any, given: Mapping[str, Any], known: Sequence[str]) -> Iterator[str]:
+    """Say of each parameter that was given and means nothing to a node what was meant.
+
+    What a parameter file says of all nodes may be for others; it is named where it is nearly the
+    name of one that is known.
+    """
+    for_all = _names_for_all(sys.argv)
+    for name in given:
+        # Those topics come and go with what there is to publish.
+        if node.has_parameter(name) or '/metrics/' in name:
+            continue
+        meant = get_close_matches(name, known, 1)
+        if meant:
+            yield f'parameter {name!r} means nothing to this node; did you mean {meant[0]!r}?'
+        elif name not in for_all:
+            yield f'parameter {name!r} means nothing to this node; it knows {", ".join(known)}'
+
+
+def _names_for_all(arguments: Sequence[str]) -> set[str]:
+    """Return the parameters that the files of a command line give to all nodes."""
+    names: set[str] = set()
+    for word, file in pairwise(arguments):
+        if word == '--params-file':
+            with suppress(ParameterError):  # rcl has read it, or this node would not be here
+                names |= {*read_parameter_file(Path(file)).get('/**', {})}
+    return names
 
 
 def descriptor(row: Row) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -23,14 +24,16 @@ from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT, SENSOR_INPUT, BaseNode
+from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.inputs import Unread
+from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
 from fisheye_svp_ros.planning.guide import NUMBERS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
+_RAW, _COMPRESSED = 'image', 'image/compressed'
 _QUICK = {'saddle': 'quick'}  # a live camera has another image soon
 _LATEST = 100  # images of which one topic may be ahead of the other
 _LOOK = 0.005  # s, how often what a search found is looked for
@@ -91,8 +94,8 @@ class Detector(BaseNode):
     _searches: BoundedCalls | None = None
     _guiding: Guiding | None = None
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._points = self.announce(PointCloud2, 'image_points', wait=True)
         self._landmarks = self.announce(PointCloud2, 'landmarks', LATCHED)
         self._pattern: Pattern
@@ -108,10 +111,11 @@ class Detector(BaseNode):
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
             self.start()
             return
-        for kind, topic in ((Image, 'image'), (CompressedImage, 'image/compressed')):
-            self.collect(kind, topic, partial(_read, kind), self._take, SENSOR_INPUT)
+        self.collect(Image, _RAW, partial(_read, Image), self._take, SENSOR)
+        self.collect(CompressedImage, _COMPRESSED, partial(_read, CompressedImage), self._take,
+                     SENSOR, name=self._compressed_topic())
         self.collect(CameraInfo, CAMERA_INFO, read_camera_info,
-                     partial(self._infos.hear, CAMERA_INFO), LATCHED_INPUT, SENSOR_INPUT)
+                     partial(self._infos.hear, CAMERA_INFO), SENSOR, latched=True)
         self.start()
         if self.settings.guide:
             self._guiding = Guiding(self, self.settings, self._pattern, self._infos)
@@ -119,6 +123,20 @@ class Detector(BaseNode):
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
         self._look = self.every(_LOOK, self._work)
+
+    def _compressed_topic(self) -> str:
+        """Return where compressed images come: beside the others, unless remapped themselves."""
+        own = str(self.resolve_topic_name(_COMPRESSED))
+        if own != self.resolve_topic_name(_COMPRESSED, only_expand=True):
+            return own
+        return f'{self.resolve_topic_name(_RAW)}/compressed'
+
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which there is nothing to detect."""
+        if self.settings.detections:
+            return [('detections',)]
+        told = self.settings.guide and self.settings.lens == CAMERA_INFO
+        return [(_RAW, _COMPRESSED), *([(CAMERA_INFO,)] if told else [])]
 
     def destroy_node(self) -> None:
         """End the search, too."""

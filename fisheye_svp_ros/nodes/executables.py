@@ -39,8 +39,8 @@ def run(name: str, args: list[str] | None = None) -> int:
     """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
     with ending_quietly():
         kind = _kind(name)
-        from fisheye_svp_ros.nodes import base
-    return base.run(kind, args)
+        from fisheye_svp_ros.nodes import running
+    return running.run(kind, args)
 
 
 def parameters(name: str) -> list[Row]:

@@ -25,8 +25,9 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, BaseNode
+from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.planning.guide import (

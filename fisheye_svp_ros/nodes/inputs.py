@@ -1,11 +1,9 @@
-"""Messages that have come: counted, decoded when somebody wants to know, taken once."""
+"""Messages that have come: counted, and decoded when somebody wants to know."""
 
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +13,6 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import nanoseconds
 
 _SHORTEST = 12  # bytes: the head of CDR and a stamp
-_TWINS = 100  # messages of which one of two subscriptions may be ahead of the other
 
 
 @dataclass
@@ -70,25 +67,3 @@ class Unread:
             kind = self._kind.__name__
             raise ObservationError(f'{self.topic}: not a {kind} ({cause})') from cause
         return self._decode(message, self.topic)
-
-
-def twins(receive: Callable[[bytes], None]) -> tuple[Callable[[bytes], None], ...]:
-    """Return callbacks for two subscriptions of one topic; what comes to both is received once.
-
-    Messages are known by their hashes: those of a volatile publisher come to one alone, and to
-    keep them would keep the last hundred.
-    """
-    ahead: list[deque[int]] = [deque(maxlen=_TWINS), deque(maxlen=_TWINS)]
-
-    def callback(own: int) -> Callable[[bytes], None]:
-        def hear(data: bytes) -> None:
-            known_by = hash(data)
-            with suppress(ValueError):
-                ahead[1 - own].remove(known_by)
-                return
-            ahead[own].append(known_by)
-            receive(data)
-
-        return hear
-
-    return callback(0), callback(1)

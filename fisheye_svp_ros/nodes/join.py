@@ -1,81 +1,175 @@
-"""Joins what carries one stamp on several topics; in which order it arrives does not matter."""
+"""Joins what belongs together on several topics; in which order it arrives does not matter."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-# Sets waiting for their rest; the oldest is given up beyond this.
+# Sets waiting for their rest, and items waiting for their set; the oldest is given up beyond this.
 LIMIT = 2000
+_MAX_MISSED = 20  # sets that went without an item which may only be late
+
+
+class NeighborPair(NamedTuple):
+    """Two items of a topic, and how far from the first to the second a set is: 0 to 1."""
+
+    first: Any
+    second: Any
+    fraction: float
 
 
 class Pending(NamedTuple):
-    """A set: when its first item came, s, and its items by topic."""
+    """A set: when its first item came, s; its items, and the stamps of these, ns, by topic."""
 
     stamp: int
     since: float
     items: dict[str, Any]
+    stamps: dict[str, int]
+
+
+class _Track:
+    """What has come on an optional topic, by stamp."""
+
+    def __init__(self) -> None:
+        self.items: dict[int, Any] = {}  # that no set has taken yet
+        self.expected, self.matched = True, False
+        self.missed: deque[int] = deque(maxlen=_MAX_MISSED)  # stamps of sets that went without
+        self._stamps: list[int] = []  # of the latest items in ascending order
+        self._latest: list[Any] = []
+
+    def add(self, stamp: int, item: Any) -> None:
+        self.items.pop(stamp, None)
+        self.items[stamp] = item
+        if len(self.items) > LIMIT:
+            del self.items[next(iter(self.items))]
+        if self._stamps and stamp <= self._stamps[-1]:  # a recording that starts over, say
+            self._stamps, self._latest = [], []
+        self._stamps.append(stamp)
+        self._latest.append(item)
+        if len(self._stamps) > LIMIT:
+            del self._stamps[0], self._latest[0]
+
+    def find(self, stamp: int, reach: int, taken: Mapping[int, None]) -> Any:
+        """Return the item of a stamp, or of the two around it, or None."""
+        if stamp in self.items:
+            return self.items[stamp]
+        after = bisect_left(self._stamps, stamp)
+        if not 0 < after < len(self._stamps):
+            return None
+        first, second = self._stamps[after - 1:after + 1]
+        # What has the stamp of another set belongs to that one.
+        if second - first > reach or first in taken or second in taken:
+            return None
+        fraction = (stamp - first) / (second - first)
+        return NeighborPair(self._latest[after - 1], self._latest[after], fraction)
+
+    def is_past(self, stamp: int) -> bool:
+        """Say whether nothing for a stamp can come: others have passed it, and never match."""
+        return not self.matched and bool(self._stamps) and self._stamps[-1] > stamp
+
+    def distance(self, stamp: int) -> int | None:
+        """Return how far the nearest stamp is, ns; None where nothing has come."""
+        after = bisect_left(self._stamps, stamp)
+        near = self._stamps[max(after - 1, 0):after + 1]
+        return min((abs(stamp - one) for one in near), default=None)
 
 
 class StampJoin:
     """Sets of items by stamp: one item a topic.
 
     A set is ready when every required item is there, and every optional one of a topic that has
-    been coming; for those it waits `patience` seconds and then goes without.  Sets come out in the
-    order in which they began.
+    been matching; for those it waits `patience` seconds and then goes without.  Sets come out in
+    the order in which they began, under the stamp of their first required topic.
+
+    optional: by topic the required one whose stamp it shares.  reaches: ns, of optional topics of
+    which a set may be given the two items around its stamp, and how far apart those may be.
+    tolerance: ns, by which required items of a set may differ.
     """
 
-    def __init__(self, required: Sequence[str], optional: Sequence[str]) -> None:
+    def __init__(self, required: Sequence[str], optional: Mapping[str, str]) -> None:
+        self.reaches: dict[str, int] = {}
+        self.tolerance = 0
         self._required = tuple(required)
-        self._expected = dict.fromkeys(optional, True)
+        self._shares = dict(optional)
+        self._tracks = {topic: _Track() for topic in optional}
         self._pending: dict[int, Pending] = {}
+        self._recent = {topic: deque[int](maxlen=LIMIT) for topic in required}
+        self._taken: dict[int, None] = {}  # stamps of sets, ready or not
 
     def __len__(self) -> int:
-        """Return how many sets with a required item are waiting for their rest."""
-        return sum(self._holds_required(one.items) for one in self._pending.values())
+        """Return how many sets are waiting for their rest."""
+        return len(self._pending)
 
     def add(self, topic: str, stamp: int, item: Any, now: float) -> bool:
         """Take an item in; say whether it is the first required one of its set.
 
         now: s, on any steady clock.
         """
-        if topic in self._expected:
-            self._expected[topic] = True
-        items = self._pending.setdefault(stamp, Pending(stamp, now, {})).items
-        first = topic in self._required and not self._holds_required(items)
-        items[topic] = item
+        track = self._tracks.get(topic)
+        if track is not None:
+            track.add(stamp, item)
+            if any(self._find(topic, missed) is not None for missed in track.missed):
+                track.expected = True
+                track.missed.clear()
+            return False
+        self._recent[topic].append(stamp)
+        self._taken[stamp] = None
+        if len(self._taken) > LIMIT:
+            del self._taken[next(iter(self._taken))]
+        one = self._find_set(topic, stamp)
+        first = one is None
+        if one is None:
+            one = self._pending[stamp] = Pending(stamp, now, {}, {})
+        one.items[topic], one.stamps[topic] = item, stamp
         return first
 
-    def items(self, stamp: int) -> dict[str, Any]:
-        """Return the items of a set that is waiting, to be changed in place; empty for none."""
-        one = self._pending.get(stamp)
-        return one.items if one else {}
+    def waiting(self, topic: str, stamp: int) -> Any:
+        """Return an item that no set has taken yet; None where there is none."""
+        if topic in self._tracks:
+            return self._tracks[topic].items.get(stamp)
+        one = self._holding(topic, stamp)
+        return one and one.items[topic]
 
-    def forget(self, stamp: int) -> None:
-        """Forget a set."""
-        self._pending.pop(stamp, None)
+    def forget(self, topic: str, stamp: int) -> None:
+        """Forget an item; of a required one its set."""
+        if topic in self._tracks:
+            self._tracks[topic].items.pop(stamp, None)
+        elif one := self._holding(topic, stamp):
+            del self._pending[one.stamp]
 
     def expect_no_more(self, topic: str) -> None:
-        """Stop waiting for an optional topic until an item of it comes again."""
-        self._expected[topic] = False
+        """Stop waiting for an optional topic until it matches a set again."""
+        self._tracks[topic].expected = False
 
     def expect(self, topic: str) -> None:
         """Wait for an optional topic, for the patience of one set."""
-        self._expected[topic] = True
+        self._shares.setdefault(topic, self._required[0])
+        self._tracks.setdefault(topic, _Track()).expected = True
+
+    def distance(self, topic: str, stamp: int) -> int | None:
+        """Return how far the nearest stamp on a topic is, ns; None where nothing has come."""
+        if topic in self._tracks:
+            return self._tracks[topic].distance(stamp)
+        return min((abs(stamp - one) for one in self._recent[topic]), default=None)
 
     def ready(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that are ready."""
         for one in list(self._pending.values()):
             if any(topic not in one.items for topic in self._required):
                 continue
-            missing = [t for t, expected in self._expected.items()
-                       if expected and t not in one.items]
-            if missing and now - one.since <= patience:
+            found = {topic: self._find(topic, one.stamps[shared])
+                     for topic, shared in self._shares.items()}
+            awaited = [topic for topic, item in found.items() if item is None
+                       and self._tracks[topic].expected
+                       and not self._tracks[topic].is_past(one.stamps[self._shares[topic]])]
+            if awaited and now - one.since <= patience:
                 continue
-            for topic in missing:
-                self.expect_no_more(topic)
+            for topic, item in found.items():
+                self._settle(topic, one, item)
             del self._pending[one.stamp]
-            yield one
+            yield one._replace(stamp=one.stamps[self._required[0]])
 
     def given_up(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that lack a required item and are out of patience."""
@@ -86,5 +180,29 @@ class StampJoin:
                 del self._pending[one.stamp]
                 yield one
 
-    def _holds_required(self, items: dict[str, Any]) -> bool:
-        return any(topic in items for topic in self._required)
+    def _find(self, topic: str, stamp: int) -> Any:
+        return self._tracks[topic].find(stamp, self.reaches.get(topic, 0), self._taken)
+
+    def _settle(self, topic: str, one: Pending, item: Any) -> None:
+        """Give a set what there is of an optional topic; wait for that topic as it matches."""
+        track, stamp = self._tracks[topic], one.stamps[self._shares[topic]]
+        track.expected = item is not None
+        if item is None:
+            track.missed.append(stamp)
+            return
+        one.items[topic] = item
+        if track.items.pop(stamp, None) is not None:
+            track.matched = True
+
+    def _find_set(self, topic: str, stamp: int) -> Pending | None:
+        """Return the set that an item belongs to, if it is there: of those that lack it."""
+        if not self.tolerance:
+            return self._pending.get(stamp)
+        near = [one for one in self._pending.values() if topic not in one.items
+                and abs(one.stamp - stamp) <= self.tolerance]
+        return min(near, key=lambda one: abs(one.stamp - stamp),
+                   default=self._pending.get(stamp))
+
+    def _holding(self, topic: str, stamp: int) -> Pending | None:
+        return next((one for one in self._pending.values() if one.stamps.get(topic) == stamp),
+                    None)

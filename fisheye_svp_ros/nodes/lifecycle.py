@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 from rclpy.lifecycle import LifecycleNodeMixin, TransitionCallbackReturn
@@ -20,29 +19,26 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
 
     settings: SolverSettings
 
-    def __init__(self) -> None:
-        BaseNode.__init__(self)
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        BaseNode.__init__(self, node_name, **options)
         self._active = not self.settings.lifecycle
-        self._creations: list[Callable[[], Any]] = []
-        self._subscribed: list[Any] = []
         if self.settings.lifecycle:
             LifecycleNodeMixin.__init__(self)
 
-    def subscribe(self, create: Callable[[], Any]) -> None:
-        """Create a subscription, now or once the node is active."""
-        self._creations.append(create)
-        if self._active:
-            self._subscribed.append(create())
+    @property
+    def listening(self) -> bool:
+        """Whether the node is active."""
+        return self._active
 
     def take_up(self) -> None:
         """Take the initial parameters into use, unless `on_configure` is to do it."""
         if not self.settings.lifecycle:
             super().take_up()
 
-    def warn_of_unknown_parameters(self) -> None:
-        """Warn of what means nothing, once the node is active: some is said of its topics."""
+    def introduce(self) -> None:
+        """Say what the node listens to, once it does."""
         if self._active:
-            super().warn_of_unknown_parameters()
+            super().introduce()
 
     def has_listeners(self) -> bool:
         """Say whether there is anybody to work for; there is nobody for an inactive node."""
@@ -60,8 +56,9 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
     def on_activate(self, state: Any) -> Any:
         """Listen."""
         self._active = True
-        self._subscribed = [create() for create in self._creations]
-        self.warn_of_unknown_parameters()
+        for one in self._inputs.values():
+            one.subscribe()
+        self.introduce()
         return super().on_activate(state)
 
     def on_deactivate(self, state: Any) -> Any:
@@ -76,6 +73,5 @@ class ManagedNode(LifecycleNodeMixin, BaseNode):  # type: ignore[misc]
 
     def _fall_silent(self) -> None:
         self._active = False
-        for subscription in self._subscribed:
-            self.destroy_subscription(subscription)
-        self._subscribed = []
+        for one in self._inputs.values():
+            one.unsubscribe()

@@ -12,10 +12,10 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.lenses import lens_of
 from fisheye_svp_ros.nodes.markers import camera_shape
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
@@ -43,8 +43,8 @@ class Localizer(SolverNode):
     METRICS = LOCALIZATION_METRICS
     settings: LocalizerSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._pose = self.announce(PoseWithCovarianceStamped, '~/pose')
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')

@@ -23,14 +23,14 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import STEREO, Observations
-from fisheye_svp_ros.study.settings import SolverSettings
+from fisheye_svp_ros.study.settings import RigSettings
 
 T = TypeVar('T')
 
@@ -38,7 +38,7 @@ _MOST = 24  # parameters of a cause that are worth a topic each
 
 
 @dataclass(frozen=True)
-class ModelCriticSettings(SolverSettings):
+class ModelCriticSettings(RigSettings):
     """Parameters of the model critic."""
 
     sigma_px: float = parameter(
@@ -78,8 +78,8 @@ class ModelCritic(SolverNode):
     BY_SCENARIO = True
     settings: ModelCriticSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._scenario: frozenset[tuple[str, str]] = frozenset()
         self._latest: tuple[int, Items]
         self._asked: tuple[object, ...] = ()

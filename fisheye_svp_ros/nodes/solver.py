@@ -6,8 +6,7 @@ import functools
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,12 +29,14 @@ from fisheye_svp_ros.io.decoding import (
 )
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR_INPUT
+from fisheye_svp_ros.nodes.backlog import Arrivals, Counts, report
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.join import LIMIT, Pending, StampJoin
+from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin
 from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.lifecycle import ManagedNode
+from fisheye_svp_ros.nodes.quality import SENSOR
+from fisheye_svp_ros.nodes.standing import StandingLandmarks
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -45,50 +46,8 @@ from fisheye_svp_ros.study.solutions import Pair
 
 Items = Mapping[str, Any]
 
-
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
-_LONGEST_DRAIN = 0.05  # s of taking in before a set is solved, come what may
-_NONE = 'no landmarks; publish them on `landmarks`'
-_NONE_OF_STAMP = ('no landmarks of its stamp in time: they were late, lost because too much comes '
-                  'at once, or never sent')
-
-
-@dataclass
-class Counts:
-    """What became of the sets so far."""
-
-    taken: int = 0
-    solved: int = 0
-    unsolved: int = 0
-    dropped: int = 0
-    incomplete: int = 0
-
-
-class _Arrivals:
-    """When to stop taking in and solve; and how late the sets are."""
-
-    def __init__(self) -> None:
-        self.count = 0  # of messages
-        self.latency = 0.0  # s, of the latest set
-        self._seen = 0
-        self._since = self._restarted = time.monotonic()
-
-    def go_on(self, now: float) -> bool:
-        """Say whether more may be waiting to be taken in."""
-        fresh, self._seen = self.count != self._seen, self.count
-        if fresh and now - self._since < _LONGEST_DRAIN:
-            return True
-        self._since = now
-        return False
-
-    def done(self, now: float, began: float) -> None:
-        """Take note that a set is solved."""
-        self._since, self.latency = now, now - began
-
-    def restart(self) -> float:
-        """Return the seconds since the last call."""
-        before, self._restarted = self._restarted, time.monotonic()
-        return max(self._restarted - before, 1e-3)
+_NS = 10**9
 
 
 class SolverNode(ManagedNode):
@@ -103,31 +62,31 @@ class SolverNode(ManagedNode):
     METRICS: ClassVar[tuple[str, ...]]
     settings: SolverSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         engines.settle(engines.LOADING)  # a node runs for long, but its start must not
         self._metrics = {
             name: self.announce(Float64, f'~/metrics/{name}') for name in self.METRICS
         }
         self._image_points = tuple(f'{camera}image_points' for camera in self.cameras)
-        poses = [f'{camera}true_pose' for camera in self.cameras]
-        self._join = StampJoin(self._image_points, [*poses, 'landmarks', 'scenario'])
+        self._poses = {f'{camera}true_pose': f'{camera}image_points' for camera in self.cameras}
+        first = self._image_points[0]
+        self._join = StampJoin(
+            self._image_points, {**self._poses, 'landmarks': first, 'scenario': first})
         self._backlog: deque[Pending] = deque()
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
         self._counts = Counts()
-        self._reported = Counts()
-        self._arrivals = _Arrivals()
-        self._standing: LandmarkSet | None = None
-        self._in_series = False
+        self._arrivals = Arrivals()
+        self._standing = StandingLandmarks()
+        self._said = ''
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
         self._wake = self.create_guard_condition(self.guarded(self._work))
         self.collect(
-            PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, LATCHED_INPUT
-        )
+            PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
         self._collect(DiagnosticArray, 'scenario', read_key_values)
-        for topic in poses:
+        for topic in self._poses:
             self._collect(PoseStamped, topic, read_pose)
         # Last, because a camera that sees this subscription counts on the others.
         for topic in self._image_points:
@@ -162,7 +121,18 @@ class SolverNode(ManagedNode):
         lens = (f'lens {settings.lens}' if not told else
                 f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
         how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
-        self.get_logger().info(f'solving with the {lens} {how} (svp: {settings.svp})')
+        text = f'solving with the {lens} {how} (svp: {settings.svp})'
+        if text != self._said:
+            self.get_logger().info(text)
+        self._said = text
+        self._join.reaches = dict.fromkeys(self._poses, round(_NS * settings.true_pose_gap))
+        self._join.tolerance = round(_NS * settings.sync_tolerance)
+
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which nothing can be solved."""
+        lens = {'': ['scenario'], CAMERA_INFO: [f'{c}{CAMERA_INFO}' for c in self.cameras]}
+        topics = [*self._image_points, 'landmarks', *lens.get(self.settings.lens, ())]
+        return [(topic,) for topic in topics]
 
     @abstractmethod
     def solve(self, stamp: int, landmarks: LandmarkSet, items: Items) -> None:
@@ -231,24 +201,7 @@ class SolverNode(ManagedNode):
 
         taken = solved + not solved + dropped + incomplete + waiting, at any time.
         """
-        counts, before, seconds = self._counts, self._reported, self._arrivals.restart()
-        self._reported = replace(counts)
-        waiting = len(self._backlog) + len(self._join)
-        came = (counts.taken - before.taken) / seconds
-        done = (counts.solved + counts.unsolved - before.solved - before.unsolved) / seconds
-        latency = self._arrivals.latency
-        told = {
-            'sets: taken': counts.taken, 'sets: solved': counts.solved,
-            'sets: not solved': counts.unsolved, 'sets: dropped': counts.dropped,
-            'sets: incomplete': counts.incomplete, 'sets: waiting': waiting,
-            'sets: come per second': round(came, 1), 'sets: done per second': round(done, 1),
-            'sets: latency_s': round(latency, 4),
-        }
-        if counts.dropped == before.dropped:
-            return told, ''
-        return told, (f'cannot keep up: {came:.0f} sets come in a second and {done:.0f} are '
-                      f'solved, {latency:.2f} s late; {waiting} wait, {counts.dropped} are '
-                      'dropped')
+        return report(self._counts, self._arrivals, len(self._backlog) + len(self._join))
 
     def _listen_to_camera_info(self) -> None:
         def hear(topic: str, stamp: int, unread: Unread) -> None:
@@ -260,7 +213,7 @@ class SolverNode(ManagedNode):
             if not self.listens_to(topic):
                 self._join.expect(topic)
                 self.collect(CameraInfo, topic, read_camera_info, functools.partial(hear, topic),
-                             LATCHED_INPUT, SENSOR_INPUT)
+                             SENSOR, latched=True)
 
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         self.collect(kind, topic, read, functools.partial(self._add, topic))
@@ -274,10 +227,7 @@ class SolverNode(ManagedNode):
     def _hear_landmarks(self, stamp: int, unread: Unread) -> None:
         if stamp:
             self._add('landmarks', stamp, unread)
-        else:
-            self._in_series = False
-        if not self._in_series:
-            self._standing = unread.read()
+        self._standing.hear(stamp, unread)
         if not stamp:
             self._join.expect_no_more('landmarks')
             self._wake.trigger()
@@ -288,7 +238,9 @@ class SolverNode(ManagedNode):
         if self._arrivals.go_on(now):
             self._wake.trigger()
             return
-        self._backlog.extend(self._join.ready(now, patience))
+        for one in self._join.ready(now, patience):
+            self._backlog.append(one)
+            self._compare_stamps(one)
         for one in self._join.given_up(now, patience):
             self._give_up(one)
         while len(self._backlog) > self.settings.backlog:
@@ -305,30 +257,34 @@ class SolverNode(ManagedNode):
         if self._backlog or self._unread:
             self._wake.trigger()
 
+    def _compare_stamps(self, one: Pending) -> None:
+        """Say how far off the true poses are that come and are of no use to a set."""
+        for topic, points in self._poses.items():
+            off = self._join.distance(topic, one.stamps[points])
+            if topic not in one.items and off is not None:
+                self.warn(f'{topic}: the nearest stamp is {1e-6 * off:.1f} ms from that of the '
+                          f'image points; between true poses that are up to true_pose_gap '
+                          f'({self.settings.true_pose_gap:g} s) apart a set is interpolated')
+
     def _look_at(self, stamp: int, topic: str) -> None:
         """Decode what waits for the rest of its set, so that bad input is told of at once."""
-        items = self._join.items(stamp)
-        if not isinstance(items.get(topic), Unread):
+        item = self._join.waiting(topic, stamp)
+        if not isinstance(item, Unread):
             return
         try:
-            items[topic] = items[topic].read()
+            item.read()
         except FisheyeSvpError as error:
             self.drop(topic, error)
-            del items[topic]
+            self._join.forget(topic, stamp)
             if topic in self._image_points:
-                self._join.forget(stamp)
                 self._fail(stamp, str(error))
 
     def _attempt(self, one: Pending) -> None:
         topic = self._image_points[0]
         try:
             items = self._contents(one.items)
-            landmarks: LandmarkSet | None = items.get('landmarks', self._standing)
-            if 'landmarks' in items:
-                # Landmarks come set by set: from now on those of another set never stand in.
-                self._in_series, self._standing = True, None
-            if landmarks is None:
-                raise ObservationError(f'{topic}: {_NONE_OF_STAMP if self._in_series else _NONE}')
+            landmarks = self._standing.find_for_set(
+                items.get('landmarks'), self._join.distance('landmarks', one.stamp))
             self.solve(one.stamp, landmarks, items)
             self._counts.solved += 1
         except FisheyeSvpError as error:
@@ -343,7 +299,8 @@ class SolverNode(ManagedNode):
         items = {}
         for topic, item in unread.items():
             try:
-                items[topic] = item.read() if isinstance(item, Unread) else item
+                items[topic] = (_interpolated_pose(item) if isinstance(item, NeighborPair)
+                                else item.read())
             except FisheyeSvpError as error:
                 if topic in (*self._image_points, 'landmarks'):
                     raise
@@ -355,10 +312,23 @@ class SolverNode(ManagedNode):
         self.publish_result(stamp, {}, problem)
 
     def _give_up(self, one: Pending) -> None:
-        present = [topic for topic in self._image_points if topic in one.items]
-        for topic in present:
-            self.drop(topic, ObservationError(f'{topic}: the other camera has no set like it'))
-        self._counts.incomplete += bool(present)
+        self._counts.incomplete += 1
+        missing = [topic for topic in self._image_points if topic not in one.items]
+        for topic, stamp in one.stamps.items():
+            reason = self._reason(missing[0], stamp) if missing else 'too many sets wait'
+            self.drop(topic, ObservationError(f'{topic}: {reason}'))
+
+    def _reason(self, missing: str, stamp: int) -> str:
+        off = self._join.distance(missing, stamp)
+        if off is None:
+            return f'nothing has come on {missing}'
+        return (f'the nearest stamp on {missing} is {1e-6 * off:.1f} ms off; with '
+                'approximate_sync:=true approximate_sync_tolerance_seconds is allowed')
+
+
+def _interpolated_pose(poses: NeighborPair) -> Pose:
+    first, second = poses.first.read(), poses.second.read()
+    return Pose(*first.retract(poses.fraction * second.difference(first)))
 
 
 def known_points(landmarks: LandmarkSet, seen: ImagePoints) -> Array:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
 
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
@@ -27,8 +29,8 @@ class StereoCalibrator(SolverNode):
     BY_SCENARIO = True
     settings: StereoCalibratorSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._rig = self.announce(TransformStamped, '~/rig', LATCHED)
         self._position_error = self.announce(Vector3Stamped, '~/position_error')
         self._rotation_error = self.announce(Vector3Stamped, '~/rotation_error')

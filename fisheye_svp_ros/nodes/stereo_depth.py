@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from geometry_msgs.msg import TransformStamped
 from sensor_msgs.msg import PointCloud2
@@ -13,8 +16,8 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, LATCHED_INPUT
 from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.solver import (
     Items,
     SolverNode,
@@ -39,12 +42,12 @@ class StereoDepth(SolverNode):
     CAMERAS = tuple(f'{name}/' for name in STEREO)
     settings: StereoDepthSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._points = self.announce(PointCloud2, '~/points')
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._latest: Pose | None = None
-        self.listen(TransformStamped, 'rig', decoding.read_transform, self._hear, LATCHED_INPUT)
+        self.listen(TransformStamped, 'rig', decoding.read_transform, self._hear, latched=True)
         self.start()
 
     def prepare(self, settings: SolverSettings) -> SolverSettings:
@@ -56,6 +59,11 @@ class StereoDepth(SolverNode):
         """Load the lens and the rig."""
         self._given = _rig_file(settings)
         super().configure(settings)
+
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which nothing can be measured."""
+        rig = {'topic': ['rig'], 'true': [f'{camera}true_pose' for camera in self.CAMERAS]}
+        return [*super().needed_inputs(), *((t,) for t in rig.get(self.settings.rig, ()))]
 
     def _hear(self, _: int, rig: Pose) -> None:
         self._latest = rig

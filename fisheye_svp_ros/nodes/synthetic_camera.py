@@ -17,9 +17,9 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, parameter, sweep_of
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
+from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -73,11 +73,12 @@ class SyntheticCamera(CameraNode):
     SETTINGS = PhotographingSettings
     settings: PhotographingSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         self._sweep = sweep_of(Scenario, self.given)
         for name, values in self._sweep.lists.items():
-            self.declare_parameter(SWEEP + name, values, ParameterDescriptor(read_only=True))
+            self.declare_parameter(SWEEP + name, values, ParameterDescriptor(read_only=True),
+                                   ignore_override=True)
         self._markers = self.announce(MarkerArray, 'markers', LATCHED)
         self.start()
 

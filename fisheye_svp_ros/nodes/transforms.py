@@ -6,7 +6,8 @@ from typing import Any
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED, RELIABLE, BaseNode
+from fisheye_svp_ros.nodes.base import BaseNode
+from fisheye_svp_ros.nodes.quality import LATCHED, RELIABLE
 from fisheye_svp_ros.pose import Pose
 
 

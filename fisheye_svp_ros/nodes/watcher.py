@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values
-from fisheye_svp_ros.nodes.base import RELIABLE
+from fisheye_svp_ros.nodes.quality import RELIABLE
 from fisheye_svp_ros.nodes.timers import every
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'

@@ -70,11 +70,14 @@ class SolverSettings(Settings):
         2.0, 'How long image points wait for what shares their stamp on other topics', 's',
         (0.0, 3600.0)
     )
+    true_pose_gap: float = parameter(
+        0.1, 'Two true poses of other stamps may be so far apart for a set between them to be '
+        'interpolated; 0: only a true pose of its own stamp counts', 's', (0.0, 60.0)
+    )
     backlog: int = parameter(
         100, 'Sets that may wait to be solved; beyond them the oldest are dropped and counted',
         span=(1, 10_000)
     )
-
     lifecycle: bool = parameter(
         False, 'Be a managed node: `configure` loads the lens, `activate` listens', fixed=True
     )
@@ -83,6 +86,29 @@ class SolverSettings(Settings):
     def solves_svp(self) -> bool:
         """Whether to solve without the viewpoint shift of the lens."""
         return self.svp == 'true' or (self.svp == 'auto' and not self.lens)
+
+    @property
+    def sync_tolerance(self) -> float:
+        """How far apart the stamps of one set may be, s."""
+        return 0.0
+
+
+@dataclass(frozen=True)
+class RigSettings(SolverSettings):
+    """Parameters of every node that solves for two cameras."""
+
+    approximate_sync: bool = parameter(
+        False, 'Pair image points of the two cameras whose stamps differ'
+    )
+    approximate_sync_tolerance_seconds: float = parameter(
+        0.005, 'With approximate_sync, by how much they may: less than half the time between two '
+        'images', 's', (0.0, 10.0)
+    )
+
+    @property
+    def sync_tolerance(self) -> float:
+        """How far apart the stamps of one set may be, s."""
+        return self.approximate_sync_tolerance_seconds if self.approximate_sync else 0.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +129,7 @@ class LocalizerSettings(SolverSettings):
 
 
 @dataclass(frozen=True)
-class StereoCalibratorSettings(SolverSettings):
+class StereoCalibratorSettings(RigSettings):
     """Parameters of the stereo calibrator."""
 
     publish_tf: bool = parameter(
@@ -118,7 +144,7 @@ class StereoCalibratorSettings(SolverSettings):
 
 
 @dataclass(frozen=True)
-class StereoDepthSettings(SolverSettings):
+class StereoDepthSettings(RigSettings):
     """Parameters of stereo depth."""
 
     rig: str = parameter(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -264,23 +263,6 @@ def test_landmarks_that_are_latched_are_heard_late_and_once(graph: Callable[...,
     attack.graph.until(lambda: attack.counts()['landmarks: received'] == '1')
     attack.solves(3)
     assert attack.counts()['landmarks: received'] == '2'
-
-
-def test_twins_take_every_message_once_and_in_order() -> None:
-    heard: list[bytes] = []
-    one, other = inputs.twins(heard.append)
-    for hear, data in ((one, b'a'), (one, b'b'), (other, b'a'), (other, b'b'), (other, b'c'),
-                       (one, b'a'), (other, b'a')):
-        hear(data)
-    assert heard == [b'a', b'b', b'c', b'a']
-
-
-def test_twins_keep_no_message() -> None:
-    one, _ = inputs.twins(lambda _: None)
-    data = bytes(1000)
-    before = sys.getrefcount(data)
-    one(data)
-    assert sys.getrefcount(data) == before
 
 
 @pytest.mark.parametrize('topics', ['!!bad name//', 'localizer/result 9x', '/', 'a//b'])

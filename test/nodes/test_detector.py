@@ -131,10 +131,12 @@ def test_an_image_that_comes_raw_and_compressed_is_searched_once(detecting: Grap
     data = array('B', cv2.imencode('.png', image)[1].tobytes())
     detecting.until(lambda: (images.publish(raw(image, 5)), points)[1])
     detecting.idle(0.5)
+    detecting.until(detecting.detector._look.is_canceled)
+    detecting.idle(0.2)
     heard = len(points)
     detecting.until(lambda: (
         tell.publish(CompressedImage(header=header(5), format='png', data=data)),
-        detecting.detector._inputs['image/compressed'].received > 2)[1])
+        detecting.detector._inputs['image/compressed'].count.received > 2)[1])
     detecting.until(lambda: (images.publish(raw(image, 6)), stamp_of(points[-1]) == 6)[1])
     assert [stamp_of(one) for one in points[heard:]].count(5) == 0
 

@@ -16,7 +16,7 @@ import pytest
 from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT, NodeProcess
 
-from fisheye_svp_ros.nodes import NODES, base, executables
+from fisheye_svp_ros.nodes import NODES, base, executables, running
 
 _CODE = """
 import sys
@@ -191,7 +191,7 @@ def test_what_fails_once_a_signal_has_ended_the_context_is_no_failure(
 ) -> None:
     def fail(*_: object, **__: object) -> None:
         if ended:
-            base.rclpy.shutdown()
+            running.rclpy.shutdown()
         raise RuntimeError('the context is not valid')
 
     monkeypatch.setattr(base.BaseNode, 'announce', fail)

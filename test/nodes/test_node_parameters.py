@@ -208,9 +208,58 @@ def test_a_sweep_is_the_product_of_its_lists_the_last_fastest() -> None:
 def test_a_parameter_that_means_nothing_is_named(
     start: Callable[..., Any], capfd: pytest.CaptureFixture[str]
 ) -> None:
-    start('localizer', '-p', 'lenz:=fish180')
+    start('localizer', '-p', 'lenz:=fish180', '-p', 'noise_px:=1.0')
     said = capfd.readouterr().err
-    assert "parameter 'lenz' means nothing to this node; it knows " in said
+    assert "parameter 'lenz' means nothing to this node; did you mean 'lens'?" in said
+    assert "parameter 'noise_px' means nothing to this node; it knows " in said
+
+
+def test_what_a_file_says_of_all_nodes_may_be_for_others(
+    start: Callable[..., Any], capfd: pytest.CaptureFixture[str], tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    file = tmp_path / 'all.yaml'
+    file.write_text('/**: {ros__parameters: {noise_px: 1.0, camera.exposure: 7, patence: 1.0}}\n'
+                    'localizer: {ros__parameters: {radius: 1.0}}\n')
+    monkeypatch.setattr('sys.argv', ['localizer', '--ros-args', '--params-file', str(file)])
+    start('localizer', '--params-file', str(file))
+    said = capfd.readouterr().err
+    assert 'noise_px' not in said and 'exposure' not in said
+    assert "'patence' means nothing to this node; did you mean 'patience'?" in said
+    assert "'radius' means nothing to this node; it knows" in said
+
+
+@pytest.mark.parametrize(('node', 'words', 'wanted'), [
+    ('synthetic_camera', ('noise_px:=1', 'radius:=2', 'rate:=50'),
+     {'noise_px': 1.0, 'radius': 2.0, 'rate': 50.0}),
+    ('synthetic_camera', ('poses:=[0, 0, 0, 1, 0, 0, 0]',), {'poses': [0.0, 0, 0, 1, 0, 0, 0]}),
+    ('synthetic_camera', ('sweep.radius:=[2, 1]',), {'sweep.radius': [2.0, 1.0]}),
+    ('localizer', ('patience:=3',), {'patience': 3.0}),
+])
+def test_whole_numbers_are_taken_where_others_are_asked_for(
+    start: Callable[..., Any], node: str, words: tuple[str, ...], wanted: dict[str, Any]
+) -> None:
+    one = start(node, *(word for pair in words for word in ('-p', pair)))
+    for name, value in wanted.items():
+        found = one.get_parameter(name).value
+        assert found == pytest.approx(value)
+        assert all(type(v) is float for v in (found if isinstance(value, list) else [found]))
+
+
+def test_overrides_of_qos_do_not_bury_those_of_the_node(start: Callable[..., Any]) -> None:
+    node = start('localizer', '-p', 'qos_overrides./image_points.subscription.depth:=7')
+    names = {*node.list_parameters([], 0).names}
+    assert {name for name in names if name.startswith('qos_overrides')} == {
+        'qos_overrides./image_points.subscription.depth'}
+
+
+def test_the_lens_is_said_when_it_changes(
+    start: Callable[..., Any], capfd: pytest.CaptureFixture[str]
+) -> None:
+    node = start('localizer', '-p', 'lens:=fish180')
+    for name, value in (('patience', 1.0), ('sigma_px', 0.5), ('lens', 'fish214')):
+        assert set_parameter(node, name, value).successful
+    assert capfd.readouterr().err.count('solving with the lens') == 2
 
 
 def test_parameter_files_and_documentation_say_what_the_code_says() -> None:

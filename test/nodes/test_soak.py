@@ -22,8 +22,7 @@ KINDS = {'landmarks': PointCloud2, 'scenario': DiagnosticArray, 'true_pose': Pos
 
 
 def test_every_hostile_message_is_received_read_and_counted(graph: Callable[..., Graph]) -> None:
-    g = graph('patience:=5.0', 'backlog:=10000',
-              'qos_overrides./landmarks.subscription_volatile.depth:=1000')
+    g = graph('patience:=5.0', 'backlog:=10000')
     results, diagnostics = g.hear(DiagnosticArray, 'localizer/result'), g.hear(
         DiagnosticArray, '/diagnostics')
     g.start(Localizer)

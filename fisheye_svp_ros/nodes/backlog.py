@@ -1,0 +1,72 @@
+"""What became of the sets of a solver, and whether it keeps up with them."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+_LONGEST_DRAIN = 0.05  # s of taking in before a set is solved, come what may
+
+
+@dataclass
+class Counts:
+    """What became of the sets so far."""
+
+    taken: int = 0
+    solved: int = 0
+    unsolved: int = 0
+    dropped: int = 0
+    incomplete: int = 0
+
+
+class Arrivals:
+    """When to stop taking in and solve; and how late the sets are."""
+
+    def __init__(self) -> None:
+        self.count = 0  # of messages
+        self.latency = 0.0  # s, of the latest set
+        self._seen = 0
+        self._since = self._restarted = time.monotonic()
+        self._reported = Counts()
+
+    def go_on(self, now: float) -> bool:
+        """Say whether more may be waiting to be taken in."""
+        fresh, self._seen = self.count != self._seen, self.count
+        if fresh and now - self._since < _LONGEST_DRAIN:
+            return True
+        self._since = now
+        return False
+
+    def done(self, now: float, began: float) -> None:
+        """Take note that a set is solved."""
+        self._since, self.latency = now, now - began
+
+    def restart(self, counts: Counts) -> tuple[Counts, float]:
+        """Return the counts at the last call, and the seconds since; remember those of now."""
+        counted, self._reported = self._reported, replace(counts)
+        before, self._restarted = self._restarted, time.monotonic()
+        return counted, max(self._restarted - before, 1e-3)
+
+
+def report(
+    counts: Counts, arrivals: Arrivals, waiting: int
+) -> tuple[dict[str, object], str]:
+    """Return the counts since the start, and what is wrong since the last report.
+
+    taken = solved + not solved + dropped + incomplete + waiting, at any time.
+    """
+    before, seconds = arrivals.restart(counts)
+    came = (counts.taken - before.taken) / seconds
+    done = (counts.solved + counts.unsolved - before.solved - before.unsolved) / seconds
+    latency = arrivals.latency
+    told: dict[str, object] = {
+        'sets: taken': counts.taken, 'sets: solved': counts.solved,
+        'sets: not solved': counts.unsolved, 'sets: dropped': counts.dropped,
+        'sets: incomplete': counts.incomplete, 'sets: waiting': waiting,
+        'sets: come per second': round(came, 1), 'sets: done per second': round(done, 1),
+        'sets: latency_s': round(latency, 4),
+    }
+    if counts.dropped == before.dropped:
+        return told, ''
+    return told, (f'cannot keep up: {came:.0f} sets come in a second and {done:.0f} are solved, '
+                  f'{latency:.2f} s late; {waiting} wait, {counts.dropped} are dropped')

@@ -1,0 +1,89 @@
+"""How a node runs as a process: from its arguments to its exit status."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.executors import ExternalShutdownException
+
+from fisheye_svp_ros.errors import FisheyeSvpError
+from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
+
+_SAME_INTERRUPT = 1.0  # s between two interrupts that are one
+
+
+def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
+    """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
+    signal.signal(signal.SIGINT, _interrupting_without_echo())
+    try:
+        try:
+            rclpy.init(args=args)
+        except Exception as error:
+            return _refuse(kind, f'ROS arguments or environment: {error}')
+        return _run(kind)
+    except KeyboardInterrupt:
+        return 0
+
+
+def _interrupting_without_echo() -> Callable[..., None]:
+    """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
+
+    The second one would end what the first one has begun to put away.  A later one counts again:
+    the first is lost where C code calls Python and drops its exceptions.
+    """
+    last = -math.inf
+
+    def interrupt(*_: Any) -> None:
+        nonlocal last
+        before, last = last, time.monotonic()
+        if last - before > _SAME_INTERRUPT:
+            raise KeyboardInterrupt
+
+    return interrupt
+
+
+def _run(kind: type[BaseNode]) -> int:
+    node = None
+    try:
+        node = kind()
+        _spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Failed as error:
+        return _refuse(kind, error)
+    except Finished:
+        pass
+    except (FisheyeSvpError, ParameterException, NameValidationException) as error:
+        return _refuse(kind, error)
+    except Exception:
+        # A signal ends the context between any two calls; what fails then is no failure.
+        if rclpy.ok():
+            raise
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+def _spin(node: BaseNode) -> None:
+    while rclpy.ok():
+        try:
+            rclpy.spin(node)
+        except (ExternalShutdownException, Finished):
+            raise
+        except Exception as error:  # of the client library, about what came over the wire
+            node.unforeseen(error)
+
+
+def _refuse(kind: type[BaseNode], error: Exception | str) -> int:
+    print(f'{kind.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+    return 2

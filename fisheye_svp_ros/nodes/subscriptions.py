@@ -1,0 +1,137 @@
+"""The inputs of a node: each is heard from whoever publishes it, whatever it offers.
+
+Who asks for more than a publisher offers does not hear it, and who asks for less does not get
+what a latched publisher has sent before.  So an input asks for what the topic usually has, and
+adds a subscription when a publisher appears that offers something else.  To ask for all at once
+would have the log of every driver say that no messages are sent.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from copy import copy
+from typing import Any
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
+
+from fisheye_svp_ros.nodes.inputs import Count
+from fisheye_svp_ros.nodes.quality import create_with_qos, overridden
+
+_MAX_HASHES = 100  # messages by which one subscription of a topic may be ahead of another
+
+_Kind = tuple[bool, bool]  # of a subscription: reliable, latched
+
+
+class Input:
+    """A topic that a node listens to, and how many messages have come.
+
+    name: to be resolved; resolved: the full name, after remapping; typename: as `ros2 topic list
+    -t` has it; latched: whether what was published before is wanted as well.
+    """
+
+    def __init__(
+        self, node: Any, kind: Any, name: str, receive: Callable[[bytes], None], qos: Any,
+        latched: bool,
+    ) -> None:
+        self.name, self.count = name, Count()
+        self.resolved = str(node.resolve_topic_name(name))
+        self.typename = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+        self._node, self._kind, self._receive = node, kind, receive
+        self._qos, self._latched = qos, latched
+        self._subscriptions: dict[_Kind, Any] = {}
+        self._since, self._before = 0.0, 0
+
+    @property
+    def profiles(self) -> list[Any]:
+        """What is asked for; empty while the node does not listen."""
+        return [one.qos_profile for one in self._subscriptions.values()]
+
+    def silent_for(self) -> float:
+        """Return for how many seconds it has been listened to in vain; 0 if it has not."""
+        waits = self._subscriptions and self.count.received == self._before
+        return time.monotonic() - self._since if waits else 0.0
+
+    def subscribe(self) -> None:
+        """Listen."""
+        self._since, self._before = time.monotonic(), self.count.received
+        self._filter = DuplicateFilter(self._receive, self._latched)
+        reliable = self._qos.reliability != ReliabilityPolicy.BEST_EFFORT
+        self._add_subscription((reliable, False), self._qos)
+
+    def unsubscribe(self) -> None:
+        """Listen no more."""
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+
+    def adapt(self) -> None:
+        """Add the subscriptions that the publishers of the topic need."""
+        if not self._subscriptions or self._is_fixed():
+            return
+        usual, first = next(iter(self._subscriptions.items()))
+        for publisher in self._node.get_publishers_info_by_topic(self.resolved):
+            offered = publisher.qos_profile
+            latched = self._latched and offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            reliable = offered.reliability != ReliabilityPolicy.BEST_EFFORT
+            needed = reliable and (usual[0] or latched), latched
+            if publisher.topic_type == self.typename and needed not in self._subscriptions:
+                qos = copy(first.qos_profile)
+                qos.reliability = (ReliabilityPolicy.RELIABLE if needed[0]
+                                   else ReliabilityPolicy.BEST_EFFORT)
+                if latched:
+                    qos.durability = DurabilityPolicy.TRANSIENT_LOCAL
+                self._add_subscription(needed, qos)
+
+    def _is_fixed(self) -> bool:
+        """Say whether the user has decided what to ask for."""
+        chosen = overridden(self._node, self.resolved, 'subscription')
+        return bool({QoSPolicyKind.RELIABILITY, QoSPolicyKind.DURABILITY} & {*chosen})
+
+    def _add_subscription(self, kind: _Kind, qos: Any) -> None:
+        node = self._node
+        adapt = node.guarded(lambda _: self.adapt())
+        events = SubscriptionEventCallbacks(
+            matched=adapt if self._latched else None,
+            incompatible_qos=None if self._is_fixed() else adapt)
+        self._subscriptions[kind] = create_with_qos(
+            node, node.create_subscription, self._kind, self.name, self._filter.callback(),
+            qos=qos, raw=True, event_callbacks=events)
+
+
+class DuplicateFilter:
+    """Passes on what comes to several subscriptions, each message once.
+
+    Messages are known by their hashes: to keep them would keep the last hundred.  history: a
+    later subscription may bring what came before.
+    """
+
+    def __init__(self, receive: Callable[[bytes], None], history: bool) -> None:
+        self._receive, self._history = receive, history
+        self._callbacks = 0
+        self._passed: OrderedDict[int, int] = OrderedDict()  # how often, by hash
+        self._heard: Counter[tuple[int, int]] = Counter()  # how often, by subscription and hash
+
+    def callback(self) -> Callable[[bytes], None]:
+        """Return the callback of one more subscription."""
+        number = self._callbacks
+        self._callbacks += 1
+
+        def hear(data: bytes) -> None:
+            if self._callbacks == 1 and not self._history:
+                self._receive(data)
+                return
+            key = hash(data)
+            self._heard[number, key] += 1
+            if self._heard[number, key] <= self._passed.get(key, 0):
+                return
+            self._passed[key] = self._passed.pop(key, 0) + 1
+            if len(self._passed) > _MAX_HASHES:
+                old, _ = self._passed.popitem(last=False)
+                for one in range(self._callbacks):
+                    self._heard.pop((one, old), None)
+            self._receive(data)
+
+        return hear

@@ -1,0 +1,325 @@
+"""What goes wrong in the first hour: nodes say what docs/reference/nodes.md says."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.graph import LATCHED, Graph
+from helpers.nodes import ROOT
+from helpers.photographs import BOARD
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
+from geometry_msgs.msg import PoseStamped  # isort: skip
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # isort: skip
+from std_msgs.msg import String  # isort: skip
+
+from fisheye_svp_ros.io.landmark_files import environment
+from fisheye_svp_ros.nodes import messages
+from fisheye_svp_ros.nodes.detector import Detector
+from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
+from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
+
+SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+MS = 10**6
+SOLVING = ('lens:=fish214', 'svp:=true', 'patience:=0.2')
+
+
+def rows_of_the_table() -> dict[str, str]:
+    """Return what a node says, as a pattern, by symptom."""
+    text = (ROOT / 'docs' / 'reference' / 'nodes.md').read_text(encoding='utf-8')
+    table = text.partition('<!-- first hour -->')[2].partition('<!-- end -->')[0]
+    rows = [[cell.strip() for cell in line.strip('| ').split(' | ')]
+            for line in table.strip().splitlines()[2:]]
+    assert all(len(row) == 3 for row in rows)
+    return {symptom: re.escape(told.strip('`')).replace('…', '.+') for symptom, told, _ in rows}
+
+
+TABLE = rows_of_the_table()
+TRIED: dict[str, Callable[..., None]] = {}
+
+
+def tries(symptom: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Register what brings a symptom about."""
+    def register(test: Callable[..., None]) -> Callable[..., None]:
+        TRIED[symptom] = test
+        return test
+
+    return register
+
+
+class Hour:
+    """A graph in which something is wrong, and what its nodes say of it."""
+
+    def __init__(self, graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]) -> None:
+        self.start, self._capfd = graph, capfd
+        self.graph: Graph
+
+    def begin(self, *parameters: str) -> Graph:
+        self.graph = self.start(*parameters)
+        self.reports = self.graph.hear(DiagnosticArray, '/diagnostics')
+        return self.graph
+
+    def says(self, pattern: str, act: Callable[[], object] = lambda: None) -> None:
+        """Assert that /diagnostics warns so while something is done again and again."""
+        def told() -> bool:
+            act()
+            return any(re.search(pattern, status.message) and status.level == status.WARN
+                       for report in self.reports for status in report.status)
+
+        try:
+            self.graph.until(told, 20)
+        except AssertionError:
+            texts = {status.message for report in self.reports for status in report.status}
+            pytest.fail(f'{pattern!r} is not in {texts}')
+
+    def logs(self, pattern: str) -> None:
+        """Assert that the log says so."""
+        assert re.search(pattern, self._capfd.readouterr().err)
+
+
+@pytest.fixture
+def hour(graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str],
+         monkeypatch: pytest.MonkeyPatch) -> Hour:
+    monkeypatch.setattr('fisheye_svp_ros.nodes.base.LIMIT', 0.5)
+    return Hour(graph, capfd)
+
+
+def image_points(stamp: int = 7, ids: Any = None) -> Any:
+    seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
+    return messages.image_points_message(
+        seen.landmark if ids is None else ids, seen.uv, stamp, 'camera')
+
+
+def landmarks(stamp: int = 0) -> Any:
+    return messages.landmarks_message(environment('whole', 2.0), stamp, 'world')
+
+
+@tries('Nothing comes: the topic has another name')
+def another_name(hour: Hour, pattern: str) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    g.probe.create_publisher(Image, '/camera/image_raw', SENSOR)
+    g.start(Detector)
+    hour.says(pattern)
+    hour.logs(pattern)
+
+
+@tries('Nothing comes: nobody publishes')
+def nobody(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    hour.says(pattern)
+    hour.logs('nothing has come on /image_points: nobody')
+
+
+@tries('Nothing comes: the topic has another type')
+def another_type(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    context = Context()  # one process cannot have two types on one topic
+    context.init(domain_id=int(os.environ['ROS_DOMAIN_ID']))
+    stranger = Node('stranger', context=context)
+    stranger.create_publisher(String, '/image_points', 1)
+    g.start(Localizer)
+    hour.says(pattern)
+    stranger.destroy_node()
+    context.shutdown()
+
+
+@tries('Nothing comes: an override of the quality of service')
+def another_qos(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING, 'qos_overrides./image_points.subscription.reliability:=reliable')
+    driver = g.probe.create_publisher(PointCloud2, '/image_points', SENSOR)
+    g.start(Localizer)
+    hour.says(pattern, lambda: driver.publish(image_points()))
+
+
+@tries('Nothing comes of large images')
+def large_images(hour: Hour, pattern: str) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    g.probe.create_publisher(Image, '/image', SENSOR)
+    g.start(Detector)
+    hour.says(pattern)
+
+
+@tries('No errors: true poses have stamps of their own, and are far apart')
+def far_poses(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    truth = g.tell(PoseStamped, 'true_pose')
+    told.publish(landmarks())
+    for stamp in (800, 1200):
+        truth.publish(messages.pose_message(identity(), stamp * MS, 'world'))
+    hour.says(pattern, lambda: points.publish(image_points(1000 * MS)))
+
+
+@tries('A rig gives nothing: the stamps of its cameras differ')
+def stereo_stamps(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(StereoDepth)
+    left, right = (g.tell(PointCloud2, f'{name}/image_points') for name in ('left', 'right'))
+    hour.says(pattern, lambda: (left.publish(image_points(1000 * MS)),
+                                right.publish(image_points(1001 * MS))))
+
+
+@tries('All sets fail: landmarks and image points have other ids')
+def other_ids(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(landmarks())
+    ids = np.arange(len(image_points().data) // 20) + 100
+    hour.says(pattern, lambda: points.publish(image_points(ids=ids)))
+
+
+@tries('All sets fail: no lens is named')
+def no_lens(hour: Hour, pattern: str) -> None:
+    g = hour.begin('patience:=0.1')
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(landmarks())
+    hour.says(pattern, lambda: points.publish(image_points()))
+
+
+@tries('All sets fail: the camera was never calibrated')
+def not_calibrated(hour: Hour, pattern: str) -> None:
+    g = hour.begin('lens:=camera_info', 'patience:=0.1')
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    driver = g.tell(CameraInfo, 'camera_info', SENSOR)
+    told.publish(landmarks())
+    hour.says(pattern, lambda: (driver.publish(CameraInfo(width=640, height=480)),
+                                points.publish(image_points())))
+
+
+@tries('Some landmarks are latched under the stamp of one set, others under that of another')
+def landmarks_of_one_set(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    for stamp in (1000, 2000):
+        told.publish(landmarks(stamp * MS))
+        points.publish(image_points(stamp * MS))
+    hour.says(pattern, lambda: points.publish(image_points(3000 * MS)))
+
+
+@tries('No board is found: depth images in place of photographs')
+def depth_images(hour: Hour, pattern: str) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    g.hear(PointCloud2, 'image_points')
+    g.start(Detector)
+    images = g.tell(Image, 'image', SENSOR)
+    hour.says(pattern, lambda: images.publish(
+        Image(height=1, width=1, encoding='32FC1', step=4, data=b'\0' * 4)))
+
+
+@tries('Poses are off: camera_info is of another image size')
+def another_size(hour: Hour, pattern: str) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    g.hear(PointCloud2, 'image_points')
+    g.start(Detector)
+    images, driver = g.tell(Image, 'image', SENSOR), g.tell(CameraInfo, 'camera_info', SENSOR)
+    info = CameraInfo(width=848, height=400, distortion_model='equidistant', d=[0.0] * 4,
+                      k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0])
+    image = messages.image_message(np.zeros((400, 424), np.uint8), 7, 'camera')
+    hour.says(pattern, lambda: (driver.publish(info), images.publish(image)))
+
+
+@tries('Time stands still: use_sim_time without a clock')
+def no_clock(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING, 'use_sim_time:=true')
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(landmarks())
+    points.publish(image_points())
+    hour.says(pattern)
+
+
+@tries('A parameter changes nothing: its name is misspelled')
+def misspelled(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING, 'patence:=3.0')
+    g.start(Localizer)
+    hour.logs(pattern)
+
+
+@pytest.mark.parametrize('symptom', TABLE)
+def test_the_node_says_what_the_table_says(symptom: str, hour: Hour) -> None:
+    TRIED[symptom](hour, TABLE[symptom])
+
+
+def test_every_row_is_tried() -> None:
+    assert {*TABLE} == {*TRIED} and len(TABLE) >= 10
+
+
+def test_it_says_nothing_where_something_comes(hour: Hour) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(landmarks())
+    points.publish(image_points())
+    g.idle(2.5)
+    last = hour.reports[-1].status[0]
+    assert last.level == last.OK and last.message == 'all inputs usable'
+
+
+def test_a_lens_that_is_named_needs_no_scenario(hour: Hour) -> None:
+    g = hour.begin(*SOLVING)
+    node = g.start(Localizer)
+    assert [*node.needed_inputs()] == [('image_points',), ('landmarks',)]
+
+
+def test_a_camera_listens_to_nothing(hour: Hour, tmp_path: Any) -> None:
+    table = tmp_path / 'seen.csv'
+    table.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
+        f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5)))
+    g = hour.begin(f'observations:={table}')
+    g.start(MeasuredCamera)
+    g.until(lambda: hour.reports)
+    hour._capfd.readouterr()
+    g.idle(1.5)
+    assert hour.reports[-1].status[0].message == 'all inputs usable'
+
+
+def test_a_best_effort_publisher_is_heard_and_not_told_of_incompatible_qos(
+    hour: Hour
+) -> None:
+    g = hour.begin(*SOLVING)
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    latest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    told = g.probe.create_publisher(PointCloud2, 'landmarks', latest)
+    points = g.probe.create_publisher(PointCloud2, 'image_points', latest)
+    g.until(lambda: (told.publish(landmarks()), points.publish(image_points()), results)[2])
+    assert not results[0].status[0].message
+
+
+@pytest.mark.parametrize('reliability', list(ReliabilityPolicy)[1:3])
+@pytest.mark.parametrize('durability', list(DurabilityPolicy)[1:3])
+def test_every_driver_is_heard_and_told_nothing(
+    hour: Hour, reliability: ReliabilityPolicy, durability: DurabilityPolicy
+) -> None:
+    g = hour.begin(f'board:={BOARD}')
+    node = g.start(Detector)
+    qos = QoSProfile(depth=1, reliability=reliability, durability=durability)
+    driver = g.probe.create_publisher(CameraInfo, 'camera_info', qos)
+    info = CameraInfo(width=848, height=400, distortion_model='equidistant', d=[0.0] * 4,
+                      k=[300.0, 0.0, 9.0, 0.0, 300.0, 9.0, 0.0, 0.0, 1.0])
+    count = node._inputs['camera_info'].count
+    driver.publish(info)  # before anybody listens: who latches is heard nevertheless
+    if durability == DurabilityPolicy.TRANSIENT_LOCAL:
+        g.until(lambda: count.received == 1)
+        g.idle(0.3)
+        assert count.received == 1
+    g.until(lambda: (driver.publish(info), count.received > 1)[1])
+    hour.graph.idle(0.3)
+    assert 'incompatible QoS' not in hour._capfd.readouterr().err
