@@ -27,13 +27,14 @@ from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
 from fisheye_svp_ros.planning.guide import NUMBERS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
-_RAW, _COMPRESSED = 'image', 'image/compressed'
+_RAW, _COMPRESSED = 'image', f'image{COMPRESSED}'
 _QUICK = {'saddle': 'quick'}  # a live camera has another image soon
 _LATEST = 100  # images of which one topic may be ahead of the other
 _LOOK = 0.005  # s, how often what a search found is looked for
@@ -113,7 +114,7 @@ class Detector(BaseNode):
             return
         self.collect(Image, _RAW, partial(_read, Image), self._take, SENSOR)
         self.collect(CompressedImage, _COMPRESSED, partial(_read, CompressedImage), self._take,
-                     SENSOR, name=self._compressed_topic())
+                     SENSOR, name=compressed_topic(self, _RAW))
         self.collect(CameraInfo, CAMERA_INFO, read_camera_info,
                      partial(self._infos.hear, CAMERA_INFO), SENSOR, latched=True)
         self.start()
@@ -123,13 +124,6 @@ class Detector(BaseNode):
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
         self._look = self.every(_LOOK, self._work)
-
-    def _compressed_topic(self) -> str:
-        """Return where compressed images come: beside the others, unless remapped themselves."""
-        own = str(self.resolve_topic_name(_COMPRESSED))
-        if own != self.resolve_topic_name(_COMPRESSED, only_expand=True):
-            return own
-        return f'{self.resolve_topic_name(_RAW)}/compressed'
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to detect."""

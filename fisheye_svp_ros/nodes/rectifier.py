@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,9 +21,11 @@ from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.io.rig_files import load_rig, rig_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import LATCHED_INPUT, SENSOR, SENSOR_INPUT, BaseNode
+from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
+from fisheye_svp_ros.nodes.quality import SENSOR
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
@@ -81,8 +84,8 @@ class Rectifier(BaseNode):
     SETTINGS = RectifierSettings
     settings: RectifierSettings
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, node_name: str | None = None, **options: Any) -> None:
+        super().__init__(node_name, **options)
         cv2.setNumThreads(1)  # other nodes want the other cores
         self._cameras = tuple(f'{name}/' for name in STEREO) if self.settings.stereo else ('',)
         self._infos = CameraInfos(self.get_logger().info)
@@ -106,12 +109,18 @@ class Rectifier(BaseNode):
             self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR))
         self._taken[camera] = deque(maxlen=_LATEST)
         take = partial(self._take, camera)
-        self.collect(Image, f'{camera}image', _read_raw, take, SENSOR_INPUT)
-        self.collect(CompressedImage, f'{camera}image/compressed', _read_compressed, take,
-                     SENSOR_INPUT)
-        topic = f'{camera}{_INFO}'
+        image, topic = f'{camera}image', f'{camera}{_INFO}'
+        self.collect(Image, image, _read_raw, take, SENSOR)
+        self.collect(CompressedImage, image + COMPRESSED, _read_compressed, take, SENSOR,
+                     name=compressed_topic(self, image))
         self.collect(CameraInfo, topic, read_camera_info, partial(self._infos.hear, topic),
-                     LATCHED_INPUT, SENSOR_INPUT)
+                     SENSOR, latched=True)
+
+    def needed_inputs(self) -> Sequence[Sequence[str]]:
+        """Return the topics without which there is nothing to rectify."""
+        images = [(f'{c}image', f'{c}image{COMPRESSED}') for c in self._cameras]
+        infos = [(f'{c}{_INFO}',) for c in self._cameras]
+        return [*images, *(infos if self.settings.lens == CAMERA_INFO else [])]
 
     def prepare(self, settings: RectifierSettings) -> _Setup:
         """Load lens and rig, compute the maps; refuse what cannot be used."""
