@@ -113,10 +113,10 @@ def test_compressed_images_come_out_once(graph: Callable[..., Graph], lens: Path
     small = CompressedImage(header=header(5, 'optical'), format='png', data=data)
     g.until(lambda: (packed.publish(small), images)[1])
     assert images[-1].encoding == 'bgr8' and images[-1].header.frame_id == 'optical'
-    before = node._inputs['image'].received
+    before = node._inputs['image'].count.received
     heard = len(images)
     g.until(lambda: (tell.publish(image_message(grey, 5, 'optical')),
-                     node._inputs['image'].received > before + 1)[1])
+                     node._inputs['image'].count.received > before + 1)[1])
     g.idle(0.2)
     assert all(one.encoding == 'bgr8' for one in images[heard:])
 
@@ -126,8 +126,8 @@ def test_nothing_is_done_while_nobody_listens(graph: Callable[..., Graph], lens:
     node = g.start(Rectifier)
     tell = g.tell(Image, 'image', SENSOR)
     raw = image_message(photograph(poses(1, 4).take(0)), 7, 'optical')
-    g.until(lambda: (tell.publish(raw), node._inputs['image'].received > 2)[1])
-    assert node._inputs['image'].read == 0
+    g.until(lambda: (tell.publish(raw), node._inputs['image'].count.received > 2)[1])
+    assert node._inputs['image'].count.read == 0
     infos = g.hear(CameraInfo, 'camera_info', SENSOR)
     g.until(lambda: (tell.publish(raw), infos)[1])
 
@@ -139,7 +139,7 @@ def test_one_camera_with_a_camera_info(graph: Callable[..., Graph]) -> None:
     tell = g.tell(Image, 'image', SENSOR)
     grey = photograph(poses(1, 4).take(0))
     raw = image_message(grey, 7, 'optical')
-    g.until(lambda: (tell.publish(raw), node._inputs['image'].dropped)[1])  # no lens is known yet
+    g.until(lambda: (tell.publish(raw), node._inputs['image'].count.dropped)[1])  # no lens is known yet
     info = g.tell(CameraInfo, 'image/camera_info', LATCHED)
     info.publish(camera_info_message(LENS, 7, 'optical'))
     g.until(lambda: (tell.publish(raw), images and infos)[1])
@@ -147,9 +147,9 @@ def test_one_camera_with_a_camera_info(graph: Callable[..., Graph]) -> None:
     side = fsvp.undistort_maps(LENS.svp(), field_of_view=1.5708)
     np.testing.assert_array_equal(pixels_of(images[-1]), side.remap(grey))
     # Another size than that of the lens is refused, and the next image comes through.
-    dropped, heard = node._inputs['image'].dropped, len(images)
+    dropped, heard = node._inputs['image'].count.dropped, len(images)
     g.until(lambda: (tell.publish(image_message(grey[:-1], 9, 'optical')),
-                     node._inputs['image'].dropped > dropped)[1])
+                     node._inputs['image'].count.dropped > dropped)[1])
     g.until(lambda: (tell.publish(raw), len(images) > heard)[1])
     kept = node._side('', 7)
     assert node._side('', 8) is kept  # maps are computed once
