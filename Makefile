@@ -1,9 +1,11 @@
 # Two commands: `make demo` and `make test`.  Both install what they need into .venv.
-# The first Python that is supported; any other with `make PYTHON=...`.
+# The first Python that there are wheels of ROS 2 for; any other with `make PYTHON=...`.
+ifndef PYTHON
 PYTHON := $(firstword $(foreach python,python3 python3.14 python3.13 python3.12 python3.11,\
 	$(shell $(python) -c 'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(python)")' 2>&-)) python3)
-COMMA := ,
+endif
 # ROS 2 out of pip, but not beside one that is sourced.
+COMMA := ,
 ROS := $(if $(shell $(PYTHON) -c 'import rclpy.node; print("sourced")' 2>&-),,$(COMMA)ros)
 VENV ?= .venv
 BIN := $(VENV)/bin

@@ -26,8 +26,9 @@ def nodes(context):
     plan = read_sweep(path)
     solvers = list(plan.solvers)
     return [
+        # A recording is to be whole, however busy the machine is.
         Node(package=PACKAGE, executable='fisheye-svp', output='screen', on_exit=fail,
-             arguments=['record', '-o', value(context, 'bag')]),
+             sigterm_timeout='60', arguments=['record', '-o', value(context, 'bag')]),
         *(
             Node(package=PACKAGE, executable=name, output='screen', on_exit=fail, parameters=[
                 str(path), {'wait_for_subscribers': 2, 'patience': PATIENCE,

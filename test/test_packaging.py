@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import re
+import shutil
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -86,3 +91,46 @@ def test_the_quality_declaration_says_what_a_release_lacks() -> None:
     exec(path.read_text(encoding='utf-8'), space)
     declared = (ROOT / 'QUALITY_DECLARATION.md').read_text().partition('## What a release')[2]
     assert sorted(space['findings']()) == sorted(re.findall('^- (.*)$', declared, re.MULTILINE))
+
+
+@pytest.fixture
+def installation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return a function that says how make would install, with some Pythons on the path."""
+    if shutil.which('make') is None:
+        pytest.skip('make is not here')
+
+    def commands(*pythons: str) -> str:
+        for name in ('python3', 'python3.14', 'python3.13', 'python3.12', 'python3.11'):
+            text = f'exec {sys.executable} "$@"' if name in pythons else 'exit 1'
+            (tmp_path / name).write_text(f'#!/bin/sh\n{text}\n')
+            (tmp_path / name).chmod(0o755)
+        env = {**os.environ, 'PATH': f'{tmp_path}{os.pathsep}{os.environ["PATH"]}'}
+        env.pop('PYTHON', None)
+        return subprocess.run(['make', '-n', 'VENV=venv', 'venv/ready'], cwd=ROOT, env=env,
+                              capture_output=True, text=True, check=True).stdout
+
+    for name in ('MAKEFLAGS', 'MAKELEVEL', 'PYTHONPATH'):
+        monkeypatch.delenv(name, raising=False)
+    return commands
+
+
+@pytest.mark.parametrize(('pythons', 'taken'), [
+    (['python3', 'python3.12'], 'python3'), (['python3.12', 'python3.11'], 'python3.12'),
+    ([], 'python3')])
+def test_make_takes_another_python_where_the_first_is_not_supported(
+    installation: Any, pythons: list[str], taken: str
+) -> None:
+    assert f'\n{taken} -m venv venv\n' in installation(*pythons)
+
+
+def test_make_installs_no_ros_beside_one_that_is_sourced(
+    installation: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sourced = tmp_path / 'sourced'
+    (sourced / 'rclpy').mkdir(parents=True)
+    (sourced / 'rclpy' / '__init__.py').touch()
+    (sourced / 'rclpy' / 'node.py').write_text('import nothing_of_that_name')
+    monkeypatch.setenv('PYTHONPATH', str(sourced))
+    assert ',ros]' in installation('python3')  # it cannot be imported: of another Python
+    (sourced / 'rclpy' / 'node.py').write_text('')
+    assert ',ros]' not in installation('python3') and 'lint' in installation('python3')

@@ -18,6 +18,7 @@ import numpy as np
 
 from benchmark.fuzz.mutations import mutated, nasty
 from fisheye_svp_ros import library
+from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import decoded, exif_turned
@@ -378,8 +379,9 @@ def surfaces() -> list[Surface]:
         Surface('parameter tables', _settings, 150),
         Surface('boards, target YAML', _boards, 50),
         Surface('photographs', _photographs, 50),
-        Surface('recording, table', _bags, 12),
-        Surface('recording, points', _bags_of_points, 12),
+        *([] if missing_rclpy() else [  # which writes their messages
+            Surface('recording, table', _bags, 12),
+            Surface('recording, points', _bags_of_points, 12)]),
         Surface('table CSV', _file('a.csv', lambda p: write_columns(p.with_suffix(''), _COLUMNS),
                                    _quietly(read_columns)), 50),
         Surface('parts of a sweep', _parts, 20),

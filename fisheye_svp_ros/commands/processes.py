@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fisheye_svp_ros.commands.ros import LOCALHOST, RANGE
 from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
 from fisheye_svp_ros.errors import GraphError
 
@@ -29,7 +30,7 @@ class Processes:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': domain(), 'PYTHONUNBUFFERED': '1'}
-        self._environment.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        self._environment.setdefault(RANGE, LOCALHOST)
         self._running: dict[str, subprocess.Popen[bytes]] = {}
         self._segments = segments()
 

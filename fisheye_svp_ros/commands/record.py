@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> None:
 def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.lock_step import record_sweep
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.commands.ros import require_rclpy
+    from fisheye_svp_ros.commands.ros import prepare_ros
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import Bag
@@ -49,7 +49,7 @@ def _sweep(name: str, bag: Path) -> None:
     plan = read_sweep(path)
     if bag.exists():
         raise BagError(f'{bag}: it exists; a recording needs a new folder')
-    require_rclpy()
+    prepare_ros()
     logs = bag.with_name(f'{bag.name}_logs')
     with progress('sweeping', len(plan.sweep)) as advance:
         record_sweep(path, plan, bag, logs, advance)
@@ -59,25 +59,20 @@ def _sweep(name: str, bag: Path) -> None:
 
 def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
-    from fisheye_svp_ros.commands.ros import require_rclpy
+    from fisheye_svp_ros.commands.ros import prepare_ros
     from fisheye_svp_ros.io.bags import BagWriter
     from fisheye_svp_ros.nodes.executables import ending_quietly
 
     with ending_quietly():
-        require_rclpy()
-        import rclpy
-
+        prepare_ros()
         from fisheye_svp_ros.nodes.recorder import Recorder
+        from fisheye_svp_ros.nodes.session import ros_session
 
-    rclpy.init(args=['--ros-args', *args.ros_args])
-    try:
-        with BagWriter(args.output) as bag:
-            recorder = Recorder(bag, args.topics)
-            recorder.spin()
-            recorder.destroy_node()
-        say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
-    finally:
-        rclpy.try_shutdown()
+    with ros_session(args.ros_args), BagWriter(args.output) as bag:
+        recorder = Recorder(bag, args.topics)
+        recorder.spin()
+        recorder.destroy_node()
+    say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
 
 
 def _pattern(text: str) -> re.Pattern[str]:

@@ -6,7 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
-from fisheye_svp_ros.commands.ros import require_rclpy
+from fisheye_svp_ros.commands.ros import prepare_ros
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import NODES, executables
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Spin the node until it ends; exit with its status.  With --help, tell its parameters."""
     with executables.ending_quietly():
-        require_rclpy()
+        prepare_ros()
     if {'-h', '--help'} & set(args.arguments):
         _print_parameters(args.node)
         return

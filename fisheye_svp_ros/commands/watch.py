@@ -21,23 +21,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Follow every result topic until interrupted."""
-    from fisheye_svp_ros.commands.ros import require_rclpy
+    from fisheye_svp_ros.commands.ros import prepare_ros
 
-    require_rclpy()
-    import rclpy
+    prepare_ros()
     from rich.live import Live
 
+    from fisheye_svp_ros.nodes.session import ros_session
     from fisheye_svp_ros.nodes.watcher import Watcher
     from fisheye_svp_ros.reporting.tables import console
 
-    rclpy.init(args=['--ros-args', *args.ros_args])
-    try:
+    with ros_session(args.ros_args):
         watcher = Watcher()
         with Live(console=console(), refresh_per_second=4) as live:
             watcher.spin(lambda: live.update(_shown(watcher, live.console.width)))
         watcher.destroy_node()
-    finally:
-        rclpy.try_shutdown()
 
 
 def _shown(watcher: Watcher, width: int) -> RenderableType:

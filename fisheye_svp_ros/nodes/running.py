@@ -15,6 +15,7 @@ from rclpy.executors import ExternalShutdownException
 
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.session import RCLError
 
 _SAME_INTERRUPT = 1.0  # s between two interrupts that are one
 
@@ -62,9 +63,11 @@ def _run(kind: type[BaseNode]) -> int:
         pass
     except (FisheyeSvpError, ParameterException, NameValidationException) as error:
         return _refuse(kind, error)
-    except Exception:
+    except Exception as error:
         # A signal ends the context between any two calls; what fails then is no failure.
         if rclpy.ok():
+            if node is None and isinstance(error, RCLError):  # such as security that it lacks
+                return _refuse(kind, f'ROS 2: {error}')
             raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -67,6 +68,18 @@ def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
     assert len(told) == 1 and len(told[0]) > 20, node.lines
     assert arguments != ['--nosuch'] or 'ROS arguments' in told[0]  # rclpy: a bare list
     assert ('a list must' in told[0]) == (arguments == ['-p', 'lens:=[]'])
+    assert 'Traceback' not in '\n'.join(node.lines)
+
+
+def test_security_that_cannot_be_had_ends_a_node_with_the_reason(
+    start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch  # type: ignore[no-untyped-def]
+) -> None:
+    (tmp_path / 'enclaves' / 'localizer').mkdir(parents=True)  # without a key
+    for name, value in (('ENABLE', 'true'), ('STRATEGY', 'Enforce'), ('KEYSTORE', str(tmp_path))):
+        monkeypatch.setenv(f'ROS_SECURITY_{name}', value)
+    node = start('localizer', '--ros-args', '--enclave', '/localizer')
+    assert node.finish() == 2
+    assert any(re.match('localizer: ROS 2: .*(security|permission)', line) for line in node.lines)
     assert 'Traceback' not in '\n'.join(node.lines)
 
 
