@@ -139,7 +139,8 @@ def test_one_camera_with_a_camera_info(graph: Callable[..., Graph]) -> None:
     tell = g.tell(Image, 'image', SENSOR)
     grey = photograph(poses(1, 4).take(0))
     raw = image_message(grey, 7, 'optical')
-    g.until(lambda: (tell.publish(raw), node._inputs['image'].count.dropped)[1])  # no lens is known yet
+    # No lens is known yet.
+    g.until(lambda: (tell.publish(raw), node._inputs['image'].count.dropped)[1])
     info = g.tell(CameraInfo, 'image/camera_info', LATCHED)
     info.publish(camera_info_message(LENS, 7, 'optical'))
     g.until(lambda: (tell.publish(raw), images and infos)[1])
