@@ -29,6 +29,11 @@ def gather_rows(parts: Sequence[tuple[Index, Array]]) -> Array:
     return whole
 
 
+def flat_rows(columns: Array) -> Array:
+    """Return columns (..., P) as (rows, P), also where P is 0."""
+    return columns.reshape(int(np.prod(columns.shape[:-1])), columns.shape[-1])
+
+
 class Batch:
     """Methods of a named tuple whose fields, arrays or batches, share their leading axes."""
 

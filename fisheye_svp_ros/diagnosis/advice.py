@@ -8,21 +8,19 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.diagnosis.budget import Component, stage_of
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.measured import Measured
-from fisheye_svp_ros.diagnosis.medium import Medium
-from fisheye_svp_ros.diagnosis.noise import FRAME, VIEW, Gross
-from fisheye_svp_ros.diagnosis.residuals import standardised_squares
-from fisheye_svp_ros.diagnosis.search import Found
-from fisheye_svp_ros.diagnosis.similar_views import SimilarViews
+from fisheye_svp_ros.diagnosis.checks.medium import Medium
+from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
+from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.outliers import FRAME, VIEW, Outliers
+from fisheye_svp_ros.diagnosis.variance_budget import Component, stage_of
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_names
 
 DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
                 'that: the lens was off in air')
-_STANDS_OUT = 2.0  # times the typical one
-_MOST = 8
+_OUTSTANDING_RATIO = 2.0  # times the typical one
+_MAX_LISTED = 8
 
 
 @dataclass(frozen=True)
@@ -41,11 +39,32 @@ class Advice:
 
 
 def advise(
-    found: Found, causes: Sequence[Cause], measured: Measured, parts: Sequence[Component]
+    evaluation: Evaluation, causes: Sequence[Cause], parts: Sequence[Component]
 ) -> list[Advice]:
     """Return what to do, what brings most first; parts: the random components that are there."""
-    gains = measured.gains()
-    advice = []
+    selection, gains = evaluation.selection, evaluation.gains
+    advice = _use_causes(evaluation, causes)
+    if any(part.stage == 'target' for part in parts):
+        advice += _measure_landmarks(evaluation, (1 - gains['named'].value) * gains['local'].value)
+    if evaluation.offsets.views is not None:
+        advice.append(_vary_views(evaluation.offsets.views))
+    advice += _retake_frames(evaluation)
+    advice += _check_photographs(
+        selection.null.linear.data.observations, selection.revision.outliers)
+    advice += _check_held_out(evaluation)
+    advice += [
+        Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
+        if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
+    ]
+    if evaluation.medium is not None:
+        advice += _calibrate_in_air(evaluation.medium, causes)
+    # Advice without a figure keeps its order, after all that has one.
+    return sorted(advice, key=lambda one: -one.gain)
+
+
+def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]:
+    """Return what to do about causes of lens and target that held-out data bear out."""
+    gains, advice = evaluation.gains, []
     stages = {stage_of(cause.effect) for cause in causes}
     if 'lens' in stages and gains['lens'].value > 0:
         advice.append(Advice('solve with the extended lens file', gain=gains['lens'].value))
@@ -58,46 +77,36 @@ def advise(
             landmarks=[n for c in causes if c.effect == 'landmark_survey' for n in _landmarks(c)],
             gain=target,
         ))
-    if any(part.stage == 'target' for part in parts):
-        advice += _local(measured, (1 - gains['named'].value) * gains['local'].value)
-    if measured.local.views is not None:
-        advice.append(_differ(measured.local.views))
-    advice += _frames(found)
-    advice += _set_aside(found.evidence.linear.data.observations, found.gross)
-    if measured.test is None:
-        alone = _numbers(found)[~measured.predicted]
-        if len(alone):
-            advice.append(_about_frames(
-                found.evidence.linear.data.observations,
-                'take more photographs like these: the others do not predict them, since they '
-                'alone show some of the image, or since something is wrong with them; the '
-                'held-out rms is that of the others', alone.tolist()))
-    else:
-        table = measured.test.observations
-        advice += _set_aside(table, measured.test_gross, 'held-out ')
-        if measured.another_target:
-            advice.append(Advice(
-                'hold out photographs of the same target: these have landmarks of the same '
-                'numbers in other places, so that nothing of what stays with the target is '
-                'predicted there'))
-        if measured.test_moved:
-            advice.append(_about_frames(
-                table, 'look at these held-out photographs: their cameras do not stand as in the '
-                'others, so that each view was posed by itself; was the rig touched, are the '
-                'cameras exchanged, are photographs of one moment numbered alike, and the points '
-                'from the same end?',
-                _seen_by_several(table)))
-    advice += [
-        Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
-        if stage_of(cause.effect) in ('noise', 'frame') or cause.indistinguishable_from
-    ]
-    if measured.medium is not None:
-        advice += _in_air(measured.medium, causes)
-    # Advice without a figure keeps its order, after all that has one.
-    return sorted(advice, key=lambda one: -one.gain)
+    return advice
 
 
-def _in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
+def _check_held_out(evaluation: Evaluation) -> list[Advice]:
+    """Return what to do about held-out frames that are no measure of a model."""
+    test = evaluation.held_out
+    if test is None:
+        alone = _frame_numbers(evaluation)[~evaluation.predicted]
+        return [_about_frames(
+            evaluation.null.linear.data.observations,
+            'take more photographs like these: the others do not predict them, since they '
+            'alone show some of the image, or since something is wrong with them; the '
+            'held-out rms is that of the others', alone.tolist())] if len(alone) else []
+    table = test.data.observations
+    advice = _check_photographs(table, test.outliers, 'held-out ')
+    if test.another_target:
+        advice.append(Advice(
+            'hold out photographs of the same target: these have landmarks of the same '
+            'numbers in other places, so that nothing of what stays with the target is '
+            'predicted there'))
+    if test.rig_differs:
+        advice.append(_about_frames(
+            table, 'look at these held-out photographs: their cameras do not stand as in the '
+            'others, so that each view was posed by itself; was the rig touched, are the '
+            'cameras exchanged, are photographs of one moment numbered alike, and the points '
+            'from the same end?', _shared_frames(table)))
+    return advice
+
+
+def _calibrate_in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
     """Return what would make a lens surer that was calibrated in air."""
     advice = []
     others = {cause.effect for cause in causes if stage_of(cause.effect) == 'lens'}
@@ -120,19 +129,20 @@ def _landmarks(cause: Cause) -> list[int]:
     return list(dict.fromkeys(int(name.partition('.')[0]) for name in cause.parameters))
 
 
-def _local(measured: Measured, gain: float) -> list[Advice]:
+def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     """Return the landmarks whose predicted offsets stand out, where predicting them helps."""
-    far = np.linalg.norm(measured.local.offset, axis=1)
+    far = np.linalg.norm(evaluation.offsets.offset, axis=1)
     if gain <= 0 or not far.any():
         return []
     typical = float(np.median(far[far > 0]))
-    order = np.argsort(-far)[:_MOST]
-    chosen = [int(measured.local.landmark[i]) for i in order if far[i] > _STANDS_OUT * typical]
+    order = np.argsort(-far)[:_MAX_LISTED]
+    chosen = [int(evaluation.offsets.landmark[i]) for i in order
+              if far[i] > _OUTSTANDING_RATIO * typical]
     what = 'measure single landmarks: they lie off by more than the others'
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
 
-def _differ(views: SimilarViews) -> Advice:
+def _vary_views(views: SimilarViews) -> Advice:
     """Return what to do where landmarks err alike in similar views."""
     soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
     return Advice(
@@ -141,34 +151,34 @@ def _differ(views: SimilarViews) -> Advice:
         'time, does light reflect, is something printed near the corners?')
 
 
-def _frames(found: Found) -> list[Advice]:
+def _retake_frames(evaluation: Evaluation) -> list[Advice]:
     """Return the frames that scatter more than the others."""
-    squares = standardised_squares(found.fitted)
-    used = found.evidence.linear.used
+    squares = evaluation.fitted.standardized_squares()
+    used = evaluation.null.linear.used
     size = squares.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
-    numbers = _numbers(found)
-    bad = size > _STANDS_OUT * np.median(size)
+    numbers = _frame_numbers(evaluation)
+    bad = size > _OUTSTANDING_RATIO * np.median(size)
     advice = []
     if bad.any():
-        order = np.flatnonzero(bad)[np.argsort(-size[bad])][:_MOST]
+        order = np.flatnonzero(bad)[np.argsort(-size[bad])][:_MAX_LISTED]
         advice.append(_about_frames(
-            found.evidence.linear.data.observations,
+            evaluation.null.linear.data.observations,
             'take these photographs again: they scatter more than the others',
             [int(numbers[i]) for i in order],
         ))
     return advice
 
 
-def _numbers(found: Found) -> Index:
+def _frame_numbers(evaluation: Evaluation) -> Index:
     """Return the numbers (F,) of the frames."""
-    data = found.evidence.linear.data
+    data = evaluation.null.linear.data
     return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
 
 
-def _set_aside(table: Observations, gross: Gross, where: str = '') -> list[Advice]:
-    """Return the frames of which whole views are gross errors, by reason."""
+def _check_photographs(table: Observations, outliers: Outliers, where: str = '') -> list[Advice]:
+    """Return the frames of which whole views are outliers, by reason."""
     off = {reason: sorted({int(table.frame[row]) for row, why in
-                           zip(gross.rows, gross.why, strict=True) if why == reason})
+                           zip(outliers.rows, outliers.why, strict=True) if why == reason})
            for reason in (VIEW, FRAME)}
     return [_about_frames(table, f'look at these {where}photographs: {reason}', frames)
             for reason, frames in off.items() if frames]
@@ -182,7 +192,7 @@ def _about_frames(table: Observations, what: str, frames: list[int]) -> Advice:
     return Advice(what, frames=frames, photographs=names)
 
 
-def _seen_by_several(table: Observations) -> list[int]:
+def _shared_frames(table: Observations) -> list[int]:
     views = np.unique(np.stack([table.frame, table.camera]), axis=1)
     frames, count = np.unique(views[0], return_counts=True)
     return [int(frame) for frame in frames[count > 1]]

@@ -1,27 +1,56 @@
-"""How far a calibration may be trusted, beside random local errors and other targets."""
+"""How far a calibration may be trusted, beside random effects and other targets, or in water.
+
+What `calibrate` says of a lens under the null model; what a lens file says of its parameters; and
+the lens as photographs under water call for it: in air they seldom fill the image as those through
+a port do, and beyond them the curve of a lens may be anything.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.budget import stage_of
-from fisheye_svp_ros.diagnosis.evidence import Evidence, gather_evidence, pseudo_inverse
-from fisheye_svp_ros.diagnosis.model import prepare
-from fisheye_svp_ros.diagnosis.noise import NO_GROSS, Gross, find_gross_errors
-from fisheye_svp_ros.diagnosis.standard_errors import honest_errors
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
+from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+from fisheye_svp_ros.diagnosis.model import (
+    Data,
+    Linearised,
+    State,
+    intrinsic_names,
+    is_shared,
+    prepare,
+)
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.outliers import (
+    NO_OUTLIERS,
+    Outliers,
+    find_outliers,
+    without_points,
+)
+from fisheye_svp_ros.diagnosis.uncertainty import total_errors
+from fisheye_svp_ros.diagnosis.variance_budget import stage_of
+from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
 from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
-_WIDE = 2.0  # standard errors of an interval
-_ROUNDS = 4
+_INTERVAL_SIGMAS = 2.0  # standard errors of an interval
+_MAX_ROUNDS = 4
+_KNOWN_SHARE = 0.01  # of an image height, beside what the focal length is off by
+_SAMPLES = 200
+_REACH_GROWTH = 1.25  # from fit to fit: the field whose points are taken in
+_MIN_VIEW_POINTS = 8  # points of a view
+_MIN_EIGENVALUE = 1e-8  # eigenvalue of correlations, beside what numbers hold
+_MEDIAN_SIZE = 0.6745  # of the size of a normal number
+_MAX_SIGMAS = 4.0  # standard deviations, rms, that no intrinsics are off
+_INDEX_SIGMA = 0.1  # standard deviation of an index before anything is known of the medium
 
 
 @dataclass(frozen=True)
@@ -38,7 +67,7 @@ class Admissible:
 
 
 @dataclass(frozen=True)
-class Trust:
+class LensTrust:
     """Standard errors of parameters, the target as it is said to be, and their ranges, by name.
 
     covariance (K, K): of all of them, over all targets that the data admit.
@@ -55,40 +84,40 @@ class Trust:
                 if name in _SHIFT_NAMES and not range_.settled}
 
 
-def calibrated_without_gross_errors(
+def calibrate_without_outliers(
     observations: Observations, calibrate: Callable[[Observations], Calibration]
-) -> tuple[Calibration, Observations, Gross]:
-    """Calibrate a lens of one camera anew for as long as gross errors are found.
+) -> tuple[Calibration, Observations, Outliers]:
+    """Calibrate a lens of one camera anew for as long as outliers are found.
 
     calibrate: fits a lens to some of the rows.  Returns the last lens, the rows that it is of, and
     those that are set aside.
     """
     rows = np.arange(len(observations))
-    gross, rounds = NO_GROSS, 0
+    rejected, rounds = NO_OUTLIERS, 0
     while True:
         result = calibrate(observations.take(rows))
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
         data = prepare(table)
-        found = find_gross_errors(data, start(data, result.adjusted.lens))[1]
+        found = find_outliers(data, start(data, result.adjusted.lens))[1]
         rounds += 1
-        if not len(found.rows) or rounds == _ROUNDS:
-            return result, table, gross
-        gross = gross.joined(found._replace(rows=rows[found.rows]))
+        if not len(found.rows) or rounds == _MAX_ROUNDS:
+            return result, table, rejected
+        rejected = rejected.join(found._replace(rows=rows[found.rows]))
         rows = np.delete(rows, found.rows)
 
 
-def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust:
+def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) -> LensTrust:
     """Return what the null model of a diagnosis says of a lens fitted to one camera's views.
 
     names: the parameters that were fitted.
     """
     data = prepare(observations)
-    evidence = gather_evidence(data, fit(data, start(data, lens), names), names)
+    null = NullModel.fit(data, fit(data, start(data, lens), names), names)
     # What else the lens has, its corrections, is fitted along and follows them.
-    errors = honest_errors(evidence)[: len(names)]
+    errors = total_errors(null)[: len(names)]
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
-    moved, covariance = _any_target(evidence, len(names))
+    moved, covariance = _free_target(null, len(names))
     values = parameter_values(lens, names)
     admissible = {
         name: _admissible(name, (value, error), (value + step, spread)) for name, value, error,
@@ -99,10 +128,10 @@ def trust(observations: Observations, lens: Lens, names: Sequence[str]) -> Trust
     covariance = covariance + np.outer(moved, moved)
     known = np.sqrt(np.diag(covariance))
     larger = np.maximum(np.nan_to_num(errors), known) / np.maximum(known, 1e-300)
-    return Trust(stderr, admissible, covariance * np.outer(larger, larger))
+    return LensTrust(stderr, admissible, covariance * np.outer(larger, larger))
 
 
-def with_stderr(lens: Lens, trusted: Trust) -> Lens:
+def with_covariance(lens: Lens, trusted: LensTrust) -> Lens:
     """Return a calibrated lens whose `calibration` says how sure its numbers are, any target.
 
     stderr: one each, by name; covariance: of all, in the same order.
@@ -113,24 +142,23 @@ def with_stderr(lens: Lens, trusted: Trust) -> Lens:
         'covariance': trusted.covariance.tolist()})
 
 
-def _any_target(evidence: Evidence, count: int) -> tuple[Array, Array]:
+def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
     """Return how far parameters (K,) move once the target is free, and their covariance (K, K).
 
     count: of these, the first of what is in the model.
     """
-    own = np.arange(evidence.own)
-    columns, prior = [own], [np.zeros(evidence.own)]
-    for form, effect in enumerate(evidence.forms.effects):
+    own = null.included
+    columns, prior = [own], [np.zeros(null.own)]
+    for form, effect in enumerate(null.fixed.forms.effects):
         if stage_of(effect.name) == 'target':
-            columns.append(evidence.columns_of(form))
-            large = np.array([parameter.large for parameter in effect.parameters])
-            prior.append(1 / (large * evidence.scale[columns[-1]]) ** 2)
-    every, information = np.concatenate(columns), evidence.information
+            columns.append(null.form_columns(form))
+            prior.append(null.prior_precision(columns[-1], effect))
+    every, information = np.concatenate(columns), null.information
     # Larger errors than `large` are no target that anybody would take for exact.
     inverse, _ = pseudo_inverse(
         information[np.ix_(every, every)] + np.diag(np.concatenate(prior)), 1e-13
     )
-    own, scale = own[:count], evidence.scale[:count]
+    own, scale = own[:count], null.scale[:count]
     return (inverse @ information[every, -1])[own] / scale, (
         inverse[np.ix_(own, own)] / np.outer(scale, scale))
 
@@ -138,7 +166,135 @@ def _any_target(evidence: Evidence, count: int) -> tuple[Array, Array]:
 def _admissible(name: str, *found: tuple[float, float]) -> Admissible:
     """Return the range of a parameter from values and standard errors, by target said and free."""
     (value, stderr), (moved, spread) = found
-    ends = [middle + sign * _WIDE * error for middle, error in found for sign in (-1, 1)]
+    ends = [middle + sign * _INTERVAL_SIGMAS * error
+            for middle, error in found for sign in (-1, 1)]
     sure = name not in _SHIFT_NAMES or min(ends) > 0 or max(ends) < 0
-    near = abs(moved - value) < _WIDE * np.hypot(stderr, spread)
+    near = abs(moved - value) < _INTERVAL_SIGMAS * np.hypot(stderr, spread)
     return Admissible(min(ends), max(ends), bool(sure and near))
+
+
+@dataclass(frozen=True)
+class InAir:
+    """How sure the intrinsics of a lens are: names, covariance (K, K) of their values."""
+
+    lens: Lens
+    names: tuple[str, ...]
+    covariance: Array
+
+    @classmethod
+    def of(cls, lens: Lens) -> InAir | None:
+        """Return what a lens file from `calibrate` or `diagnose` tells; None if it is nothing.
+
+        Raises LensError for half of it, or what cannot be.
+        """
+        if lens.uncertainty is not None:
+            errors = LensErrors.of(lens)
+            known, whole = errors.model.names, errors.model.covariance
+        elif (said := lens.calibration or {}).get('covariance') is None:
+            return None
+        else:
+            known, whole = _stated_covariance(lens, said)
+        at = [i for i, name in enumerate(known) if name in ('f', *intrinsic_names(lens))]
+        names = tuple(known[i] for i in at)
+        return cls(lens, names, whole[np.ix_(at, at)]) if {'f', 'fx'} & set(names) else None
+
+    @property
+    def focal(self) -> float:
+        """Relative standard error of the focal length."""
+        at = next(i for i, name in enumerate(self.names) if name in ('f', 'fx'))
+        return float(np.sqrt(self.covariance[at, at])) / self.lens.fx
+
+    @property
+    def reach(self) -> float:
+        """Distance from the principal point, px, up to which the curve is known."""
+        lens = self.lens
+        theta = np.linspace(0.0, lens.max_incidence, _SAMPLES)[1:]
+        height = lens.image_height.value_and_slope(theta)[0]
+        by = {'f': height, 'fx': height, **dict(zip(
+            lens.image_height.coefficient_names, lens.fx * lens.image_height.columns(theta).T,
+            strict=True))}
+        columns = np.stack([by.get(name, np.zeros_like(theta)) for name in self.names], axis=-1)
+        spread = np.sqrt(np.einsum('tk,kl,tl->t', columns, self.covariance, columns))
+        open_ = spread > (self.focal + _KNOWN_SHARE) * lens.fx * height
+        return float(lens.fx * height[np.argmax(open_)]) if open_.any() else np.inf
+
+    def fit_behind_port(
+        self, everything: Data, lens: Lens, place: tuple[str, ...], index: str
+    ) -> Lens | None:
+        """Return the lens with the intrinsics that photographs behind its port call for.
+
+        They move within what is known of them, beside the port's `place` and the medium's `index`;
+        the field whose points are taken in grows, for beyond it nothing is known of the curve.
+        None if they are far from what is known.  Raises GeometryError where a view cannot be
+        posed.
+        """
+        names, reach = (*place, index, *self.names), self.reach
+        while near := self.select_points(everything, reach):
+            data, _ = find_outliers(near, start(near, lens))
+            state = fit(data, start(data, lens), place)
+            state = fit(data, state, names, self._prior(data, state, index))
+            lens = replace(state.lens, max_incidence=field_of_view(state.lens))
+            if near.views.used.sum() == everything.views.used.sum():
+                break
+            reach *= _REACH_GROWTH
+        return lens if self.squared_distance(lens) < _MAX_SIGMAS**2 * len(self.names) else None
+
+    def select_points(self, data: Data, reach: float) -> Data | None:
+        """Return the points up to a distance from the principal point, px; None if too few."""
+        off = np.linalg.norm(data.views.uv - [self.lens.cx, self.lens.cy], axis=-1)
+        inside = data.views.used & (off <= reach)
+        whole = (inside | ~data.views.used).all(axis=1, keepdims=True)
+        inside &= whole | (inside.sum(axis=1, keepdims=True) >= _MIN_VIEW_POINTS)
+        return without_points(data, ~inside) if inside.any() else None
+
+    def squared_distance(self, lens: Lens) -> float:
+        """Return how unlikely the intrinsics of a lens are: squares of standard deviations."""
+        found, own = (np.array(parameter_values(one, self.names)) for one in (lens, self.lens))
+        return float(((self._root @ (found - own)) ** 2).sum())
+
+    @property
+    def _root(self) -> Array:
+        """What values are off, times this (K, K), is of unit covariance."""
+        size = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(size, size))
+        return np.asarray((vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))).T / size)
+
+    def _prior(self, data: Data, state: State, index: str) -> Prior:
+        """Return what is known of index and intrinsics, beside rows as noisy as a fit's."""
+        linear = Linearised(data, state, ())
+        noise = float(np.median(np.abs(linear.residual[linear.used]))) / _MEDIAN_SIZE
+        others = sum(len(values) for effect, values in state.terms if is_shared(effect))
+        mean = np.concatenate([[state.lens.parameters[index]],
+                               parameter_values(self.lens, self.names),
+                               np.zeros(others)])
+        root = np.zeros((1 + len(self.names), len(mean)))
+        root[0, 0] = 1 / _INDEX_SIGMA
+        root[1:, 1:1 + len(self.names)] = self._root
+        return Prior(mean, noise * root)
+
+
+def _stated_covariance(lens: Lens, said: Mapping[str, Any]) -> tuple[tuple[str, ...], Array]:
+    """Return names and covariance (K, K) from the `calibration` block of a lens file."""
+    try:
+        names, whole = tuple(said['stderr']), np.array(said['covariance'], dtype=float)
+        right = whole.shape == (len(names), len(names)) and np.isfinite(whole).all()
+        if not (right and (np.diag(whole) >= 0).all()):
+            raise ValueError
+    except (KeyError, TypeError, ValueError) as cause:
+        raise LensError(f'lens {lens.name!r}: calibration: covariance is no matrix of finite '
+                        'numbers, a row and a column for each name in stderr; calibrate anew, or '
+                        'leave it out') from cause
+    return names, whole
+
+
+def stated_parameters(lenses: Mapping[str, Lens]) -> dict[str, tuple[float, float]]:
+    """Return the parameters of lenses as given, each with the error that its file states."""
+    stated = {}
+    for camera, lens in lenses.items():
+        air = InAir.of(lens)
+        errors = {} if air is None else dict(
+            zip(air.names, np.sqrt(np.diag(air.covariance)).tolist(), strict=True))
+        for name, value in lens.parameters.items():
+            error = errors.get('f' if name in ('fx', 'fy') and 'f' in errors else name, 0.0)
+            stated[f'{camera}.{name}' if camera else name] = value, error
+    return stated

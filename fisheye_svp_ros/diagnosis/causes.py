@@ -1,4 +1,4 @@
-"""Causes: estimates, what they may be mistaken for, whether they survive."""
+"""Causes: estimates, what they are confounded with, whether they remain significant."""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.choice import (
-    CLASS_SIGNIFICANCE,
-    CLASS_STRENGTH,
-    SIGNIFICANCE,
-    candidates,
-)
-from fisheye_svp_ros.diagnosis.evidence import Evidence, Placed
-from fisheye_svp_ros.diagnosis.search import drop_test
+from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
+from fisheye_svp_ros.diagnosis.outliers import NoiseGrowth, Outliers
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.photograph_names import photograph_entry
+
+# An effect is confounded with another unless, with it in the model, the other is still needed.
+_CONFOUNDED_P = 0.002
+_CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,8 @@ class Cause:
     to_separate: str
 
 
-def mean_causes(
-    evidence: Evidence, found: Sequence[Placed], errors: Array, shares: dict[str, float],
+def selected_causes(
+    tests: EffectTests, found: Sequence[PlacedEffect], errors: Array, shares: dict[str, float],
     held_out: Sequence[tuple[float, float]],
 ) -> list[Cause]:
     """Return the causes that move predictions; held_out: rms and gain once each is in."""
@@ -55,44 +56,43 @@ def mean_causes(
             for p, v, e in zip(
                 effect.parameters, effect.reported(values), errors[columns], strict=True)
         }
-        included = np.arange(evidence.own)
         causes.append(Cause(
-            name, effect.key, parameters, drop_test(evidence, included, columns, effect).p_value,
-            shares[name], _survives(evidence, effect, columns), rms, gain,
-            _look_alikes(evidence, name, columns), effect.to_separate,
+            name, effect.key, parameters,
+            tests.test_removal(tests.null.included, columns, effect).p_value,
+            shares[name], _survives(tests, effect, columns), rms, gain,
+            _confounded_effects(tests, name, columns), effect.to_separate,
         ))
     return causes
 
 
-def _survives(evidence: Evidence, effect: Effect, columns: Index) -> bool:
+def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
-    factor = evidence.forms.names()
-    for _, other, _ in evidence.terms:
-        included = np.setdiff1d(np.arange(evidence.own), other)
+    factor = tests.effect_count
+    for _, other, _ in tests.null.terms:
+        included = np.setdiff1d(tests.null.included, other)
         if not np.array_equal(other, columns) and (
-            drop_test(evidence, included, columns, effect).p_value * factor > SIGNIFICANCE
+            tests.test_removal(included, columns, effect).p_value * factor > SIGNIFICANCE
         ):
             return False
     return True
 
 
-def _look_alikes(evidence: Evidence, name: str, columns: Index) -> list[str]:
+def _confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
     """Return the effects with which in the model this one would no longer be needed."""
     if name == LandmarkSurveyEffect.name:
         return []
-    rest = np.setdiff1d(np.arange(evidence.own), columns)
-    remaining = evidence.remaining(evidence.information, rest)
-    strength = evidence.score(remaining, columns).statistic
-    known = evidence.kinds
+    rest = np.setdiff1d(tests.null.included, columns)
+    strength = tests.score_beside(rest, columns).statistic
+    known = tests.null.kinds
     same: list[str] = []
-    for other in candidates(evidence, rest):
+    for other in tests.candidates(rest):
         if known & set(other.effect.kinds) or other.effect.name in (name, *same):
             continue
-        if other.score.statistic < CLASS_STRENGTH * strength:
+        if other.score.statistic < _CONFOUNDED_SHARE * strength:
             continue
-        both = np.concatenate([rest, evidence.columns_of(other.form)])
-        own = evidence.score(evidence.remaining(evidence.information, both), columns)
-        if own.p_value > CLASS_SIGNIFICANCE:
+        both = np.concatenate([rest, tests.null.form_columns(other.form)])
+        own = tests.score_beside(both, columns)
+        if own.p_value > _CONFOUNDED_P:
             same.append(other.effect.name)
     return same
 
@@ -105,3 +105,44 @@ def plain_cause(
         name, name, parameters, p_value, share, True, float('nan'), 0.0, [],
         CATALOGUE[name].to_separate,
     )
+
+
+def table_causes(observations: Observations, outliers: Outliers, step: float) -> list[Cause]:
+    """Return causes in the table: wrong ids, and rounding to a step (px; 0 for none)."""
+    causes = []
+    swapped = outliers.swapped
+    # One of many outliers is chance.
+    if swapped > 1 or 2 * swapped >= len(outliers.rows) > 0:
+        fraction = swapped / len(observations)
+        value = {'value': fraction, 'stderr': fraction / np.sqrt(swapped), 'unit': '1'}
+        causes.append(plain_cause('wrong_ids', {'fraction': value}, 0.0, 0.0))
+    if step:
+        value = {'value': step, 'stderr': 0.0, 'unit': 'px'}
+        causes.append(plain_cause('quantisation', {'step': value}, 0.0, 0.0))
+    return causes
+
+
+def growth_cause(growth: NoiseGrowth | None) -> list[Cause]:
+    """Return noise that grows with the angle as a cause, if it does."""
+    if growth is None:
+        return []
+    value = {'value': growth.value, 'stderr': growth.stderr, 'unit': '1/rad^2'}
+    return [plain_cause('noise_vs_angle', {'growth': value}, growth.p_value, 0.0)]
+
+
+def outlier_rows(
+    observations: Observations, outliers: Outliers, where: str = ''
+) -> list[dict[str, Any]]:
+    """Return outliers by frame and landmark, the farthest first."""
+    found = []
+    for i in np.argsort(-outliers.px, kind='stable'):
+        row = outliers.rows[i]
+        frame = int(observations.frame[row])
+        camera = observations.cameras[observations.camera[row]]
+        found.append({
+            'frame': frame, **photograph_entry(observations, frame, camera),
+            'landmark': int(observations.landmark[row]),
+            'px': float(outliers.px[i]), 'why': where + outliers.why[i],
+            **({'camera': camera} if len(observations.cameras) > 1 else {}),
+        })
+    return found

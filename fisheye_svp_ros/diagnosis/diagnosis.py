@@ -1,103 +1,188 @@
-"""Diagnosis: show, name, extend, measure, and say what is left (design, section 7)."""
+"""Diagnosis: show, name, extend, measure, and say what is left (design, section 7).
+
+Problem -> NullModel -> EffectTests -> Selection -> FittedModel -> Evaluation -> Diagnosis.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.advice import Advice, advise
-from fisheye_svp_ros.diagnosis.budget import REPEATED, Component, found_components
-from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.choice import TraceStep
-from fisheye_svp_ros.diagnosis.in_air import InAir
-from fisheye_svp_ros.diagnosis.inputs import (
-    ROUNDING,
-    check_cameras,
-    check_other,
-    dithered,
-    free_names,
-    of_rig,
-    rig_lenses,
-    right_first,
-    thinned,
-    without_copies,
-)
+from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
+from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
+from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
+from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets, compare_datasets
+from fisheye_svp_ros.diagnosis.cross_validation import Comparison
+from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
+from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
-from fisheye_svp_ros.diagnosis.measured import FitQuality, Intrinsic, Measured
-from fisheye_svp_ros.diagnosis.medium import find_medium
-from fisheye_svp_ros.diagnosis.model import Linearised, State, prepare
-from fisheye_svp_ros.diagnosis.moments import (
-    each_alone,
-    few_shared,
-    loose,
-    unrelated,
-    without_rig,
+from fisheye_svp_ros.diagnosis.model import Linearised, State
+from fisheye_svp_ros.diagnosis.problem import (
+    ROUNDING,
+    DiagnosisOptions,
+    Inputs,
+    Problem,
+    Progress,
+    check_distinct,
+    dither,
+    has_no_rig,
 )
-from fisheye_svp_ros.diagnosis.noise import (
-    find_gross_errors,
-    quantisation_step,
+from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
+from fisheye_svp_ros.diagnosis.stepwise import TraceStep
+from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors
+from fisheye_svp_ros.diagnosis.variance_budget import (
+    REPEATED,
+    Component,
+    Structure,
+    add_outliers,
+    remaining_structure,
+    significant_components,
 )
-from fisheye_svp_ros.diagnosis.prediction import Gain
-from fisheye_svp_ros.diagnosis.refit import Local
-from fisheye_svp_ros.diagnosis.residuals import rms_px
-from fisheye_svp_ros.diagnosis.search import Found, search
-from fisheye_svp_ros.diagnosis.structure import Structure, remaining_structure
-from fisheye_svp_ros.diagnosis.table import gross_rows, growth_cause, table_causes, with_outliers
-from fisheye_svp_ros.diagnosis.two_cameras import TwoCameras, agreed
-from fisheye_svp_ros.diagnosis.uncertainty import ModelError
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.of_cameras import camera_terms
-from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
+from fisheye_svp_ros.effects.target_map import BoardMap, board_maps
+from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 
-if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.two_sets import TwoSets
 
-# A step this small beside the noise is how numbers are written, not a cause.
-_STEP_OVER_NOISE = 0.1
+class CrossChecks(NamedTuple):
+    """What other cameras and another data set say: of each two cameras, and of the other set."""
+
+    cameras: tuple[TwoCameras, ...] = ()
+    datasets: TwoDatasets | None = None
 
 
-@dataclass
+@dataclass(frozen=True)
 class Diagnosis:
-    """The answer; `before` and `after` are the linearised states for whoever draws them.
+    """The answer: what was found, what remains, and the lenses with it.
 
-    errors: of poses and image points by the extended lens; uncertainty: their summary; cameras:
-    what each two cameras of a rig say of each other; against: what another data set of the camera
-    says.
+    causes: confirmed, those in the noise last; errors: of poses and image points by the extended
+    lenses.
     """
 
-    verdict: str
-    noise_px: float
-    frames: int
-    observations: int
-    base: FitQuality
+    evaluation: Evaluation
     components: list[Component]
     causes: list[Cause]
-    named: FitQuality
-    lens_only: FitQuality
-    extended: FitQuality
-    gross: list[dict[str, Any]]
-    advice: list[Advice]
     remaining: list[Structure]
-    untestable: dict[str, str]
-    trace: list[TraceStep]
-    gain: Gain
-    intrinsics: dict[str, Intrinsic]
+    advice: list[Advice]
+    errors: ModelErrors
     lenses: dict[str, Lens]
-    local: Local
-    errors: ModelError
-    uncertainty: dict[str, dict[str, float]]
-    cameras: list[TwoCameras]
-    before: Linearised
-    after: Linearised
-    against: TwoSets | None = None
+    checks: CrossChecks
+
+    @property
+    def problem(self) -> Problem:
+        """Data and simulation."""
+        return self.evaluation.selection.problem
+
+    @property
+    def verdict(self) -> str:
+        """Whether the simulation is adequate, (partly) explained or unexplained."""
+        if self.causes:
+            return 'partly_explained' if self.remaining else 'explained'
+        return 'unexplained' if self.remaining else 'adequate'
+
+    @property
+    def noise_px(self) -> float:
+        """Standard deviation of the noise of one coordinate, px."""
+        return self.evaluation.noise_px
+
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return self.after.data.frames
+
+    @property
+    def observations(self) -> int:
+        """How many observations there are."""
+        return len(self.problem.observations)
+
+    @property
+    def base(self) -> FitQuality:
+        """The simulation as it was fitted."""
+        return self.evaluation.base
+
+    @property
+    def named(self) -> FitQuality:
+        """All causes, without random effects."""
+        return self.evaluation.named
+
+    @property
+    def lens_only(self) -> FitQuality:
+        """Only what moves with the lens."""
+        return self.evaluation.lens_only
+
+    @property
+    def extended(self) -> FitQuality:
+        """Causes and predicted random effects."""
+        return self.evaluation.extended
+
+    @property
+    def gain(self) -> Comparison:
+        """Of the best prediction over the simulation, held out."""
+        return self.evaluation.gain
+
+    @property
+    def intrinsics(self) -> dict[str, Intrinsic]:
+        """Free intrinsics before and after."""
+        return self.evaluation.intrinsics
+
+    @property
+    def offsets(self) -> PredictedOffsets:
+        """What the random effects of target, image and views are predicted to be."""
+        return self.evaluation.offsets
+
+    @property
+    def trace(self) -> list[TraceStep]:
+        """What was tried, and what came of it."""
+        return list(self.evaluation.selection.trace)
+
+    @property
+    def untestable(self) -> dict[str, str]:
+        """Effects that the data cannot test, and why."""
+        return EffectTests(self.evaluation.selection.first).untestable
+
+    @cached_property
+    def gross(self) -> list[dict[str, Any]]:
+        """Outliers by frame and landmark, the farthest first."""
+        rows = outlier_rows(
+            self.problem.observations, self.evaluation.selection.revision.outliers)
+        table, test = self.problem.inputs.held_out, self.evaluation.held_out
+        if table is not None and test is not None:
+            rows += outlier_rows(table, test.outliers, 'held out: ')
+        return rows
+
+    @property
+    def before(self) -> Linearised:
+        """The simulation as it was fitted, for whoever draws it."""
+        return self.evaluation.before
+
+    @property
+    def after(self) -> Linearised:
+        """The extended model, for whoever draws it."""
+        return self.evaluation.null.linear
+
+    @cached_property
+    def uncertainty(self) -> dict[str, dict[str, float]]:
+        """How far off poses and image points are by the extended lenses: a summary."""
+        return self.errors.summary(self.after)
+
+    @property
+    def cameras(self) -> tuple[TwoCameras, ...]:
+        """What each two cameras of a rig say of each other."""
+        return self.checks.cameras
+
+    @property
+    def against(self) -> TwoDatasets | None:
+        """What another data set of the camera says."""
+        return self.checks.datasets
 
     @property
     def lens(self) -> Lens:
@@ -107,18 +192,24 @@ class Diagnosis:
     @property
     def rig(self) -> tuple[tuple[str, str], Pose] | None:
         """The two cameras of a rig and the first in the second, by the extended lenses."""
-        data, place = self.after.data, self.after.state.rig
+        data, rig = self.after.data, self.after.state.rig
         names = rig_cameras(data.observations.cameras)
-        if names is None or without_rig(data):
+        if names is None or has_no_rig(data):
             return None
-        first, second = (place.take(data.observations.cameras.index(name)) for name in names)
+        first, second = (rig.take(data.observations.cameras.index(name)) for name in names)
         return names, second.inverse().compose(first)
+
+    def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
+        """Return how the target differs from what it is said to be; names: by these effects."""
+        state = self.after.state
+        terms = [term for term in state.terms if not names or term[0].name in names]
+        return board_maps(self.after.data.views, terms, state.lens)
 
     @property
     def scatter_px(self) -> float:
         """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
-        found = [part.sd_px for part in self.components if part.name in ('noise', REPEATED)]
-        return float(np.hypot.reduce(found))
+        parts = [part.sd_px for part in self.components if part.name in ('noise', REPEATED)]
+        return float(np.hypot.reduce(parts))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
@@ -146,7 +237,7 @@ class Diagnosis:
             'advice': [asdict(advice) for advice in self.advice],
             'remaining': {'structure': [s._asdict() for s in self.remaining]},
             'untestable': [{'effect': e, 'why': why} for e, why in self.untestable.items()],
-            'gain': self.gain._asdict(),
+            'gain': self.gain.interval,
             'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
             'uncertainty': self.uncertainty,
             'trace': [asdict(step) for step in self.trace],
@@ -158,146 +249,119 @@ def diagnose(
     observations: Observations, lens: Lens | Mapping[str, Lens], *,
     free_intrinsics: bool | None = None,
     poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
-    wanted: Wanted | None = None, progress: Callable[[str, float], None] = lambda *_: None,
+    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
 ) -> Diagnosis:
     """Find what a lens's simulation gets wrong about observations.
 
     lens: of every camera, or the lenses of a rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
     poses: true poses by frame, of a rig's right camera; held_out: other frames of the same camera
-    and target; wanted: causes to take in or leave out; progress: told what is being done, and
+    and target; options: effects to include or leave out; progress: told what is being done, and
     which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
-    observations, _ = without_copies(observations)
-    observations.landmarks()  # each is in one place
-    if poses is not None:
-        observations = right_first(observations)
-    check_cameras(observations)
-    lenses = rig_lenses(observations, lens)
-    free = free_names(lenses, free_intrinsics)
-    first, *others = lenses.values()
-    observations = on_boards(observations, first.target.get(LANDMARKS))
-    if held_out is not None:
-        held_out = of_rig(held_out, observations.cameras)
-        held_out = on_boards(held_out, landmark_rows(observations))
-        check_other(observations, held_out)
-    wanted = wanted or Wanted()
-    if wanted.quick:
-        observations = thinned(observations)
-    progress('fitting the simulation as it is', 0.0)
-    everything = prepare(observations, poses)
-    simulated = start(everything, first, others)
-    if unrelated(everything, simulated):
-        everything = each_alone(everything)
-        simulated = start(everything, first, others)
-    data, gross = find_gross_errors(everything, simulated)
-    base = fit(data, start(data, first, others), free)
-    if few_shared(data) or loose(data, (first, *others), base, free):
-        data = each_alone(data)
-        base = fit(data, start(data, first, others), free)
-    step = quantisation_step(observations.uv)
-    rounded = step / np.sqrt(6) > _STEP_OVER_NOISE * rms_px(Linearised(data, base, free))
-    if rounded:
-        # Values on a lattice repeat with the pixel by themselves.
-        wanted = replace(wanted, left_out=(*wanted.left_out, 'detector_bias'))
-    medium = None
-    if 'flat_port' not in wanted.left_out:
-        medium = find_medium(everything, data, first, base, free, progress)
-    if medium is not None:
-        # Index and lens curve look alike: the intrinsics stay as they were in air.  Where they
-        # were off, a step after the first few frames would stand in for them.
-        if 'session_step' not in wanted.included:
-            wanted = replace(wanted, left_out=(*wanted.left_out, 'session_step'))
-        data, gross, base, free = medium.air.data, medium.gross, medium.state, medium.names
-    found = search(data, base, free, wanted, gross, progress)
-    if medium is not None and (thinner := medium.glassless(found.evidence)) is not None:
-        # What stood in for a cause was no glass.
-        medium, base, free = thinner, thinner.state, thinner.names
-        found = search(data, base, free, wanted, gross, progress)
-    found, cameras = agreed(found, free, wanted, lambda less: search(
-        data, base, free, less, gross, lambda stage, _: progress(stage, 0.79)), progress)
-    noise_causes = growth_cause(found.growth)
-    noise_causes += table_causes(observations, found.gross, step if rounded else 0.0)
-    progress('measuring the gain on held-out data', 0.8)
-    judged = _judged(
-        observations, lenses, found,
-        Measured(found, free, held_out, wanted.quick, _stated(simulated), medium),
-        noise_causes, cameras, held_out,
-    )
-    if judged.noise_px > ROUNDING:
-        return judged
-    return diagnose(dithered(observations), lens, free_intrinsics=free_intrinsics, poses=poses,
-                    held_out=held_out, wanted=wanted, progress=progress)
+    inputs = Inputs.check(
+        observations, lens, options or DiagnosisOptions(), free_intrinsics=free_intrinsics,
+        poses=poses, held_out=held_out)
+    diagnosis = _run_stages(inputs, progress)
+    if diagnosis.noise_px > ROUNDING:
+        return diagnosis
+    return _run_stages(replace(inputs, observations=dither(inputs.observations)), progress)
 
 
-def _judged(
-    observations: Observations, lenses: Mapping[str, Lens], found: Found, measured: Measured,
-    noise_causes: list[Cause], cameras: list[TwoCameras], held_out: Observations | None,
+def diagnose_against(
+    observations: Observations, other: Observations, lens: Lens | Mapping[str, Lens], *,
+    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
+    free_intrinsics: bool | None = None, **settings: Any,
 ) -> Diagnosis:
-    evidence, errors = found.evidence, ModelError.of(found.evidence, found.fitted)
-    uncertainty = errors.summary(evidence.linear)
-    components = measured.components({c.effect: c.p_value for c in noise_causes})
-    causes = measured.causes(components) + noise_causes
+    """Diagnose a data set, and ask another one of the same camera whether the lens's causes hold.
+
+    other: its target may be another one; the rest as in `diagnose`.  Causes of the lens that the
+    other set refutes are given up.
+    Raises ObservationError for data sets of several cameras, and what `diagnose` raises.
+    """
+    for table in (observations, other):
+        if len(np.unique(table.camera)) > 1:
+            raise ObservationError(f'{table.source}: two data sets of one camera are compared; '
+                                   'choose the rows of one camera')
+    check_distinct(observations, other)
+    options = options or DiagnosisOptions()
+
+    def diagnose_one(
+        table: Observations, options: DiagnosisOptions, begin: float, end: float, prefix: str = '',
+        **settings: Any,
+    ) -> Diagnosis:
+        return diagnose(
+            table, lens, free_intrinsics=free_intrinsics, options=options,
+            progress=lambda stage, done: progress(prefix + stage, begin + done * (end - begin)),
+            **settings)
+
+    found = diagnose_one(observations, options, 0.0, 0.35, **settings)
+    second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
+    progress('asking each set what it says of the other', 0.7)
+    datasets = compare_datasets(
+        found.evaluation, second.evaluation, observations.source, other.source)
+    gone = tuple(name for name in datasets.refuted if name not in options.included)
+    if gone:
+        found = diagnose_one(observations, options.without(*gone), 0.7, 0.85,
+                             'without what the other set refutes: ', **settings)
+        datasets = replace(datasets, withdrawn=gone)
+    return replace(found, checks=found.checks._replace(datasets=datasets))
+
+
+def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
+    """Take checked inputs through all stages."""
+    progress('fitting the simulation as it is', 0.0)
+    problem = Problem.of(inputs)
+    medium = find_medium(problem, progress)
+    if medium is not None:
+        problem = behind_port(problem, medium)
+    selection = select_causes(problem, progress)
+    if medium is not None and (thinner := medium.without_glass(selection.null)) is not None:
+        # What stood in for a cause was no glass.
+        medium = thinner
+        selection = select_causes(behind_port(problem, medium), progress)
+    selection, cameras = agree_on_target(selection, progress)
+    progress('measuring the gain on held-out data', 0.8)
+    evaluation = Evaluation.of(selection, FittedModel.of(selection.null), medium)
+    return _conclude(evaluation, CrossChecks(tuple(cameras)))
+
+
+def _conclude(evaluation: Evaluation, checks: CrossChecks) -> Diagnosis:
+    """Return the diagnosis of an evaluated selection."""
+    selection, null = evaluation.selection, evaluation.null
+    problem, observations = selection.problem, selection.problem.observations
+    noise_causes = growth_cause(selection.revision.growth)
+    noise_causes += table_causes(observations, selection.revision.outliers, problem.step)
+    components = evaluation.components({c.effect: c.p_value for c in noise_causes})
+    causes = evaluation.causes(components) + noise_causes
+    significant = significant_components(components)
+    errors = ModelErrors.of(null, evaluation.fitted)
+    misfit = errors.summary(null.linear)['image_px']['misfit']
+    lenses = with_uncertainty(
+        errors, null.linear, evaluation.noise_px, misfit,
+        lambda state: extended_lenses(problem.inputs.lenses, state, observations))
+    remaining = _remaining(selection, evaluation, noise_causes, significant)
+    return Diagnosis(
+        evaluation, components, causes, remaining, advise(evaluation, causes, significant), errors,
+        lenses, checks)
+
+
+def _remaining(
+    selection: Selection, evaluation: Evaluation, noise_causes: Sequence[Cause],
+    components: Sequence[Component],
+) -> list[Structure]:
+    """Return what residuals still depend on."""
+    observations = selection.problem.observations
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
     stated = bool(np.isfinite(observations.sigma).all()) and not noise_causes
     remaining = remaining_structure(
-        evidence, found.fitted, found_components(components), stated
-    )
-    remaining = with_outliers(remaining, found.gross, len(observations))
+        EffectTests(selection.null), evaluation.fitted, components, stated)
+    remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
     if 'quantisation' in {cause.effect for cause in noise_causes}:
         # Values on a lattice depend on the place within a pixel by themselves.
         remaining = [one for one in remaining if one.variable != 'pixel_phase']
-    gross = gross_rows(observations, found.gross)
-    if held_out is not None:
-        gross += gross_rows(held_out, measured.test_gross, 'held out: ')
-    return Diagnosis(
-        verdict=_verdict(causes, remaining),
-        noise_px=measured.noise,
-        frames=evidence.linear.data.frames,
-        observations=len(observations),
-        base=measured.base,
-        components=components,
-        causes=causes,
-        named=measured.named,
-        lens_only=measured.lens_only,
-        extended=measured.extended,
-        gross=gross,
-        advice=advise(found, causes, measured, found_components(components)),
-        remaining=remaining,
-        untestable=found.base.untestable,
-        trace=found.trace,
-        gain=measured.gain,
-        intrinsics=measured.intrinsics,
-        lenses=with_uncertainty(
-            errors, evidence.linear, measured.noise, uncertainty['image_px']['misfit'],
-            lambda state: extended_lenses(lenses, state, observations)),
-        local=measured.local,
-        errors=errors,
-        uncertainty=uncertainty,
-        cameras=cameras,
-        before=measured.before,
-        after=evidence.linear,
-    )
-
-
-def _stated(given: State) -> dict[str, tuple[float, float]]:
-    """Return the parameters of lenses as given, each with the error that its file states."""
-    found = {}
-    for label, lens in zip(given.labels, given.lenses, strict=True):
-        said = InAir.of(lens)
-        known = {} if said is None else dict(
-            zip(said.names, np.sqrt(np.diag(said.covariance)).tolist(), strict=True))
-        for name, value in lens.parameters.items():
-            error = known.get('f' if name in ('fx', 'fy') and 'f' in known else name, 0.0)
-            found[f'{label}.{name}' if label else name] = value, error
-    return found
-
-
-def _verdict(causes: Sequence[Cause], remaining: Sequence[Structure]) -> str:
-    if causes:
-        return 'partly_explained' if remaining else 'explained'
-    return 'unexplained' if remaining else 'adequate'
+    return remaining
 
 
 def extended_lenses(
@@ -306,10 +370,10 @@ def extended_lenses(
     """Return the lenses that were fitted, with their effects, for every command and node."""
     # What happened to one recording is no part of the lens.
     lasting = [term for term in state.terms if not term[0].of_recording]
-    found = {}
+    extended = {}
     for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
         # A fitted height curve may turn a little earlier than the one the lens came with.
         limit = min(lenses[name].max_incidence, fitted.image_height.limit * (1 - 1e-6))
         own = replace(fitted, calibration=lenses[name].calibration, max_incidence=limit)
-        found[name] = extend_lens(own, camera_terms(lasting, camera), observations)
-    return found
+        extended[name] = extend_lens(own, camera_terms(lasting, camera), observations)
+    return extended

@@ -13,27 +13,30 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.adjustment import moved
-from fisheye_svp_ros.diagnosis.gathered import Setting
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
-from fisheye_svp_ros.diagnosis.reml import GONE, Variances
-from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, ModelError, pose_maps
-from fisheye_svp_ros.effects.base import Term
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, ColumnGeometry
+from fisheye_svp_ros.diagnosis.uncertainty import (
+    ErrorParts,
+    ModelErrors,
+    parameter_names,
+    pose_maps,
+)
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, Variances
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, Views, make_observations, views_of
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured
 
-_STEP = 1e-3  # of a standard error
-_AT_ONCE = 500  # stereo points
+_STEP_SIGMAS = 1e-3  # of a standard error
+_MAX_POINTS = 500  # stereo points
 
 
 def with_uncertainty(
-    errors: ModelError, linear: Linearised, noise: float, misfit: float,
+    errors: ModelErrors, linear: Linearised, noise: float, misfit: float,
     lenses_of: Callable[[State], Mapping[str, Lens]],
 ) -> dict[str, Lens]:
     """Return the lenses of a diagnosis, each with what is known of its errors.
@@ -48,7 +51,7 @@ def with_uncertainty(
         if k < 6 * (linear.data.cameras - 1) or not stderr:
             continue  # of the rig
         step = np.zeros(len(errors.covariance))
-        step[k] = _STEP * stderr
+        step[k] = _STEP_SIGMAS * stderr
         one, other = (lenses_of(moved(linear.data, linear.state, linear.free, frames, way))
                       for way in (step, -step))
         for name, columns in by.items():
@@ -68,32 +71,29 @@ def _numbers(lens: Lens) -> dict[str, float]:
     terms = (*ForwardModel(lens).terms, *(target.terms if target else ()))
     return {**lens.parameters, **{
         name: float(value) for term in terms for name, value in
-        zip(_names(term), term[1], strict=True)}}
-
-
-def _names(term: Term) -> list[str]:
-    return [f'{term[0].name}.{parameter.name}' for parameter in term[0].parameters]
+        zip(parameter_names(term), term[1], strict=True)}}
 
 
 def _entry(
-    errors: ModelError, camera: int, noise: float, misfit: float, covariance: Array,
+    errors: ModelErrors, camera: int, noise: float, misfit: float, covariance: Array,
     names: list[str],
 ) -> dict[str, Any]:
-    setting, variances = errors.setting, errors.variances
+    geometry, variances = errors.geometry, errors.variances
     sizes = {name: float(size) for name, size in zip(NAMES, variances.tau, strict=True)
              if size and STAGE_OF[name] != 'target'}
-    off = np.concatenate([setting.alone, setting.modes.reshape(len(setting.points), -1)], axis=1)
+    modes = geometry.modes.reshape(len(geometry.points), -1)
+    off = np.concatenate([geometry.alone, modes], axis=1)
     known = np.diag(covariance) > 0
     return {
         'noise_px': noise, 'misfit_px': misfit,
         'parameters': [name for name, there in zip(names, known, strict=True) if there],
         'covariance': covariance[np.ix_(known, known)].tolist(),
         'components': sizes,
-        'extent_px': setting.extents[camera].tolist(),
-        'finest_px': float(setting.finest) if np.isfinite(setting.finest) else None,
+        'extent_px': geometry.extents[camera].tolist(),
+        'finest_px': float(geometry.finest) if np.isfinite(geometry.finest) else None,
         'landmarks': [[*pair, *place, *(float(f'{value:.6g}') for value in values)]
                       for *pair, place, values in zip(
-            setting.landmark.tolist(), setting.board.tolist(), setting.points.tolist(), off,
+            geometry.landmark.tolist(), geometry.board.tolist(), geometry.points.tolist(), off,
             strict=True)],
     }
 
@@ -102,17 +102,14 @@ def _entry(
 class LensErrors:
     """A lens and what its file says of its errors.
 
-    noise, misfit: of a coordinate of an image point, px; covariance (K, K) of the numbers `names`;
-    variances, setting: of what remains without a name.
+    noise, misfit: of a coordinate of an image point, px; model: of its parameters, and of what
+    remains without a name, over the noise.
     """
 
     lens: Lens
     noise: float
     misfit: float
-    names: tuple[str, ...]
-    covariance: Array
-    variances: Variances
-    setting: Setting
+    model: ModelErrors
 
     @classmethod
     def of(cls, lens: Lens) -> LensErrors:
@@ -123,25 +120,25 @@ class LensErrors:
                             '`diagnose -o` writes has')
         try:
             size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
-            lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, GONE)
+            lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, LAMBDA_ABSENT)
             finest = entry['finest_px']
             rows = np.array(entry['landmarks'], dtype=float)
             rows = rows.reshape(len(rows), -1)
             if rows.shape[1] < 8:
                 raise ValueError('landmarks without how far they may be off')
             ids, boards = (np.array([*map(int, rows[:, i])], dtype=np.int64) for i in (0, 1))
-            setting = Setting(
+            geometry = ColumnGeometry(
                 np.array(entry['extent_px'], dtype=float).reshape(1, 2, 2),
                 np.nan if finest is None else float(finest), ids, boards, rows[:, 2:5],
                 rows[:, 8:].reshape(len(rows), 3, -1), rows[:, 5:8])
             names = tuple(map(str, entry['parameters']))
             covariance = np.array(entry['covariance'], dtype=float).reshape(len(names), len(names))
-            found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']), names,
-                        covariance, Variances(1.0, lam, np.zeros(0)), setting)
+            found = cls(lens, float(entry['noise_px']), float(entry['misfit_px']),
+                        ModelErrors(names, covariance, Variances(1.0, lam, np.zeros(0)), geometry))
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as cause:
             raise LensError(f'lens {lens.name!r}: uncertainty is incomplete ({cause})') from cause
         numbers = (found.noise, found.misfit, *covariance.ravel(), *size)
-        wide = np.diff(setting.extents, axis=1) > 0
+        wide = np.diff(geometry.extents, axis=1) > 0
         if not (np.isfinite(numbers).all() and found.noise > 0 and len(rows) and wide.all()
                 and np.isfinite(rows).all() and (np.diag(covariance) >= 0).all()):
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
@@ -154,7 +151,7 @@ class LensErrors:
     def of_poses(self, views: Views, pose: Pose) -> ErrorParts:
         """Return covariances (S, 6, 6), m and rad, of poses, for noise of 1 / weight."""
         linear = self.linearised(views, pose)
-        return self.through(linear, pose_maps(linear.frame_columns))
+        return self.model.through(linear, pose_maps(linear.frame_columns))
 
     def of_solved(self, views: Views, solved: Localization, sigma: float | None) -> ErrorParts:
         """Return covariances (S, 6, 6), m and rad, of the change in `Pose.retract` of poses.
@@ -165,7 +162,7 @@ class LensErrors:
         """
         linear = self.linearised(views, solved.pose)
         maps = pose_maps(linear.frame_columns)
-        parts = self.through(linear, maps)
+        parts = self.model.through(linear, maps)
         excess = np.trace(solved.covariance, axis1=1, axis2=2)
         excess = excess / np.trace(parts.noise, axis1=1, axis2=2) / (sigma or 1.0) ** 2
         if sigma is None:
@@ -181,19 +178,10 @@ class LensErrors:
         model = ForwardModel(self.lens)
         views, terms = model.labelled(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})
-        own = [name for name in self.names if name in bare.parameters]
+        own = [name for name in self.model.names if name in bare.parameters]
         count = len(views.frame)
         data = Data(_table(views), views, np.arange(count), np.zeros(count, dtype=np.int64))
         return Linearised(data, State(pose, identity(1), bare, terms), own)
-
-    def through(self, linear: Linearised, maps: Array) -> ErrorParts:
-        """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
-        names = [*linear.free, *(name for term in linear.state.terms for name in _names(term))]
-        at = {name: i for i, name in enumerate(self.names)}
-        place = np.array([at.get(name, len(at)) for name in names], dtype=np.int64)
-        whole = np.pad(self.covariance, (0, 1))
-        return ModelError(self.variances, whole[np.ix_(place, place)], self.setting).through(
-            linear, maps)
 
 
 def localize_with_errors(
@@ -217,7 +205,7 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
     where a point is NaN or a camera does not see it.
     """
     found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
-    for rows in _chunks(np.flatnonzero(np.isfinite(points).all(axis=1))):
+    for rows in _split_rows(np.flatnonzero(np.isfinite(points).all(axis=1))):
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
         pairs = [(errors, errors.linearised(views, pose)) for errors, pose in (
             (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
@@ -229,7 +217,7 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
         information[~seen] = np.eye(3)
         for (errors, linear), one in zip(pairs, by, strict=True):
             maps = np.linalg.solve(information * errors.noise, np.swapaxes(one, -1, -2))
-            parts = errors.through(linear, np.asarray(maps))
+            parts = errors.model.through(linear, np.asarray(maps))
             parts = parts._replace(noise=parts.noise * errors.noise**2)
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = np.nan_to_num(whole[rows]) + part
@@ -238,9 +226,9 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
     return ErrorParts(*found)
 
 
-def _chunks(rows: Index) -> Iterator[Index]:
-    for first in range(0, len(rows), _AT_ONCE):
-        yield rows[first:first + _AT_ONCE]
+def _split_rows(rows: Index) -> Iterator[Index]:
+    for first in range(0, len(rows), _MAX_POINTS):
+        yield rows[first:first + _MAX_POINTS]
 
 
 def _table(views: Views) -> Observations:

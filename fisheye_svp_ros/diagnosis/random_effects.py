@@ -1,7 +1,8 @@
-"""The random parts of the null model: what targets, frames and lenses have of their own.
+"""The random effects of the null model: what targets, frames and lenses have of their own.
 
 Every component is a set of columns whose coefficients are drawn from one normal distribution (the
-offsets of landmarks from a t distribution); the variances come from the data (`mixed`).
+offsets of landmarks from a t distribution); the variances come from the data (`mixed_model`).
+Frames are the groups of the mixed model, landmarks its units.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.gathered import GatheredPoints, Setting
 from fisheye_svp_ros.diagnosis.model import Linearised
+from fisheye_svp_ros.effects.target import Target
+from fisheye_svp_ros.mixed_model import Components, RandomColumns
+from fisheye_svp_ros.scene.boards import Board, find_boards
 
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
@@ -25,12 +28,15 @@ STAGE_OF = {
     'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
 }
 NAMES = tuple(STAGE_OF)
-_STATIC = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine', 14, 3.0),
+OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
+_NUMEROUS = np.isin(NAMES, ('frame_bumps', 'image_finest'))  # coefficients, seldom called for
+_IMAGE_GRIDS = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine', 14, 3.0),
            ('image_finest', 26, 3.0))
 _FRAME_CELLS, _BOARD_CELLS = 4, 4
-_FEWEST_ON_BOARD = 12
-_REACH = 3.0  # of a bump, in its standard deviations
-_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
+_MIN_LANDMARKS = 12
+_BUMP_REACH = 3.0  # of a bump, in its standard deviations
+_BUMP_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
+MILLIMETRE = 1e-3  # unit of offsets on the target
 
 
 class Grid(NamedTuple):
@@ -50,81 +56,169 @@ class BoardField(NamedTuple):
     values: Array
 
 
-class Design(NamedTuple):
-    """Columns of the random coefficients, whitened, and the component of each.
+class RandomEffects(NamedTuple):
+    """The random columns of a state, and what they stand for.
 
-    frame (F, M, B): of coefficients that each frame has for itself, frame_label (B,);
-    place (F, N, 2, 3) by landmark_slot (F, N): offsets of landmarks (L,), landmark_label (L, 3);
-    shared: sparse (F M, Q), shared_label (Q,), of grids (u and v of each bump), then of fields
-    (axis by axis); axes (L, 3, 3): of the board of each landmark; -1 labels what is not there.
+    landmark (L,): ids of the units; grids, fields: what the shared columns are of, grids first (u
+    and v of each bump), then fields (axis by axis); axes (L, 3, 3): of the board of each landmark.
     """
 
-    frame: Array
-    frame_label: Index
-    place: Array
-    slot: Index
+    columns: RandomColumns
     landmark: Index
-    landmark_label: Index
-    shared: sparse.csr_array
-    shared_label: Index
     grids: tuple[Grid, ...]
     fields: tuple[BoardField, ...]
     axes: Array
 
-    @property
-    def offsets(self) -> sparse.csr_array:
-        """Columns (F M, 3 L) of the offsets of landmarks, sparse; zero for what is not there."""
-        row, place = np.arange(self.slot.size * 2), self.place.reshape(-1, 3)
-        slot = np.repeat(self.slot.ravel(), 2)
-        values = np.where((slot >= 0)[:, None] & (self.landmark_label[slot] >= 0), place, 0.0)
-        column = 3 * np.maximum(slot, 0)[:, None] + np.arange(3)
-        return sparse.csr_array(
-            (values.ravel(), (np.repeat(row, 3), column.ravel())),
-            (len(row), 3 * len(self.landmark)),
-        )
-
-    def kept(self, alive: Mask) -> Design:
-        """Return the design with some of the components (`NAMES`) only."""
-        known = np.append(alive, False)
-        columns, shared = known[self.frame_label], known[self.shared_label]
-        landmark = np.where(known[self.landmark_label], self.landmark_label, -1)
+    def select(self, alive: Mask) -> RandomEffects:
+        """Return the effects of some of the components (`NAMES`) only."""
         return self._replace(
-            frame=self.frame[..., columns], frame_label=self.frame_label[columns],
-            landmark_label=landmark, shared=self.shared[:, shared],
-            shared_label=self.shared_label[shared],
-            grids=tuple(g for g in self.grids if known[NAMES.index(g.name)]),
-            fields=tuple(f for f in self.fields if known[NAMES.index(f.name)]),
+            columns=self.columns.select(alive),
+            grids=tuple(g for g in self.grids if alive[NAMES.index(g.name)]),
+            fields=tuple(f for f in self.fields if alive[NAMES.index(f.name)]),
         )
 
+    @property
+    def grid_columns(self) -> int:
+        """How many of the shared columns, the first ones, belong to grids."""
+        return sum(2 * len(grid.centres) for grid in self.grids)
 
-def design(linear: Linearised, finest: bool = False, setting: Setting | None = None) -> Design:
+
+class ColumnGeometry(NamedTuple):
+    """What the columns rest on, for data other than those that the variances are of.
+
+    extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
+    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
+    modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
+    boards, each as a sum of the modes, drawn once for all, and of what it has alone.
+    """
+
+    extents: Array
+    finest: float
+    landmark: Index
+    board: Index
+    points: Array
+    modes: Array
+    alone: Array
+
+    @classmethod
+    def of(cls, linear: Linearised, finest: float, modes: Array, alone: Array) -> ColumnGeometry:
+        """Return that of a linearised state; modes, alone: see above."""
+        views = linear.data.views
+        used = views.used
+        landmark, first = np.unique(views.landmark[used], return_index=True)
+        return cls(GatheredPoints.of(linear).extents, finest, landmark,
+                   views.board[used][first], views.points[used][first], modes, alone)
+
+
+class GatheredPoints(NamedTuple):
+    """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
+
+    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
+    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on
+    the board over its size; place (F, N, 2, 3): whitened derivatives by an offset along the
+    board's axes, per mm.  extents (C, 2, 2), px: see `ColumnGeometry`; boards, and of_landmark
+    (L,): that of each landmark, at (L, 2): where it is on it.
+    """
+
+    used: Mask
+    uv: Array
+    weight: Array
+    camera: Index
+    slot: Index
+    landmark: Index
+    board: Index
+    local: Array
+    place: Array
+    extents: Array
+    boards: list[Board]
+    of_landmark: Index
+    at: Array
+
+    @classmethod
+    def of(cls, linear: Linearised, geometry: ColumnGeometry | None = None) -> GatheredPoints:
+        """Gather the points of a linearised state; geometry: None for its own."""
+        data, views = linear.data, linear.data.views
+
+        def rows(values: Array | Index) -> Array:
+            return data.blocks(np.asarray(values, dtype=float)[..., None, :])
+
+        weight = rows(linear.weight[..., None])[..., 0]
+        used = weight > 0
+        camera = np.broadcast_to(data.camera_of[:, None, None], (*views.landmark.shape, 1))
+        camera = rows(camera)[..., 0].astype(np.int64)
+        points, uv = rows(views.points), rows(np.nan_to_num(linear.linear.uv))
+        landmark = rows(views.landmark[..., None])[..., 0].astype(np.int64)
+        number = rows(views.board[..., None])[..., 0].astype(np.int64)
+        if geometry is None:
+            known, shown, boards = np.unique(landmark[used]), used, linear.scene.boards
+            extents = _extents(uv, used, camera)
+        else:
+            target = Target((), geometry.landmark, geometry.board, geometry.points)
+            there = rows(target.shown(views).astype(float)[..., None])[..., 0] > 0
+            known, shown = geometry.landmark, used & there
+            boards, extents = find_boards(geometry.points, geometry.board), geometry.extents
+        slot = np.where(shown, np.searchsorted(known, landmark).clip(max=len(known) - 1), -1)
+        if geometry is not None:
+            number, points = geometry.board[slot], geometry.points[slot]
+        place = linear.whitened(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
+        board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
+        for i, one in enumerate(boards):
+            mine = shown & (number == one.id)
+            board[mine], local[mine] = i, one.local(points[mine])[:, :2]
+            place[mine] = place[mine] @ one.axes.T
+        of_landmark, at = np.zeros(len(known), dtype=np.int64), np.zeros((len(known), 2))
+        if geometry is None:
+            of_landmark[slot[used]], at[slot[used]] = board[used], local[used]
+        else:
+            of_landmark = np.searchsorted([one.id for one in boards], geometry.board)
+            for i, one in enumerate(boards):
+                mine = of_landmark == i
+                at[mine] = one.local(geometry.points[mine])[:, :2]
+        return cls(used, uv, weight, camera, slot, known, board, local, place, extents, boards,
+                   of_landmark, at)
+
+
+def _extents(uv: Array, used: Mask, camera: Index) -> Array:
+    """Return the least and the largest u, v of each camera, (C, 2, 2), px; NaN without points."""
+    extents = np.full((int(camera.max()) + 1, 2, 2), np.nan)
+    for i in range(len(extents)):
+        mine = used & (camera == i)
+        if mine.any():
+            extents[i] = uv[mine].min(axis=0), uv[mine].max(axis=0)
+    return extents
+
+
+def make_random_effects(
+    linear: Linearised, finest: bool = False, geometry: ColumnGeometry | None = None
+) -> RandomEffects:
     """Build the columns of every component that the data can hold; finest: of the image, too.
 
-    setting: of the data that the variances are of, None for these; with it every component has
+    geometry: of the data that the variances are of, None for these; with it every component has
     its columns, and what stays with a target those views alone that show it.
     """
-    points = GatheredPoints.of(linear, setting)
-    frame, label = _frame_columns(points, setting is None)
-    static = list(_grids(points, finest) if setting is None else
-                  _all_grids(points, setting.finest))
+    points = GatheredPoints.of(linear, geometry)
+    frame, label = _frame_columns(points, geometry is None)
+    static = list(_image_grids(points, finest) if geometry is None else
+                  _complete_grids(points, geometry.finest))
     grids, fields = [grid for grid, _ in static], _board_fields(points)
     weight = points.weight.reshape(-1, 1)
-    parts = [_moving_both(bumps.multiply(weight).tocsr()) for _, bumps in static]
+    parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
     names = [grid.name for grid in grids] + [field.name for field in fields]
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
-    rows = points.weight.size * 2
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
     )
     kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3 for one in points.boards]
-    return Design(
-        frame, label, points.place, points.slot, points.landmark,
-        np.array(kinds)[points.of_landmark],
-        sparse.hstack([sparse.csr_array((rows, 0)), *parts], format='csr'),
-        np.concatenate([np.zeros(0, dtype=np.int64), *of]), tuple(grids), tuple(fields),
-        np.stack([one.axes for one in points.boards])[points.of_landmark],
+    columns = RandomColumns(
+        frame, label, points.place, points.slot, np.array(kinds)[points.of_landmark],
+        sparse.hstack(
+            [sparse.csr_array((points.weight.size * 2, 0)), *parts], format='csr'),
+        np.concatenate([np.zeros(0, dtype=np.int64), *of]),
+        Components(OF_LANDMARKS, _NUMEROUS),
     )
+    return RandomEffects(columns, points.landmark, tuple(grids), tuple(fields),
+                         np.stack([one.axes for one in points.boards])[points.of_landmark])
 
 
 def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]:
@@ -141,11 +235,12 @@ def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]
         blocks.append(('frame_focal', radial))
         for name, degree in (('frame_centre', 0), ('frame_linear', 1), ('frame_quadratic', 2)):
             powers = np.stack([x ** (degree - j) * y**j for j in range(degree + 1)], axis=-1)
-            blocks.append((name, _both(powers * weight[..., None])))
+            blocks.append((name, _on_both_axes(powers * weight[..., None])))
         pitch = 2 * half / _FRAME_CELLS
-        bumps = bump_values(points.uv, mine, _over(points, mine, pitch), pitch).toarray()
+        bumps = bump_values(points.uv, mine, _cover_points(points, mine, pitch), pitch).toarray()
         bumps = bumps.reshape(*mine.shape, -1) * weight[..., None]
-        blocks.append(('frame_bumps', _both(_compact(bumps) if compact else bumps)))
+        bumps = _compact_columns(bumps) if compact else bumps
+        blocks.append(('frame_bumps', _on_both_axes(bumps)))
     blocks.append(('frame_bend', _bend_columns(points)))
     columns = np.concatenate([block for _, block in blocks], axis=-1)
     label = np.concatenate([
@@ -155,7 +250,7 @@ def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]
     return columns.reshape(frames, 2 * count, -1), label
 
 
-def _over(points: GatheredPoints, mine: Mask, pitch: float) -> Array:
+def _cover_points(points: GatheredPoints, mine: Mask, pitch: float) -> Array:
     """Return centres of bumps over the extent of a camera and over all its points."""
     low, high = points.extents[int(points.camera[mine][0])]
     uv = points.uv[mine]
@@ -173,7 +268,7 @@ def _bend_columns(points: GatheredPoints) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.csr_array]]:
+def _image_grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.csr_array]]:
     """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
 
     Each grid with its values (F N, K) at the points.
@@ -182,7 +277,7 @@ def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.
         mine = points.used & (points.camera == camera)
         if not mine.any():
             continue
-        for name, most, fewest in _STATIC[: 4 if finest else 3]:
+        for name, most, fewest in _IMAGE_GRIDS[: 4 if finest else 3]:
             fits = max(int(np.sqrt(mine.sum() / fewest)), 16)
             cells = min(most, fits) if name == 'image_finest' else most
             pitch = max(float((high - low).max()) / cells, 1e-9)
@@ -194,16 +289,16 @@ def _grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.
                 yield Grid(name, camera, centres[seen], pitch), bumps[:, seen]
 
 
-def _all_grids(
+def _complete_grids(
     points: GatheredPoints, finest: float
 ) -> Iterator[tuple[Grid, sparse.csr_array]]:
     """Yield the bumps wherever there are points; finest: pitch of the finest grid, px, or NaN."""
     for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
-        for name, most, _ in _STATIC if mine.any() else ():
+        for name, most, _ in _IMAGE_GRIDS if mine.any() else ():
             pitch = finest if name == 'image_finest' else float((high - low).max()) / most
             if np.isfinite(pitch):
-                centres = _over(points, mine, pitch)
+                centres = _cover_points(points, mine, pitch)
                 yield (Grid(name, camera, centres, pitch),
                        bump_values(points.uv, mine, centres, pitch))
 
@@ -217,7 +312,7 @@ def _board_fields(points: GatheredPoints) -> list[BoardField]:
     fields = []
     for i, board in enumerate(points.boards):
         mine = points.of_landmark == i
-        if not board.flat or mine.sum() < _FEWEST_ON_BOARD:
+        if not board.flat or mine.sum() < _MIN_LANDMARKS:
             continue
         at = points.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
@@ -229,14 +324,14 @@ def _board_fields(points: GatheredPoints) -> list[BoardField]:
         smooth = ('board_in_plane', (0, 1), 1), ('board_normal', (2,), board.highest_degree)
         for name, axes, degree in smooth:
             values = np.zeros((len(points.at), len(centres)))
-            values[mine] = _outside_powers(bumps, at, degree)
+            values[mine] = _remove_polynomial(bumps, at, degree)
             kept = np.sqrt((values**2).sum(axis=0)) > 0.05
             if kept.any():
                 fields.append(BoardField(name, axes, values[:, kept]))
     return fields
 
 
-def _outside_powers(values: Array, at: Array, degree: int) -> Array:
+def _remove_polynomial(values: Array, at: Array, degree: int) -> Array:
     """Take the best polynomial of places (L, 2) out of values (L, K)."""
     x, y = at.T
     powers = np.stack(
@@ -260,15 +355,15 @@ def hexagons(low: Array, high: Array, pitch: float) -> Array:
 
 def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.csr_array:
     """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
-    sd = _WIDTH * pitch
+    sd = _BUMP_WIDTH * pitch
     near = cKDTree(at[mine]).sparse_distance_matrix(
-        cKDTree(centres), _REACH * sd, output_type='ndarray')
+        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray')
     row = np.flatnonzero(mine)[near['i']]
     values = np.exp(-((near['v'] / sd) ** 2) / 2)
     return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))
 
 
-def _compact(columns: Array) -> Array:
+def _compact_columns(columns: Array) -> Array:
     """Move the columns (F, N, K) that a frame has to the front: most frames lack most of them."""
     weight = columns.sum(axis=1)
     kept = weight > 2.0 * np.median(columns.max(axis=(1, 2)))
@@ -278,7 +373,7 @@ def _compact(columns: Array) -> Array:
     return np.asarray(packed)
 
 
-def _both(values: Array) -> Array:
+def _on_both_axes(values: Array) -> Array:
     """Return columns (F, N, 2, 2 K) that move u and v apart by values (F, N, K)."""
     columns = np.zeros((*values.shape[:2], 2, values.shape[-1], 2))
     columns[..., 0, :, 0] = values
@@ -286,6 +381,6 @@ def _both(values: Array) -> Array:
     return columns.reshape(*values.shape[:2], 2, -1)
 
 
-def _moving_both(values: sparse.csr_array) -> sparse.csr_array:
+def _move_both_axes(values: sparse.csr_array) -> sparse.csr_array:
     """Return columns (2 n, 2 K) that move u and v apart by values (n, K)."""
     return sparse.csr_array(sparse.kron(values, np.eye(2), 'csr'))

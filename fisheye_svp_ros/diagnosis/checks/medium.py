@@ -7,116 +7,117 @@ where that explains as well what a free lens curve would need a dozen numbers fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.budget import Component
+from fisheye_svp_ros.diagnosis.calibration import InAir
 from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.evidence import Evidence, block_basis, pseudo_inverse
-from fisheye_svp_ros.diagnosis.in_air import InAir
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views, flat_rows
-from fisheye_svp_ros.diagnosis.noise import Gross, find_gross_errors
-from fisheye_svp_ros.diagnosis.prediction import Gain, HeldOut, on_other_data
-from fisheye_svp_ros.diagnosis.residuals import rms_px
-from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
+from fisheye_svp_ros.diagnosis.cross_validation import Comparison, HeldOut, predict_other_data
+from fisheye_svp_ros.diagnosis.fitted_model import rms_px
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
+from fisheye_svp_ros.diagnosis.problem import Problem, Progress
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
+from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
+from fisheye_svp_ros.effects.session_step import SessionStepEffect
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
 
-PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
-INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
-_UNITS = {INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
+PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
+MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
+_UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
           THICKNESS: 'm'}
-_SUSPECT = 1.0  # px: less than this is no third of the image
-_LOST = 5.0  # px: what leaves more explains nothing
-_LARGER = 1.1  # than in air: what looks so much larger may be seen through a flat port
+_SUSPICIOUS_PX = 1.0  # px: less than this is no third of the image
+_LOST_PX = 5.0  # px: what leaves more explains nothing
+_MIN_MAGNIFICATION = 1.1  # than in air: what looks so much larger may be seen through a flat port
 _FOLDS = 5
-_FEW = 12  # frames, enough for a start
-_TERMS = 8  # of a free lens curve
-_EXPLAINED = 0.98  # of what a free lens curve explains
-_WORSE = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
-_LIQUIDS = (1.30, 1.56)  # refractive indices of what one photographs through (water to oils)
-_KEPT = 0.8  # of the points, at least, are no gross errors behind a port that is there
-_THICKEST = 0.05  # m, of glass
-_SURE = 3.0  # standard errors of its thickness
-_TOLD = 0.02  # standard error above which the index is not told by the data
+_START_FRAMES = 12  # frames, enough for a start
+_CURVE_TERMS = 8  # of a free lens curve
+_EXPLAINED_SHARE = 0.98  # of what a free lens curve explains
+_MAX_COST_RATIO = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
+_LIQUID_INDICES = (1.30, 1.56)  # refractive: of what one photographs through, water to oils
+_MIN_KEPT_SHARE = 0.8  # of the points, at least, are no outliers behind a port that is there
+_MAX_THICKNESS = 0.05  # m, of glass
+_THICKNESS_SIGMAS = 3.0  # standard errors of its thickness
+_MAX_INDEX_ERROR = 0.02  # standard error above which the index is not told by the data
 
 
 @dataclass(frozen=True)
 class Medium:
     """A port with another medium behind it, and the simulation in air that it takes the place of.
 
-    state, names: the fit, and what of the port was fitted; gross: errors set aside beside it; air:
-    the simulation as it was, fitted to the same data;
-    magnified: relative standard error of the focal length in air, as far as the lens tells;
-    p_value, share: of the misfit in air; alike: whether a free lens curve describes it as well;
-    merit: by how much less likely than one (BIC); moved: whether the intrinsics are no longer as
-    they were in air, within what the calibration there left open.
+    state, names: the fit, and what of the port was fitted; outliers: found beside it; air: the
+    simulation as it was, fitted to the same data; p_value, share: of the misfit in air; alike:
+    whether a free lens curve describes it as well; criterion: by how much less likely than one
+    (BIC); moved: whether the intrinsics are no longer as they were in air, within what the
+    calibration there left open; focal_error: relative standard error of the focal length in air.
     """
 
     state: State
     names: tuple[str, ...]
-    gross: Gross
+    outliers: Outliers
     air: Linearised
-    free: tuple[str, ...]
     p_value: float
     share: float
     alike: bool
-    merit: float
+    criterion: float
     moved: bool
-    magnified: float = 0.0
+    focal_error: float = 0.0
 
-    def glassless(self, evidence: Evidence) -> Medium | None:
+    def without_glass(self, null: NullModel) -> Medium | None:
         """Return the medium with its glass counted as part of the distance.
 
-        evidence: once all causes are found; None where it still tells of the glass.
+        null: once all causes are found; None where it still tells of the glass.
         """
         if THICKNESS not in self.names:
             return None
-        thickness = evidence.linear.state.lens.parameters[THICKNESS]
-        error = standard_errors(evidence)[evidence.linear.free.index(THICKNESS)]
-        if _is_glass(thickness) and thickness > _SURE * error:
+        thickness = null.linear.state.lens.parameters[THICKNESS]
+        error = standard_errors(null)[null.linear.free.index(THICKNESS)]
+        if _is_glass(thickness) and thickness > _THICKNESS_SIGMAS * error:
             return None
         names = tuple(name for name in self.names if name != THICKNESS)
         lens = self.state.lens.with_parameters([THICKNESS], [0.0])
         state = fit(self.air.data, replace(self.state, lens=lens), names)
         return replace(self, state=state, names=names)
 
-    def held_out(self) -> HeldOut:
+    def cross_validate(self) -> HeldOut:
         """Predict parts of the frames in turn, in air."""
         data, state = self.air.data, self.air.state
-        if not self.free:
-            return on_other_data(data, state)
+        if not self.air.free:
+            return predict_other_data(data, state)
         part = np.arange(data.frames) % min(_FOLDS, data.frames)
         squares, counts = np.zeros(data.frames), np.zeros(data.frames)
         for fold in range(int(part.max()) + 1):
             mine = part == fold
             kept = chosen_views(data, ~mine[data.frame_of])
-            trained = fit(kept, replace(state, pose=state.pose.take(~mine)), self.free)
+            trained = fit(kept, replace(state, pose=state.pose.take(~mine)), self.air.free)
             test = chosen_views(data, mine[data.frame_of])
             near = replace(trained, pose=state.pose.take(mine))
-            squares[mine], counts[mine] = on_other_data(test, near)
+            squares[mine], counts[mine] = predict_other_data(test, near)
         return HeldOut(squares, counts)
 
-    def cause(self, stderr: dict[str, float], rms: float, gain: Gain) -> Cause:
+    def cause(self, stderr: dict[str, float], rms: float, gain: Comparison) -> Cause:
         """Return the cause; stderr by name; rms, gain: of held-out frames once it is in."""
         values = self.state.lens.parameters
-        if INDEX in stderr:
+        if MEDIUM_INDEX in stderr:
             # Nothing seen through the port tells the index from the focal length in air.
-            told = float(np.hypot(stderr[INDEX], self.magnified * values[INDEX]))
-            stderr = {**stderr, INDEX: told}
+            told = float(np.hypot(stderr[MEDIUM_INDEX], self.focal_error * values[MEDIUM_INDEX]))
+            stderr = {**stderr, MEDIUM_INDEX: told}
         parameters = {
             name.removeprefix('port_'): {
                 'value': float(values[name]), 'stderr': stderr.get(name, 0.0),
                 'unit': _UNITS[name],
-            } for name in _UNITS if name in (INDEX, *self.names)
+            } for name in _UNITS if name in (MEDIUM_INDEX, *self.names)
         }
         form = f'{FlatPortEffect.name}(medium)'
         return Cause(
@@ -143,59 +144,71 @@ class Medium:
         return [own, *parts]
 
 
-def find_medium(
-    everything: Data, data: Data, lens: Lens, base: State, free: Sequence[str],
-    progress: Callable[[str, float], None],
-) -> Medium | None:
-    """Ask whether the camera looks through a flat port into another medium than air.
-
-    everything: with gross errors, data: without those that stand out in air; lens: as it was in
-    air; base: the fit of the simulation with `free` intrinsics.
-    """
-    if lens.port is not None or data.cameras > 1:
+def find_medium(problem: Problem, progress: Progress) -> Medium | None:
+    """Ask whether the camera looks through a flat port into another medium than air."""
+    table, data, base, free = problem.table, problem.data, problem.base, problem.free
+    lens = next(iter(problem.inputs.lenses.values()))
+    if lens.port is not None or data.cameras > 1 or (
+        FlatPortEffect.name in problem.options.left_out
+    ):
         return None
-    air = Linearised(data, base, free)
-    if not (_magnified(air, lens, base) if free else rms_px(air) > _SUSPECT):
+    air = problem.linear
+    if not (_is_magnified(air, lens, base) if free else rms_px(air) > _SUSPICIOUS_PX):
         return None
     progress('asking whether the camera looks into another medium', 0.02)
     curve = _free_curve(data, base)
-    if not (_magnified(air, lens, curve) or rms_px(Linearised(data, curve, ())) > _SUSPECT):
+    if not (_is_magnified(air, lens, curve)
+            or rms_px(Linearised(data, curve, ())) > _SUSPICIOUS_PX):
         return None
-    known, found = InAir.of(lens), [_told(everything, lens, _started(data, lens), free, 0.0)]
+    known = InAir.of(lens)
+    media = [_assess_port(table, lens, _start_port(data, lens), free, 0.0)]
     if known is not None:
         progress('asking what photographs in air left open of the lens', 0.03)
-        wet = _corrected(everything, lens, known)
-        moved = 0.0 if wet is None else known.unlikely(wet)
-        found.append(_told(everything, lens, wet, free, moved))
-    return min(filter(None, found), key=lambda one: one.merit, default=None)
+        wet = _correct_lens(table, lens, known)
+        distance = 0.0 if wet is None else known.squared_distance(wet)
+        media.append(_assess_port(table, lens, wet, free, distance))
+    return min(filter(None, media), key=lambda one: one.criterion, default=None)
 
 
-def _corrected(everything: Data, lens: Lens, known: InAir) -> Lens | None:
+def behind_port(problem: Problem, medium: Medium) -> Problem:
+    """Return the problem with the simulation behind its port.
+
+    Index and lens curve look alike: the intrinsics stay as they were in air.  Where they were off,
+    a step after the first few frames would stand in for them.
+    """
+    options, step = problem.options, SessionStepEffect.name
+    if step not in options.included and step not in options.left_out:
+        options = options.without(step)
+    return replace(problem, data=medium.air.data, outliers=medium.outliers, base=medium.state,
+                   free=medium.names, options=options)
+
+
+def _correct_lens(everything: Data, lens: Lens, known: InAir) -> Lens | None:
     """Return a lens behind its port, moved within what photographs in air had left open of it."""
-    near = known.within(everything, known.reach)
-    wet = None if near is None else _started(near, lens)
+    near = known.select_points(everything, known.reach)
+    wet = None if near is None else _start_port(near, lens)
     if wet is None:
         return None
     try:
-        found = known.behind(everything, wet, PLACE, INDEX)
+        found = known.fit_behind_port(everything, wet, PORT_PLACE, MEDIUM_INDEX)
     except GeometryError:
         return None
     # What index the lens is found beside need not be that of a liquid: it is asked for anew.
-    return found and found.with_parameters([INDEX], [MEDIA['water']])
+    return found and found.with_parameters([MEDIUM_INDEX], [MEDIA['water']])
 
 
-def _told(
+def _assess_port(
     everything: Data, lens: Lens, wet: Lens | None, free: Sequence[str], moved: float
 ) -> Medium | None:
     """Return the medium if a port explains as well as a free lens curve would.
 
     wet: the lens with its port about where it is and the intrinsics that it is held to; moved: how
-    unlikely these are by the calibration in air, as `InAir.unlikely` says.
+    unlikely these are by the calibration in air, as `InAir.squared_distance` says.
     """
-    found = None if wet is None else _behind_port(everything, wet)
+    found = None if wet is None else _fit_port(everything, wet)
     if found is None:
         return None
-    data, gross, state, names = found
+    data, outliers, state, names = found
     base = fit(data, start(data, lens), free)
     air, curve = Linearised(data, base, free), _free_curve(data, base)
     plain = replace(base, lens=replace(state.lens, port=None))
@@ -203,18 +216,19 @@ def _told(
         fit(data, plain, ()), state, curve))
     rows = int(air.used.sum())
     square = min(after, least) / rows
-    merits = (after / square + len(names) * np.log(rows) + moved,
-              least / square + (len(INTRINSICS) + _TERMS) * np.log(rows))
-    near = before - after > _EXPLAINED * (before - least) and after < _WORSE * least
-    if not (merits[0] < merits[1] or near):
+    criteria = (after / square + len(names) * np.log(rows) + moved,
+              least / square + (len(INTRINSICS) + _CURVE_TERMS) * np.log(rows))
+    near = before - after > _EXPLAINED_SHARE * (before - least) and after < _MAX_COST_RATIO * least
+    if not (criteria[0] < criteria[1] or near):
         return None
     mine = _cost(air)
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
-    return Medium(state, names, gross, air, tuple(free), p_value, max(0.0, 1 - after / mine),
-                  bool(merits[1] < merits[0]), merits[0] - merits[1], moved > 0, _of_focal(lens))
+    return Medium(
+        state, names, outliers, air, p_value, max(0.0, 1 - after / mine),
+        bool(criteria[1] < criteria[0]), criteria[0] - criteria[1], moved > 0, _focal_error(lens))
 
 
-def _of_focal(lens: Lens) -> float:
+def _focal_error(lens: Lens) -> float:
     """Return the relative standard error of a focal length, 0 where a lens says nothing of it."""
     if known := InAir.of(lens):
         return known.focal
@@ -224,61 +238,63 @@ def _of_focal(lens: Lens) -> float:
     return 0.0
 
 
-def _started(data: Data, lens: Lens) -> Lens | None:
+def _start_port(data: Data, lens: Lens) -> Lens | None:
     """Return the lens with a port about where it is, fitted to a few frames."""
-    chosen = np.linspace(0, data.frames - 1, min(_FEW, data.frames)).astype(int)
+    chosen = np.linspace(0, data.frames - 1, min(_START_FRAMES, data.frames)).astype(int)
     few = chosen_views(data, np.isin(data.frame_of, chosen))
     tried: list[tuple[float, Lens]] = []
     for port in FlatGlass(0.0, MEDIA['water']).starts():
         try:
-            state = fit(few, start(few, replace(lens, port=port)), PLACE)
+            state = fit(few, start(few, replace(lens, port=port)), PORT_PLACE)
         except GeometryError:
             continue  # nothing of a view is seen through a port there
-        tried.append((_cost(Linearised(few, state, PLACE)), state.lens))
+        tried.append((_cost(Linearised(few, state, PORT_PLACE)), state.lens))
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
     found = min(tried, key=lambda one: one[0])[1]
     return replace(lens, port=found.port)
 
 
-def _behind_port(
+def _fit_port(
     everything: Data, wet: Lens
-) -> tuple[Data, Gross, State, tuple[str, ...]] | None:
+) -> tuple[Data, Outliers, State, tuple[str, ...]] | None:
     """Fit the place of a port; free the index where the data tell it.
 
-    Returns also the data without the gross errors that stand out behind the port: in air other
+    Returns also the data without the outliers that stand out behind the port: in air other
     points may have seemed to be some.
     """
-    data, gross = find_gross_errors(everything, start(everything, wet))
-    if data.views.used.sum() < _KEPT * everything.views.used.sum():
+    data, outliers = find_outliers(everything, start(everything, wet))
+    if data.views.used.sum() < _MIN_KEPT_SHARE * everything.views.used.sum():
         return None
-    state = fit(data, start(data, wet), PLACE)
+    state = fit(data, start(data, wet), PORT_PLACE)
     if not np.isfinite(_cost(Linearised(data, state, ()))):
         return None
-    freed, errors, _ = _freed(data, state, (*PLACE, INDEX))
-    names: tuple[str, ...] = PLACE
-    liquid = _LIQUIDS[0] <= freed.lens.parameters[INDEX] <= _LIQUIDS[1]
-    if errors[-1] < _TOLD and liquid:
-        state, names = freed, (*PLACE, INDEX)
-    freed, errors, gain = _freed(data, state, (*names, THICKNESS))
+    freed, errors, _ = _free_parameters(data, state, (*PORT_PLACE, MEDIUM_INDEX))
+    names: tuple[str, ...] = PORT_PLACE
+    liquid = _LIQUID_INDICES[0] <= freed.lens.parameters[MEDIUM_INDEX] <= _LIQUID_INDICES[1]
+    if errors[-1] < _MAX_INDEX_ERROR and liquid:
+        state, names = freed, (*PORT_PLACE, MEDIUM_INDEX)
+    freed, errors, gain = _free_parameters(data, state, (*names, THICKNESS))
     # Glass of no thickness is part of the distance.
     there = _is_glass(freed.lens.parameters[THICKNESS])
     if there and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
-    if rms_px(Linearised(data, state, ())) > _LOST:
+    if rms_px(Linearised(data, state, ())) > _LOST_PX:
         return None
-    return data, gross, state, names
+    return data, outliers, state, names
 
 
 def _is_glass(thickness: float) -> bool:
-    return 0 < thickness < _THICKEST
+    return 0 < thickness < _MAX_THICKNESS
 
 
-def _freed(data: Data, state: State, names: tuple[str, ...]) -> tuple[State, Array, float]:
+def _free_parameters(
+    data: Data, state: State, names: tuple[str, ...]
+) -> tuple[State, Array, float]:
     """Fit named parameters; return their standard errors, and the last one's likelihood ratio."""
     freed = fit(data, state, names)
     linear = Linearised(data, freed, names)
-    basis, clean = block_basis(linear.frame_columns), linear.shared_columns
+    basis, clean = group_basis(linear.frame_columns), linear.shared_columns
     flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
     inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
     square = _cost(linear) / int(linear.used.sum())
@@ -290,18 +306,18 @@ def _free_curve(data: Data, base: State) -> State:
     """Return the fit of a lens curve and a centre of any kind, in air."""
     theta = Linearised(data, base, ()).scene.theta_max
     known = [t for t in base.terms if t[0].name != RadialProfileEffect.name]
-    effect = RadialProfileEffect(_TERMS, round(theta, 6))
-    free = replace(base, terms=(*known, (effect, np.zeros(_TERMS))))
+    effect = RadialProfileEffect(_CURVE_TERMS, round(theta, 6))
+    free = replace(base, terms=(*known, (effect, np.zeros(_CURVE_TERMS))))
     return fit(data, free, INTRINSICS)
 
 
-def _magnified(air: Linearised, lens: Lens, state: State) -> bool:
+def _is_magnified(air: Linearised, lens: Lens, state: State) -> bool:
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
     model = Linearised(air.data, state, ()).model.model(0).lens
     height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
                      for one in (model, lens))
-    return height > _LARGER * known
+    return height > _MIN_MAGNIFICATION * known
 
 
 def _cost(linear: Linearised) -> float:

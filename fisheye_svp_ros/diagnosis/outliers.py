@@ -1,4 +1,4 @@
-"""Causes that move no prediction: wrong ids, quantisation, noise that grows with the angle."""
+"""Outliers, and what lies in the noise: wrong ids, rounding, noise that grows with the angle."""
 
 from __future__ import annotations
 
@@ -10,50 +10,50 @@ from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.cameras import Cameras
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.model import Data, State, chosen_views
-from fisheye_svp_ros.diagnosis.refit import Fitted
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 
-_GROSS = 8.0  # robust standard deviations beyond which a point cannot belong to its landmark
-_GATE = 6.0  # and within which it belongs to another one
-_CHANCE = 0.01  # that so many do by chance
-_SUSPECT = 6.0  # below this no point is worth a robust fit
-_ORDINARY = 4.0  # and below this one is like all others
+_OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not its landmark's
+_SWAP_SIGMAS = 6.0  # and within which it belongs to another one
+_SWAP_CHANCE = 0.01  # that so many do by chance
+_SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
+_REINSTATED_SIGMAS = 4.0  # and below this one is like all others
 SWAPPED = 'it lies where another landmark is predicted'
 FAR = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
 FRAME = ('its cameras contradict each other: points in another order, another moment, or cameras '
          'exchanged')
-_VIEW, _VIEW_PX = 15.0, 3.0  # times the median view, and px: a view that belongs elsewhere
-_FRAME = 6.0  # times the median frame: cameras that contradict each other
-_FEW_TORN = 0.5  # of the views that another camera can contradict: a minority
-_OUTLYING = 0.005  # probability of one such point among clean ones
-_FADE = 2.0
-_SETTLED = 0.1  # of the scale: how little predictions may move
-_UNSEEN = 1e9  # px, for points out of the field of view: further off than any other
-_ROUNDING = 1e-6  # px: no residual of computed points is smaller
-_MEDIAN = 1.1774  # of the norm of two standard normal coordinates
-_ROUNDS = 8
-_WITHIN = 2.6  # standard errors
+_VIEW_RATIO, _MIN_VIEW_PX = 15.0, 3.0  # times the median view, px: it belongs elsewhere
+_FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
+_MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority
+_OUTLIER_PROBABILITY = 0.005  # probability of one such point among clean ones
+_CAUCHY_SCALE = 2.0
+_CONVERGED = 0.1  # of the scale: how little predictions may move
+_UNSEEN_PX = 1e9  # px, for points out of the field of view: further off than any other
+_MIN_RESIDUAL_PX = 1e-6  # px: no residual of computed points is smaller
+_MEDIAN_NORM = 1.1774  # of the norm of two standard normal coordinates
+_MAX_ITERATIONS = 8
+_WITHIN_SIGMAS = 2.6  # standard errors
 
 
-class Gross(NamedTuple):
-    """Gross errors of a table: outlying rows of it, how far (px), and why."""
+class Outliers(NamedTuple):
+    """Outliers errors of a table: outlying rows of it, how far (px), and why."""
 
     rows: Index
     px: Array
     why: tuple[str, ...]
 
-    def joined(self, other: Gross) -> Gross:
+    def join(self, other: Outliers) -> Outliers:
         """Return these and other rows."""
-        return Gross(np.concatenate([self.rows, other.rows]),
+        return Outliers(np.concatenate([self.rows, other.rows]),
                      np.concatenate([self.px, other.px]), (*self.why, *other.why))
 
-    def with_more(self, rows: Index, px: Array, why: str) -> Gross:
+    def append(self, rows: Index, px: Array, why: str) -> Outliers:
         """Return these and other rows, of one reason."""
-        return self.joined(Gross(rows, px, (why,) * len(rows)))
+        return self.join(Outliers(rows, px, (why,) * len(rows)))
 
     @property
     def swapped(self) -> int:
@@ -61,10 +61,10 @@ class Gross(NamedTuple):
         return self.why.count(SWAPPED)
 
 
-NO_GROSS = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
+NO_OUTLIERS = Outliers(np.zeros(0, dtype=np.int64), np.zeros(0), ())
 
 
-class NoiseCause(NamedTuple):
+class NoiseGrowth(NamedTuple):
     """Noise that changes: value, standard error, p-value; variance (F, M): over the mean one."""
 
     value: float
@@ -73,50 +73,60 @@ class NoiseCause(NamedTuple):
     variance: Array
 
 
-def find_gross_errors(data: Data, state: State) -> tuple[Data, Gross]:
-    """Return the data without gross errors, and what the errors were.
+def find_outliers(data: Data, state: State) -> tuple[Data, Outliers]:
+    """Return the data without outliers, and what these were.
 
-    Every view is localized with weights that fade for points far from their prediction (Cauchy),
-    on the scale of the median residual of that view or of all, whichever is larger: a view that
-    a model error bends as a whole holds no gross error, nor does a landmark that is off in most
-    of its views.  A view out of all proportion belongs elsewhere as a whole.  A point whose own
-    sigma is larger than most may lie so much further off.
+    A view that a model error bends as a whole holds no outlier, nor does a landmark that is off in
+    most of its views.  A view out of all proportion belongs elsewhere as a whole.  A point whose
+    own sigma is larger than most may lie so much further off.
     """
-    model = state.cameras
-    views, pose = data.views, state.view_poses(data)
-    alone = model.localize(views) if data.cameras > 1 else pose
-    unsure = _unsure(views)
-    scale, offset = _scale(views, model.offsets(pose, views) / unsure)
-    if np.nanmax(offset / scale) > _SUSPECT:
-        for _ in range(_ROUNDS):
-            before = offset
-            fading = 1 / np.sqrt(1 + (offset / (_FADE * scale)) ** 2)
-            weight = np.where(views.used, views.weight * fading, 0.0)
-            alone = pose = model.localize(views._replace(weight=weight), pose)
-            scale, offset = _scale(views, model.offsets(pose, views) / unsure)
-            with np.errstate(invalid='ignore'):  # what is out of sight stays so
-                change = np.nanmax(np.abs(offset - before) / scale)
-            if change < _SETTLED:
-                break
-    of_landmark = _scale_of_landmark(views, offset)
+    model, views = state.cameras, data.views
+    pose, alone, scale, offset = _localize_robustly(data, state)
+    of_landmark = _landmark_scale(views, offset)
     typical = float(np.median(scale))
-    whole = scale[:, 0] > max(_VIEW * typical, _VIEW_PX)
+    whole = scale[:, 0] > max(_VIEW_RATIO * typical, _MIN_VIEW_PX)
     whole = np.asarray(whole & (whole.mean() < 0.2))
-    far = views.used & (offset > _GROSS * np.maximum(scale, of_landmark)) & ~whole[:, None]
-    swapped = _fits_another(model, pose, views, far, _GATE * typical)
-    gross = NO_GROSS
-    torn, apart = _torn_frames(data, state, alone, typical)
+    limit = _OUTLIER_SIGMAS * np.maximum(scale, of_landmark)
+    far = views.used & (offset > limit) & ~whole[:, None]
+    swapped = _find_swaps(model, pose, views, far, _SWAP_SIGMAS * typical)
+    torn, apart = _inconsistent_frames(data, state, alone, typical)
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
-    offset = offset * unsure
+    offset, outliers = offset * _relative_sigma(views), NO_OUTLIERS
     for mask, px, why in ((swapped, offset, SWAPPED), (far & ~swapped, offset, FAR),
                           (views.used & whole[:, None], offset, VIEW),
                           (views.used & torn[:, None], apart, FRAME)):
-        gross = gross.with_more(views.row[mask], px[mask], why)
-    return set_aside(data, far | (views.used & (whole | torn)[:, None])), gross
+        outliers = outliers.append(views.row[mask], px[mask], why)
+    return without_points(data, far | (views.used & (whole | torn)[:, None])), outliers
 
 
-def _torn_frames(
+def _localize_robustly(data: Data, state: State) -> tuple[Pose, Pose, Array, Array]:
+    """Localize every view with weights that fade for points far from their prediction (Cauchy).
+
+    On the scale of the median residual of that view or of all, whichever is larger.  Returns poses
+    (S,), those of each view by itself (S,), scales (S, 1) and offsets (S, N) over the points' own
+    relative sigma, px.
+    """
+    model, views, pose = state.cameras, data.views, state.view_poses(data)
+    alone = model.localize(views) if data.cameras > 1 else pose
+    sigma = _relative_sigma(views)
+    scale, offset = _robust_scale(views, model.offsets(pose, views) / sigma)
+    if not np.nanmax(offset / scale) > _SUSPICIOUS_SIGMAS:
+        return pose, alone, scale, offset
+    for _ in range(_MAX_ITERATIONS):
+        before = offset
+        fading = 1 / np.sqrt(1 + (offset / (_CAUCHY_SCALE * scale)) ** 2)
+        weight = np.where(views.used, views.weight * fading, 0.0)
+        pose = model.localize(views._replace(weight=weight), pose)
+        scale, offset = _robust_scale(views, model.offsets(pose, views) / sigma)
+        with np.errstate(invalid='ignore'):  # what is out of sight stays so
+            change = np.nanmax(np.abs(offset - before) / scale)
+        if change < _CONVERGED:
+            break
+    return pose, pose, scale, offset
+
+
+def _inconsistent_frames(
     data: Data, state: State, alone: Pose, typical: float
 ) -> tuple[Mask, Array]:
     """Return the views (S,) of frames whose cameras contradict each other, and by how much, px.
@@ -127,17 +137,17 @@ def _torn_frames(
     """
     if data.cameras < 2:
         return np.zeros(len(data.frame_of), dtype=bool), np.zeros(data.views.used.shape)
-    misfit, apart = between_cameras(data, state, alone)
+    misfit, apart = cross_camera_offsets(data, state, alone)
     several = np.isfinite(misfit)
     usual = float(np.quantile(misfit[several], 0.5, method='lower')) if several.any() else 0.0
-    torn = several & (misfit > max(_VIEW * typical, _VIEW_PX, _FRAME * usual))
+    torn = several & (misfit > max(_VIEW_RATIO * typical, _MIN_VIEW_PX, _FRAME_RATIO * usual))
     # Of two views that contradict each other either may be wrong.
     borne_out = np.bincount(data.frame_of, several & ~torn)[data.frame_of] > 1
     torn |= several & ~borne_out & np.isin(data.frame_of, data.frame_of[torn])
-    return np.asarray(torn & (torn.sum() < _FEW_TORN * several.sum())), apart
+    return np.asarray(torn & (torn.sum() < _MAX_INCONSISTENT_SHARE * several.sum())), apart
 
 
-def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array]:
+def cross_camera_offsets(data: Data, state: State, alone: Pose) -> tuple[Array, Array]:
     """Return how far off, px, each view is from where another camera of its frame has it.
 
     alone: poses (S,) of the views, each by itself; another camera is the one that predicts it
@@ -155,13 +165,13 @@ def between_cameras(data: Data, state: State, alone: Pose) -> tuple[Array, Array
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
         offset = model.offsets(body.take(other).compose(place), views)
-        median = np.nanmedian(np.minimum(offset, _UNSEEN), axis=1)
+        median = np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
-        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=_UNSEEN), median[mine]
+        apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=_UNSEEN_PX), median[mine]
     return misfit, apart
 
 
-def set_aside(data: Data, mask: Mask) -> Data:
+def without_points(data: Data, mask: Mask) -> Data:
     """Return the data without some points (S, N), and without views that have none left."""
     views = data.views
     views = views._replace(
@@ -170,16 +180,16 @@ def set_aside(data: Data, mask: Mask) -> Data:
     return chosen_views(replace(data, views=views), np.asarray(views.used.any(axis=1)))
 
 
-def outlying(
-    data: Data, fitted: Fitted, gross: Gross, squares: Array
-) -> tuple[Data, Gross]:
-    """Set aside points that are too far off once every random part is predicted.
+def reject_outliers(
+    data: Data, fitted: FittedModel, outliers: Outliers, squares: Array
+) -> tuple[Data, Outliers]:
+    """Reject points that are too far off once every random part is predicted.
 
     squares: of the standardised residuals (F, M).
     """
     views = data.views
     pairs = data.by_view(squares).sum(axis=-1)
-    limit = -2 * np.log(_OUTLYING / max(int(views.used.sum()), 1))
+    limit = -2 * np.log(_OUTLIER_PROBABILITY / max(int(views.used.sum()), 1))
     mask = views.used & (pairs > limit)
     mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]
     # A landmark that is off in most of its views is not where it is said to be.
@@ -187,55 +197,57 @@ def outlying(
     off = np.bincount(views.landmark[mask], minlength=len(every))
     mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
     px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
-    return set_aside(data, mask), gross.with_more(views.row[mask], px[mask], FAR)
+    return without_points(data, mask), outliers.append(views.row[mask], px[mask], FAR)
 
 
-def taken_back(data: Data, fitted: Fitted, gross: Gross) -> tuple[Data, Gross]:
-    """Take back points that were set aside, where the causes predict them as well as others.
+def reinstate_outliers(
+    data: Data, fitted: FittedModel, outliers: Outliers
+) -> tuple[Data, Outliers]:
+    """Reinstate points that were rejected, where the causes predict them as well as others.
 
-    Beside a simulation that is wrong the nearest landmarks look like gross errors.
+    Beside a simulation that is wrong the nearest landmarks look like outliers.
     """
-    views, again = data.views, np.zeros(len(gross.rows), dtype=bool)
-    off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / _unsure(views)
-    scale, _ = _scale(views, np.where(views.used, off, np.nan))
-    near = ~views.used & (views.landmark >= 0) & (off < _ORDINARY * scale)
+    views, again = data.views, np.zeros(len(outliers.rows), dtype=bool)
+    off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / _relative_sigma(views)
+    scale, _ = _robust_scale(views, np.where(views.used, off, np.nan))
+    near = ~views.used & (views.landmark >= 0) & (off < _REINSTATED_SIGMAS * scale)
     weight, row, table = views.weight.copy(), views.row.copy(), data.observations
     for view, point in np.argwhere(near):
-        known = ((table.frame[gross.rows] == views.frame[view])
-                 & (table.camera[gross.rows] == views.camera[view])
-                 & (table.landmark[gross.rows] == views.landmark[view, point])
-                 & (table.uv[gross.rows] == views.uv[view, point]).all(axis=1))
+        known = ((table.frame[outliers.rows] == views.frame[view])
+                 & (table.camera[outliers.rows] == views.camera[view])
+                 & (table.landmark[outliers.rows] == views.landmark[view, point])
+                 & (table.uv[outliers.rows] == views.uv[view, point]).all(axis=1))
         for i in np.flatnonzero(known & ~again)[:1]:
-            again[i], row[view, point] = True, gross.rows[i]
-            weight[view, point] = 1 / np.nan_to_num(table.sigma[gross.rows[i]], nan=1.0)
-    why = tuple(one for one, back in zip(gross.why, again, strict=True) if not back)
+            again[i], row[view, point] = True, outliers.rows[i]
+            weight[view, point] = 1 / np.nan_to_num(table.sigma[outliers.rows[i]], nan=1.0)
+    why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
     return (replace(data, views=views._replace(weight=weight, row=row)),
-            Gross(gross.rows[~again], gross.px[~again], why))
+            Outliers(outliers.rows[~again], outliers.px[~again], why))
 
 
-def _unsure(views: Views) -> Array:
+def _relative_sigma(views: Views) -> Array:
     """Return the sigma of each point (S, N) over the median one, 1 at least."""
     sigma = 1 / np.where(views.used, views.weight, np.nan)
     return np.nan_to_num(np.maximum(sigma / np.nanmedian(sigma), 1.0), nan=1.0)
 
 
-def _scale(views: Views, offset: Array) -> tuple[Array, Array]:
+def _robust_scale(views: Views, offset: Array) -> tuple[Array, Array]:
     """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
-    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN), axis=axis, keepdims=True)
+    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
                        for axis in (1, None))
-    return np.maximum(median, np.maximum(typical, _ROUNDING)) / _MEDIAN, offset
+    return np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM, offset
 
 
-def _scale_of_landmark(views: Views, offset: Array) -> Array:
+def _landmark_scale(views: Views, offset: Array) -> Array:
     """Robust standard deviations (S, N) of a coordinate, one a landmark."""
     scale = np.zeros_like(offset)
     for landmark in np.unique(views.landmark[views.used]):
         mine = views.used & (views.landmark == landmark)
-        scale[mine] = np.median(offset[mine]) / _MEDIAN
+        scale[mine] = np.median(offset[mine]) / _MEDIAN_NORM
     return scale
 
 
-def quantisation_step(uv: Array) -> float:
+def quantization_step(uv: Array) -> float:
     """Return the largest step of which all coordinates (M, 2) are multiples, px; 0 for none."""
     values = np.unique(uv.ravel())
     gaps = np.diff(values)
@@ -246,7 +258,7 @@ def quantisation_step(uv: Array) -> float:
     return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
 
 
-def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
+def noise_growth(fitted: FittedModel, squares: Array) -> NoiseGrowth:
     """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
 
     Those of outlying points count as little as the limit allows.  It is none where the same
@@ -270,13 +282,13 @@ def noise_growth(fitted: Fitted, squares: Array) -> NoiseCause:
     stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
     landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
     rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
-    within = np.sign(best.x) * _within(e2, z, rows, np.nonzero(used)[0])
-    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN else 1.0
+    within = np.sign(best.x) * _growth_within_landmarks(e2, z, rows, np.nonzero(used)[0])
+    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN_SIGMAS else 1.0
     level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
-    return NoiseCause(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
+    return NoiseGrowth(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
 
 
-def _within(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
+def _growth_within_landmarks(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
     """Return how squares e2 (M,) grow with z for the same landmarks (M,), in standard errors.
 
     What one frame (M,) says counts as one observation: its points may err together.
@@ -293,7 +305,7 @@ def with_noise_growth(state: State, growth: float) -> State:
     return replace(state, terms=(*state.terms, term))
 
 
-def _fits_another(
+def _find_swaps(
     model: Cameras, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
     """Which far points (S, N) lie where another landmark of the table is predicted.
@@ -318,4 +330,4 @@ def _fits_another(
             reach = 2 * off[~other]
             around = other & (np.linalg.norm(seen - seen[~other], axis=-1) < reach)
             by_chance += float(np.nan_to_num(around.sum() * (gate / reach) ** 2).sum())
-    return np.asarray(swapped & (special.pdtrc(swapped.sum() - 1, by_chance) < _CHANCE))
+    return np.asarray(swapped & (special.pdtrc(swapped.sum() - 1, by_chance) < _SWAP_CHANCE))

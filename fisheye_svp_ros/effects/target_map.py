@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.optics.lens import Lens
@@ -83,11 +82,10 @@ def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
     return np.where(known[..., None], values[slot], 0.0)
 
 
-def board_maps(linear: Linearised, names: Sequence[str] = ()) -> list[BoardMap]:
-    """Return how effects on the target displace the landmarks; names: of these effects alone."""
-    state, known = linear.state, KnownTarget.of(linear.data.views)
-    terms = [term for term in state.terms if not names or term[0].name in names]
-    return known.maps(known.moved(terms, state.lens))
+def board_maps(views: Views, terms: Sequence[Term], lens: Lens) -> list[BoardMap]:
+    """Return how effects on the target, among some terms, displace the landmarks of views."""
+    known = KnownTarget.of(views)
+    return known.maps(known.moved(terms, lens))
 
 
 def less_similarity(points: Array, moved: Array) -> Array:

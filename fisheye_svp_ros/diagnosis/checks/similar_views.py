@@ -18,7 +18,7 @@ import numpy as np
 from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
 

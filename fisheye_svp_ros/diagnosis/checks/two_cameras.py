@@ -1,0 +1,314 @@
+"""Two cameras as each other's truth: one board has one shape, and a rig stands still.
+
+What each camera alone says of the target is carried over to the other, which took no part in
+finding it; and the rig is found view by view, from poses of each camera by itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import fit
+from fisheye_svp_ros.diagnosis.cross_validation import (
+    Comparison,
+    HeldOut,
+    compare_errors,
+    cross_validate,
+    rms_reduction,
+)
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.problem import MIN_SHARED_FRAMES, Progress, is_unpaired
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
+from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
+from fisheye_svp_ros.diagnosis.variance_budget import stage_of
+from fisheye_svp_ros.effects.forward import Term
+from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
+from fisheye_svp_ros.mixed_model import Variances
+from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
+
+_MIN_COMMON_LANDMARKS = 6  # landmarks, the fewest that two maps are compared by
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """Frames of `to`, each left out in turn, without and with what was found in `source`.
+
+    without_px, with_px: rms of the 2-D residual; less_px: by how much it is less, and its 95 %
+    interval over frames.
+    """
+
+    source: str
+    to: str
+    without_px: float
+    with_px: float
+    less_px: Comparison
+
+    @classmethod
+    def of(cls, source: str, to: str, without: HeldOut, carried: HeldOut) -> Transfer:
+        """Compare two predictions of the same frames, those that the others can predict."""
+        rows = without.predicted | carried.predicted
+        without, carried = without.take(rows), carried.take(rows)
+        return cls(source, to, without.rms, carried.rms, rms_reduction(without, carried))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        return asdict(self) | {'less_px': self.less_px.interval}
+
+    @property
+    def better(self) -> bool:
+        """Whether it predicts better beyond chance."""
+        return self.less_px.low > 0
+
+    @property
+    def worse(self) -> bool:
+        """Whether it predicts worse beyond chance."""
+        return self.less_px.high < 0
+
+
+def moves_with_lens(term: Term) -> bool:
+    """Whether an effect moves with the lens, from one recording and target to the next."""
+    effect = term[0]
+    return effect.stage != 'noise' and not effect.of_recording and stage_of(effect.name) == 'lens'
+
+
+def displaces_landmarks(term: Term) -> bool:
+    """Whether an effect displaces landmarks."""
+    return term[0].stage == 'target'
+
+
+def effect_names(terms: Sequence[Term]) -> list[str]:
+    """Return the names of effects."""
+    return [effect.name for effect, _ in terms]
+
+
+def fit_and_predict(
+    data: Data, state: State, free: Sequence[str], held: Collection[str] = ()
+) -> tuple[State, HeldOut]:
+    """Fit by least squares, and predict frames left out in turn; held: effects left as they are.
+
+    Nothing random: what was carried over is tried as whoever uses it would.
+    """
+    fitted = fit(data, state, free, held=held)
+    return fitted, cross_validate(
+        NullModel.with_variances(data, fitted, free), held=held)
+
+
+def landmark_variances(data: Data, variances: Variances, landmark: Index) -> Variances:
+    """Return variances of landmarks (L,) for the landmarks of other data."""
+    seen = np.unique(data.views.landmark[data.views.used])
+    return replace(variances, weight=variances.weight[np.searchsorted(landmark, seen)])
+
+
+def fitted_target(fitted: FittedModel, known: KnownTarget) -> Array:
+    """Return where a fit has the landmarks of a target, displacements (L, 3), m.
+
+    Effects of the target and predicted offsets; those of landmarks it did not see are zero.
+    """
+    offsets = fitted.predicted_offsets()
+    moved = known.moved(fitted.state.terms, fitted.state.lens)
+    moved[np.searchsorted(known.landmark, offsets.landmark)] += offsets.offset
+    return moved
+
+
+def displace_target(data: Data, known: KnownTarget, moved: Array) -> Data:
+    """Return data with displaced landmarks."""
+    points = data.views.points + at_landmarks(data.views, known.landmark, moved)
+    return replace(data, views=data.views._replace(points=points))
+
+
+class Maps(NamedTuple):
+    """Two maps of one target.
+
+    landmarks: how many are in both; correlation, correlation_along: of the displacements off their
+    boards and along them; rms_m: of those off the boards, by each camera.
+    """
+
+    landmarks: int
+    correlation: float
+    correlation_along: float
+    rms_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TwoCameras:
+    """What two cameras of a rig say of each other.
+
+    target: its shape found by one, tried on the other; rig: translation_m and rotation_rad, mean
+    distance of a frame's rig from the middle of all, before and after; withdrawn: the causes that
+    were given up because the two contradict each other; posed_alone: whether each view was posed
+    by itself, since the two did not keep their places, were not photographed together, or saw
+    too few frames together.
+    """
+
+    cameras: tuple[str, str]
+    target: tuple[Transfer, ...]
+    maps: Maps | None
+    rig: dict[str, Comparison]
+    withdrawn: tuple[str, ...] = ()
+    posed_alone: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Whether they agree on the target: agree, contradict, undecided; nothing: no shape."""
+        if not self.target:
+            return 'nothing'
+        apart = bool(self.rig) and not self.posed_alone and all(
+            moved.high < 0 for moved in self.rig.values())
+        if apart or any(one.worse for one in self.target):
+            return 'contradict'
+        return 'agree' if all(one.better for one in self.target) else 'undecided'
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        return {
+            'cameras': list(self.cameras), 'verdict': self.verdict,
+            'target': [one.to_dict() for one in self.target],
+            'maps': self.maps and self.maps._asdict(),
+            'rig': {name: value.to_dict() for name, value in self.rig.items()},
+            'withdrawn': list(self.withdrawn), 'posed_alone': self.posed_alone,
+        }
+
+
+class _Camera(NamedTuple):
+    """One camera by itself: its lens before, and its data and state with the causes."""
+
+    name: str
+    before: State
+    data: Data
+    state: State
+    free: tuple[str, ...]
+    target: Array | None
+
+
+def agree_on_target(
+    selection: Selection, progress: Progress
+) -> tuple[Selection, list[TwoCameras]]:
+    """Ask the cameras of a rig whether they agree on the target; give up what they do not."""
+    if selection.null.linear.data.cameras < 2:
+        return selection, []
+    progress('asking each camera what it says of the other', 0.78)
+    pairs, problem = compare_cameras(selection), selection.problem
+    gone = tuple(e.name for e, _, _ in selection.causes
+                 if e.stage == 'target' and e.name not in problem.options.included)
+    if not gone or all(pair.verdict != 'contradict' for pair in pairs):
+        return selection, pairs
+    selection = select_causes(
+        replace(problem, options=problem.options.without(*gone)),
+        lambda stage, _: progress(stage, 0.79))
+    return selection, [replace(pair, withdrawn=gone if pair.verdict == 'contradict' else ())
+                       for pair in pairs]
+
+
+def compare_cameras(selection: Selection) -> list[TwoCameras]:
+    """Return what each two cameras of a rig say of each other, if both saw enough."""
+    data = selection.null.linear.data
+    known = KnownTarget.of(data.views)
+    cameras = [_fit_camera(selection, camera, known) for camera in range(data.cameras)
+               if (data.camera_of == camera).sum() >= MIN_SHARED_FRAMES]
+    alone = is_unpaired(data)
+    return [replace(_compare(one, other, known), posed_alone=alone)
+            for one, other in combinations(cameras, 2)]
+
+
+def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camera:
+    """Fit one camera by itself, under the null model of all."""
+    null, base = selection.null, selection.problem.base
+    data, mine = null.linear.data, null.linear.data.camera_of == camera
+    own = chosen_views(data, mine)
+    own = replace(own, camera_of=np.zeros_like(own.camera_of), poses=None)
+    pose = selection.state.view_poses(data).take(np.flatnonzero(mine))
+    at = camera if selection.state.others else 0
+    names = tuple(selection.state.own_names(selection.problem.free)[at])
+    state = _single_camera(selection.state, pose, at, camera)
+    target = None
+    if _has_target(selection):
+        variances = landmark_variances(own, null.variances, null.random.landmark)
+        state = refit(own, state, names, variances)
+        target = fitted_target(
+            FittedModel.of_state(Linearised(own, state, names), variances), known)
+    return _Camera(data.observations.cameras[camera], _single_camera(base, pose, at, camera), own,
+                   state, names, target)
+
+
+def _single_camera(state: State, pose: Pose, lens: int, camera: int) -> State:
+    return State(pose, identity(1), state.lenses[lens], camera_terms(state.terms, camera))
+
+
+def _has_target(selection: Selection) -> bool:
+    """Whether anything was found that stays with the target."""
+    alive = selection.null.variances.alive
+    return any(map(displaces_landmarks, selection.state.terms)) or any(
+        STAGE_OF[name] == 'target' for name, there in zip(NAMES, alive, strict=True) if there)
+
+
+def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
+    carried, poses = [], []
+    for mine, source in ((one, other), (other, one)):
+        data, state = mine.data, mine.state.without(effect_names(
+            [term for term in mine.state.terms if displaces_landmarks(term)]))
+        if source.target is None:
+            after = fit(data, state, mine.free)
+        else:
+            _, without = fit_and_predict(data, state, mine.free)
+            data = displace_target(data, known, less_similarity(known.points, source.target))
+            after, there = fit_and_predict(data, state, mine.free)
+            carried.append(Transfer.of(source.name, mine.name, without, there))
+        poses.append((fit(mine.data, mine.before, mine.free).pose, after.pose))
+    return TwoCameras((one.name, other.name), tuple(carried), _maps(one, other, known),
+                      _scatter((one.data, other.data), poses))
+
+
+def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> Maps | None:
+    """Compare what two cameras found of the target, by the landmarks that both saw."""
+    if one.target is None or other.target is None:
+        return None
+    seen = [np.isin(known.landmark, mine.data.views.landmark[mine.data.views.used])
+            for mine in (one, other)]
+    both = seen[0] & seen[1]
+    if both.sum() < _MIN_COMMON_LANDMARKS:
+        return None
+    shared = KnownTarget(known.landmark[both], known.board[both], known.points[both])
+    off, along = (
+        [np.concatenate([getattr(board, name).ravel() for board in shared.maps(moved[both])])
+         for moved in (one.target, other.target)] for name in ('height', 'slide')
+    )
+    return Maps(int(both.sum()), _correlation(*off), _correlation(*along),
+                (float(np.sqrt((off[0]**2).mean())), float(np.sqrt((off[1]**2).mean()))))
+
+
+def _correlation(one: Array, other: Array) -> float:
+    size = np.sqrt((one**2).sum() * (other**2).sum())
+    return float((one * other).sum() / size) if size > 0 else 0.0
+
+
+def _scatter(
+    data: tuple[Data, Data], poses: Sequence[tuple[Pose, Pose]]
+) -> dict[str, Comparison]:
+    """Compare how the rig scatters that each frame gives, before and after."""
+    shared, first, second = np.intersect1d(
+        data[0].views.frame, data[1].views.frame, return_indices=True)
+    if len(shared) < MIN_SHARED_FRAMES:
+        return {}
+    before, after = (
+        deviations(one.take(first).inverse().compose(other.take(second)))
+        for one, other in zip(*poses, strict=True)
+    )
+    names = ('translation_m', 'rotation_rad')
+    return {name: compare_errors(b, a) for name, b, a in zip(names, before, after, strict=True)}
+
+
+def deviations(rig: Pose) -> tuple[Array, Array]:
+    """Return how far (F,), m and rad, each rig is from the middle of all."""
+    turn = vector_from_rotation(np.swapaxes(rig.rotation[:1], -1, -2) @ rig.rotation)
+    place, angle = (
+        np.linalg.norm(part - np.median(part, axis=0), axis=-1) for part in (rig.position, turn))
+    return place, angle

@@ -1,0 +1,200 @@
+"""Two data sets of one camera: what moves with the lens must agree, what stays with a board not.
+
+The causes that one set calls for are tried on the other, which took no part in finding them, and
+both are fitted with the causes of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.checks.two_cameras import (
+    Transfer,
+    displace_target,
+    displaces_landmarks,
+    effect_names,
+    fit_and_predict,
+    fitted_target,
+    moves_with_lens,
+)
+from fisheye_svp_ros.diagnosis.effect_forms import with_effect
+from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
+from fisheye_svp_ros.diagnosis.model import State
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
+from fisheye_svp_ros.effects.forward import Term
+from fisheye_svp_ros.effects.target_map import KnownTarget, less_similarity
+from fisheye_svp_ros.optics.lens import INTRINSICS
+
+_SAME_PLACE = 1e-6  # m: no two targets are told apart by less
+
+
+class SharedParameter(NamedTuple):
+    """One parameter of the lens by each set: values, standard errors, difference over its own."""
+
+    value: float
+    stderr: float
+    other_value: float
+    other_stderr: float
+    unit: str
+
+    @property
+    def apart(self) -> float:
+        """The difference over its standard error."""
+        return (self.value - self.other_value) / float(np.hypot(self.stderr, self.other_stderr))
+
+
+@dataclass(frozen=True)
+class TransferredCauses:
+    """What of one set was tried on the other.
+
+    lens: all causes that move with the lens, intrinsics fitted anew; whole: with the intrinsics
+    as they are; causes: each of them, all others being there; target: what stays with the target,
+    None where the other set shows other landmarks.
+    """
+
+    lens: Transfer
+    whole: Transfer
+    causes: dict[str, Transfer]
+    target: Transfer | None
+
+
+@dataclass(frozen=True)
+class TwoDatasets:
+    """What two data sets of one camera say of each other.
+
+    tried: of this set on the other, and of the other on this; parameters: of the lens, by both,
+    fitted with the causes of both; withdrawn: causes given up because the other set refutes them.
+    """
+
+    source: str
+    tried: tuple[TransferredCauses | None, TransferredCauses | None]
+    parameters: dict[str, SharedParameter]
+    withdrawn: tuple[str, ...] = ()
+
+    @property
+    def refuted(self) -> list[str]:
+        """The causes of this set without which the other is predicted better beyond chance."""
+        return [] if self.tried[0] is None else [
+            name for name, one in self.tried[0].causes.items() if one.worse]
+
+    @property
+    def verdict(self) -> str:
+        """Whether the lens's causes hold: agree, contradict, undecided; nothing: there is none."""
+        both = [one.lens for one in self.tried if one is not None]
+        if not both:
+            return 'nothing'
+        if self.withdrawn or any(one.worse for one in both):
+            return 'contradict'
+        return 'agree' if all(one.better for one in both) else 'undecided'
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        def plain(one: Transfer | None) -> dict[str, Any] | None:
+            return None if one is None else one.to_dict()
+
+        return {
+            'against': self.source, 'verdict': self.verdict, 'withdrawn': list(self.withdrawn),
+            'tried': [{
+                'lens': plain(one.lens), 'whole': plain(one.whole), 'target': plain(one.target),
+                'causes': {name: plain(cause) for name, cause in one.causes.items()},
+            } for one in self.tried if one is not None],
+            'parameters': {name: one._asdict() | {'apart': one.apart}
+                           for name, one in self.parameters.items()},
+        }
+
+
+def compare_datasets(one: Evaluation, other: Evaluation, source: str, to: str) -> TwoDatasets:
+    """Return what two evaluations of one camera say of each other."""
+    return TwoDatasets(
+        to, (_transfer_causes(one, other, source, to), _transfer_causes(other, one, to, source)),
+        _parameters(one, other),
+    )
+
+
+def _transfer_causes(
+    one: Evaluation, other: Evaluation, source: str, to: str
+) -> TransferredCauses | None:
+    """Try on another set what one found; None where it found nothing that moves with the lens."""
+    carried = [term for term in one.null.linear.state.terms if moves_with_lens(term)]
+    if not carried:
+        return None
+    data, free = other.null.linear.data, other.null.linear.free
+    own = other.null.linear.state
+    bare = own.without(effect_names([t for t in own.terms if moves_with_lens(t)]))
+
+    def predict(terms: Sequence[Term], state: State = bare, free: Sequence[str] = free) -> Any:
+        there = replace(state, terms=(*state.terms, *terms))
+        return fit_and_predict(data, there, free, effect_names(terms))[1]
+
+    without, there = predict(()), predict(carried)
+    whole = (predict((), replace(bare, lens=one.before.state.lens), ()),
+             predict(carried, replace(bare, lens=one.null.linear.state.lens), ()))
+    causes = {
+        effect.name: Transfer.of(source, to, predict(
+            [term for term in carried if term[0].name != effect.name]), there)
+        for effect, _ in carried
+    }
+    return TransferredCauses(
+        Transfer.of(source, to, without, there), Transfer.of(source, to, *whole), causes,
+        _transfer_target(one, other, source, to))
+
+
+def _transfer_target(one: Evaluation, other: Evaluation, source: str, to: str) -> Transfer | None:
+    """Try the target's corrections on the other set, if it shows landmarks of the same places."""
+    known, there = (KnownTarget.of(d.null.linear.data.views) for d in (one, other))
+    if not any(map(displaces_landmarks, one.null.linear.state.terms)) or not (
+        np.array_equal(known.landmark, there.landmark)
+        and np.abs(known.points - there.points).max() < _SAME_PLACE
+    ):
+        return None
+    fitted = FittedModel.of_state(one.null.linear, one.null.variances)
+    linear, own = other.null.linear, other.null.linear.state
+    state = own.without(effect_names([t for t in own.terms if displaces_landmarks(t)]))
+    shift = less_similarity(known.points, fitted_target(fitted, known))
+    _, without = fit_and_predict(linear.data, state, linear.free)
+    _, carried = fit_and_predict(displace_target(linear.data, known, shift), state, linear.free)
+    return Transfer.of(source, to, without, carried)
+
+
+def _parameters(one: Evaluation, other: Evaluation) -> dict[str, SharedParameter]:
+    """Fit both sets with the causes of both and compare what is the lens's."""
+    both = [_with_lens_effects(a, b) for a, b in ((one, other), (other, one))]
+    found: dict[str, SharedParameter] = {}
+    first, second = (_estimates(d, state) for d, state in zip((one, other), both, strict=True))
+    for name, (value, stderr, unit) in first.items():
+        if name in second and np.isfinite([stderr, second[name][1]]).all():
+            found[name] = SharedParameter(value, stderr, *second[name][:2], unit)
+    return found
+
+
+def _with_lens_effects(one: Evaluation, other: Evaluation) -> State:
+    """Return the state with the other's causes of the lens as well, starting from nothing."""
+    state = one.null.linear.state
+    known = {effect.name: len(values) for effect, values in state.terms}
+    for effect, values in other.null.linear.state.terms:
+        # Of two forms of one effect the one with more parameters.
+        if moves_with_lens((effect, values)) and len(values) > known.get(effect.name, 0):
+            state = with_effect(state, effect, np.zeros_like(values))
+    return state
+
+
+def _estimates(one: Evaluation, state: State) -> dict[str, tuple[float, float, str]]:
+    """Return value, standard error and unit of the intrinsics and the lens's causes."""
+    data, free, variances = one.null.linear.data, one.null.linear.free, one.null.variances
+    state = refit(data, state, free, variances)
+    null = NullModel.with_variances(data, state, free, variances)
+    errors = standard_errors(null)
+    rig = null.own - len(free) - sum(len(values) for _, _, values in null.terms)
+    found = {name: (state.parameters[name], float(errors[rig + i]),
+                    'px' if name in INTRINSICS else '') for i, name in enumerate(free)}
+    for effect, columns, values in null.terms:
+        if moves_with_lens((effect, values)):
+            found |= {f'{effect.name}.{p.name}': (float(v), float(e), p.unit) for p, v, e in zip(
+                effect.parameters, values, errors[columns], strict=True)}
+    return found

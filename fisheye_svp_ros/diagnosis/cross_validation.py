@@ -1,0 +1,343 @@
+"""Cross-validation: residuals of frames that were not used, and errors where the truth is known.
+
+Poses are fitted to the frames, all else is predicted from the others or from other data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, moved
+from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets, refit
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.pose import Pose, axis_angle_between
+from fisheye_svp_ros.solve.stereo_depth import triangulate
+
+_RESAMPLES = 2000
+_PREDICTED_RATIO = 5.0  # times the median frame
+_LINEAR_PX = 3.0  # rms: how far a step that is taken to be linear may move image points
+_FOLDS = 3
+
+
+class HeldOut(NamedTuple):
+    """Misfit of held-out frames: sums (F,) of squared 2-D residuals, px^2, and counts (F,)."""
+
+    squares: Array
+    counts: Array
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the 2-D residual norm, px."""
+        return float(self.rms_of(np.arange(len(self.squares))))
+
+    @property
+    def predicted(self) -> Mask:
+        """Which frames (F,) are not far worse than most: those show what no other frame does."""
+        size = np.sqrt(self.squares / self.counts)
+        return np.asarray(size <= _PREDICTED_RATIO * np.median(size))
+
+    def take(self, rows: Index | Mask) -> HeldOut:
+        """Return some of the frames."""
+        return HeldOut(self.squares[rows], self.counts[rows])
+
+    def rms_of(self, rows: Index) -> Array:
+        """Return the rms (...), px, of the frames (..., F) that count."""
+        return np.asarray(
+            np.sqrt(self.squares[rows].sum(axis=-1) / self.counts[rows].sum(axis=-1)))
+
+    def excess(self, noise: float, rows: Index) -> Array:
+        """Mean squares (B,) above what noise leaves once each frame has fitted its pose, px^2.
+
+        rows: the frames (B, F) that count.
+        """
+        squares, counts = self.squares[rows].sum(axis=1), self.counts[rows].sum(axis=1)
+        freedom = 2 * counts - 6 * rows.shape[1]
+        return np.asarray((squares - noise**2 * freedom) / counts)
+
+
+class Comparison(NamedTuple):
+    """An error before and after: by how much it is less, and the 95 % interval over frames.
+
+    value: 1 - after / before, of what the function that makes it says, or before - after.
+    """
+
+    before: float
+    after: float
+    value: float
+    low: float
+    high: float
+
+    @property
+    def interval(self) -> dict[str, float]:
+        """Return value and interval alone, as diagnosis.json has them."""
+        return {'value': self.value, 'low': self.low, 'high': self.high}
+
+    def to_dict(self) -> dict[str, float]:
+        """Return what diagnosis.json holds of an error and its gain."""
+        return {'base': self.before, 'extended': self.after, 'gain': self.value,
+                'low': self.low, 'high': self.high}
+
+
+def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
+    """Return by how much the rms is less, px, with a bootstrap interval over frames."""
+    rows = _resample_frames(len(before.squares))
+    low, high = np.quantile(before.rms_of(rows) - after.rms_of(rows), (0.025, 0.975))
+    return Comparison(before.rms, after.rms, before.rms - after.rms, float(low), float(high))
+
+
+def held_out_gain(before: HeldOut, after: HeldOut, noise: float) -> Comparison:
+    """Return 1 - (held-out misfit above noise after) / (before), with a bootstrap interval."""
+    rows = _resample_frames(len(before.squares))
+    low, high = np.quantile(_excess_gain(before, after, noise, rows), (0.025, 0.975))
+    whole = np.arange(len(before.squares))[None]
+    value = float(_excess_gain(before, after, noise, whole)[0])
+    return Comparison(before.rms, after.rms, value, float(low), float(high))
+
+
+def compare_errors(base: Array, extended: Array) -> Comparison:
+    """Compare the mean errors (F,) of frames, NaN where there is none."""
+    known = np.isfinite(base) & np.isfinite(extended)
+    both = np.stack([base[known], extended[known]])
+    before, after = both[:, _resample_frames(both.shape[1])].mean(axis=-1)
+    low, high = np.quantile(1 - after / before, (0.025, 0.975))
+    first, second = both.mean(axis=1).tolist()
+    return Comparison(first, second, 1 - second / first, float(low), float(high))
+
+
+def _resample_frames(frames: int) -> Index:
+    return np.random.default_rng(0).integers(0, frames, (_RESAMPLES, frames))
+
+
+def _excess_gain(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> Array:
+    base = before.excess(noise, rows)
+    # With nothing above the noise there is nothing to gain.
+    some = base > 1e-3 * noise**2
+    gain = 1 - after.excess(noise, rows) / np.where(some, base, 1.0)
+    return np.where(some, np.clip(gain, -1.0, 1.0), 0.0)
+
+
+def predict_other_data(
+    test: Data, state: State, offsets: PredictedOffsets | None = None
+) -> HeldOut:
+    """Predict other frames of the same camera and target, from poses in the state."""
+    # In px every point counts alike, however noisy it is.
+    plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
+    data = test if offsets is None else offsets.apply(test)
+    fitted = fit_poses(data, plain)
+    if offsets is not None and offsets.views is not None:
+        repeating = offsets.views.at(Linearised(data, replace(fitted, terms=state.terms), ()))
+        data = replace(data, views=data.views._replace(uv=data.views.uv - repeating))
+        fitted = fit_poses(data, fitted)
+    linear = Linearised(data, fitted, ())
+    return _sum_squares(linear, linear.residual)
+
+
+def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str]) -> State:
+    """Return the state without some of its effects, the rest fitted anew.
+
+    By one linear step; where that is too long to be linear, step by step.
+    """
+    linear = null.linear
+    kept, change, _ = _refit_shared(null, null.information, names, ())
+    shared = np.zeros(null.own)
+    shared[kept] = change
+    moves = (linear.shared_columns @ shared)[linear.used] / linear.row_weight[linear.used]
+    if np.sqrt(2 * np.mean(moves**2)) > _LINEAR_PX:
+        state = fit(linear.data, linear.state.without(names), free)
+        return refit(linear.data, state, free, null.variances)
+    frame = np.zeros((linear.data.frames, 6))
+    return moved(linear.data, linear.state, free, frame, shared).without(names)
+
+
+def _refit_shared(
+    null: NullModel, information: Array, names: Collection[str], held: Collection[str]
+) -> tuple[Index, Array, Array]:
+    """Return the columns that are fitted, their change, and (m,) what is left.
+
+    information (m, m): of what is in the model and, last, the residual; more columns are left
+    alone.  names: causes that are gone; held: causes that stay as they are.  The last is the
+    combination of the border that is the residual then.
+    """
+    gone = np.zeros(null.own, dtype=bool)
+    values = np.zeros(null.own)
+    for effect, columns, value in null.terms:
+        if effect.name in names:
+            gone[columns], values[columns] = True, value
+        elif effect.name in held:
+            gone[columns] = True
+    combination = np.zeros(len(information))
+    combination[-1] = 1.0
+    # Without an effect its displacement comes back into the residual.
+    combination[: null.own] += np.where(gone, values * null.scale[: null.own], 0.0)
+    kept = np.flatnonzero(~gone)
+    inverse, _ = pseudo_inverse(information[np.ix_(kept, kept)], 1e-13)
+    change = inverse @ (information[kept] @ combination)
+    combination[kept] -= change
+    return kept, change / null.scale[kept], combination
+
+
+def cross_validate(
+    null: NullModel, without: Collection[str] = (), offsets: PredictedOffsets | None = None,
+    held: Collection[str] = (),
+) -> HeldOut:
+    """Predict frames left out in turn by a fit to the others (linear in all parameters).
+
+    without: causes that are left out; offsets: random effects to predict, each frame's from the
+    others; held: causes that are not fitted anew.
+    """
+    linear, ratio = null.linear, _noise_ratio(null.linear)
+    residual = np.zeros_like(linear.residual)
+    repeating = np.zeros_like(residual)
+    if offsets is not None and offsets.views is not None:
+        repeating = linear.data.blocks(offsets.views.own * linear.data.views.weight[..., None])
+    at = null.columns_and_residual(null.included)
+    for frame, information in enumerate(null.information_without_frames(at)):
+        _, _, combination = _refit_shared(null, information, without, held)
+        rows = null.fixed.border if offsets is None else null.leave_one_out.rows
+        left, poses = rows[frame][:, at] @ combination * ratio[frame], linear.frame_columns[frame]
+        left -= repeating[frame]
+        poses = poses * ratio[frame][:, None]
+        residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)
+    return _sum_squares(linear, residual / ratio)
+
+
+def _noise_ratio(linear: Linearised) -> Array:
+    """Return what takes the weights (F, M) of uneven noise out of whitened rows."""
+    weight = linear.data.blocks(linear.data.views.weight[..., None] * np.ones(2))
+    own = linear.row_weight
+    return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
+
+
+def _sum_squares(linear: Linearised, whitened: Array) -> HeldOut:
+    weight = linear.row_weight
+    px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
+    return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)
+
+
+def known_errors(
+    before: Linearised, after: Linearised, free: Sequence[str]
+) -> dict[str, Comparison]:
+    """Compare the errors of two states of the same data, each fitted without the judged frames.
+
+    position_error_m and axis_error_rad of the first camera where true poses are known;
+    depth_error_m of two cameras (Error3 of Kita, section 5), unless the landmarks themselves are
+    in doubt, or where the cameras stood at each moment: mean distance of triangulated landmarks
+    from where poses and rig say they are.
+    """
+    measured: dict[str, Callable[[Data, State], Array]] = {}
+    if after.data.poses is not None:
+        measured |= {'position_error_m': _position_errors, 'axis_error_rad': _axis_errors}
+    doubtful = any(effect.stage in ('target', 'pose') for effect, _ in after.state.terms)
+    if after.data.cameras == 2 and not doubtful:
+        measured['depth_error_m'] = _depth_errors
+    pairs = [list(_train_folds(linear, free)) for linear in (before, after)] if measured else []
+    found = {
+        name: [np.concatenate([errors(held_out, state) for held_out, state in folds])
+               for folds in pairs]
+        for name, errors in measured.items()
+    }
+    return {name: compare_errors(*both) for name, both in found.items()
+            if np.isfinite(both[0] + both[1]).any()}
+
+
+def _train_folds(linear: Linearised, free: Sequence[str]) -> Iterator[tuple[Data, State]]:
+    """Yield held-out data and a state with the poses of the first camera's views in it."""
+    data = linear.data
+    folds = np.arange(data.frames) % min(_FOLDS, data.frames)
+    for fold in np.unique(folds):
+        kept = folds != fold
+        part = replace(linear.state, pose=linear.state.pose.take(np.flatnonzero(kept)))
+        trained = fit(chosen_views(data, kept[data.frame_of]), part, free)
+        held_out = chosen_views(data, ~kept[data.frame_of])
+        solved = trained.cameras.localize(held_out.views.take(_first_camera(held_out)))
+        yield held_out, replace(trained, pose=solved)
+
+
+def _first_camera(data: Data) -> Index:
+    """Return the views of the first camera."""
+    return np.flatnonzero(data.camera_of == 0)
+
+
+def _true_poses(data: Data) -> Pose:
+    assert data.poses is not None
+    return data.poses.take(data.frame_of[_first_camera(data)])
+
+
+def _position_errors(held_out: Data, state: State) -> Array:
+    off = state.pose.position - _true_poses(held_out).position
+    return np.asarray(np.linalg.norm(off, axis=-1))
+
+
+def _axis_errors(held_out: Data, state: State) -> Array:
+    return axis_angle_between(state.pose, _true_poses(held_out))
+
+
+def _depth_errors(held_out: Data, state: State) -> Array:
+    """Return the mean error of each frame, m; NaN where the cameras share no landmark."""
+    first, second = (state.cameras.model(camera) for camera in (0, 1))
+    place = state.pose if held_out.poses is None else _true_poses(held_out)
+    right_pose = place.compose(state.rig.take(1))
+    rig = state.rig.take(1).inverse()
+    errors = []
+    for i, view in enumerate(_first_camera(held_out)):
+        points, left, right = _shared_points(held_out, int(view))
+        found = triangulate(first, second, rig, left, right).points
+        off = np.linalg.norm(found - right_pose.take(i).into_body(points), axis=-1)
+        errors.append(float(off[np.isfinite(off)].mean()) if np.isfinite(off).any() else np.nan)
+    return np.array(errors)
+
+
+def _shared_points(data: Data, view: int) -> tuple[Array, Array, Array]:
+    """Return what a view of the first camera shares with the second: points (N, 3), uv (N, 2)."""
+    other = np.flatnonzero((data.frame_of == data.frame_of[view]) & (data.camera_of == 1))
+    ids = np.where(data.views.used, data.views.landmark, -1 - data.camera_of[:, None])
+    _, i, j = np.intersect1d(ids[view], ids[other], return_indices=True)
+    uv = data.views.uv
+    return data.views.points[view, i], uv[view, i], uv[other].reshape(-1, 2)[j]
+
+
+class PointResiduals(NamedTuple):
+    """K observations by frame and camera.
+
+    frame, camera, landmark (K,); t (K,), s, NaN where unknown; uv (K, 2), px; before and after
+    (K, 2), px: measured minus predicted by the fitted base and the fitted extended model; theta
+    (K,), rad, and range (K,), m, under the latter; outlier (K,): a gross error, left out of fits.
+    """
+
+    frame: Index
+    camera: Index
+    landmark: Index
+    t: Array
+    uv: Array
+    before: Array
+    after: Array
+    theta: Array
+    range: Array
+    outlier: Mask
+
+
+def point_residuals(before: Linearised, after: Linearised) -> PointResiduals:
+    """Return the residuals of two states of the same data."""
+    views = after.data.views
+    seen = views.landmark >= 0
+    per_point = np.ones_like(seen, dtype=np.int64)
+    distance = np.linalg.norm(after.scene.pose.into_body(views.points), axis=-1)
+    return PointResiduals(
+        frame=(views.frame[:, None] * per_point)[seen],
+        camera=(views.camera[:, None] * per_point)[seen],
+        landmark=views.landmark[seen],
+        t=views.t[seen],
+        uv=views.uv[seen],
+        before=(views.uv - before.linear.uv)[seen],
+        after=(views.uv - after.linear.uv)[seen],
+        theta=after.scene.theta[seen],
+        range=distance[seen],
+        outlier=~views.used[seen],
+    )

@@ -1,0 +1,248 @@
+"""What could be added to a model: the catalogue's effects in all forms, and fields without a name.
+
+Forms are the columns of effects that the data can hold.  Smooth fields over angle, range, place in
+a pixel and time, and walks of the intrinsics, are what structure without a name is tested by.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.cameras import RigScene
+from fisheye_svp_ros.diagnosis.model import Linearised, State
+from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
+from fisheye_svp_ros.effects.session_step import SessionStepEffect
+
+_LONGEST_PAUSES = 4
+_CURVE_DEGREE = 5  # degree of smooth curves over an angle
+_MAX_WAVES = 12
+
+
+@dataclass(frozen=True)
+class EffectForms:
+    """Effects in all their forms.
+
+    effects: every form; at: the columns of each (a form of several cameras has those of each);
+    columns (F, M, K), whitened; generic (K,): those of the richest forms, of equals all;
+    form_counts: of each name; untestable: why, by name.
+    """
+
+    effects: tuple[Effect, ...]
+    at: tuple[Index, ...]
+    columns: Array
+    generic: Index
+    form_counts: Mapping[str, int]
+    untestable: dict[str, str]
+
+    def count_effects(self) -> int:
+        """Return how many effects are tested, single landmarks and causes without forms too."""
+        return len(CATALOGUE) - len(self.untestable)
+
+
+def effect_forms(linear: Linearised, left_out: Sequence[str] = ()) -> EffectForms:
+    """Return the columns of the catalogue, without the effects left out."""
+    effects, richest, untestable = _catalogue_effects(linear, left_out)
+    ends = np.cumsum([0, *(len(effect.parameters) for effect in effects)])
+    at = [np.arange(*ends[i : i + 2]) for i in range(len(effects))]
+    blocks = [linear.effect_columns(effect) for effect in effects]
+    columns = np.concatenate([np.zeros((*linear.residual.shape, 0)), *blocks], axis=-1)
+    generic = [own for e, own in zip(effects, at, strict=True) if any(e is r for r in richest)]
+    where = np.concatenate([np.zeros(0, dtype=np.int64), *generic])
+    for both, theirs in _common_forms(effects, at, linear.data.cameras):
+        effects.append(both)
+        at.append(theirs)
+    form_counts = Counter(effect.name for effect in effects)
+    return EffectForms(tuple(effects), tuple(at), columns, where, form_counts, untestable)
+
+
+def _catalogue_effects(
+    linear: Linearised, left_out: Sequence[str]
+) -> tuple[list[Effect], list[Effect], dict[str, str]]:
+    """Return all forms, the richest of each effect, and why others are untestable, by name."""
+    effects: list[Effect] = []
+    richest: list[Effect] = []
+    untestable: dict[str, str] = {}
+    for name, kind in CATALOGUE.items():
+        if kind.stage == 'noise' or name in left_out:
+            continue
+        try:
+            by_lens = _forms(kind, linear)
+        except Untestable as why:
+            untestable[name] = str(why)
+            continue
+        if name == LandmarkSurveyEffect.name:
+            continue  # single landmarks are asked last, all at once
+        for own in by_lens:
+            effects += own
+            if name == SessionStepEffect.name:
+                richest += _longest_pauses(own)
+            elif lasting := [form for form in own if not form.per_frame]:
+                # What every frame has anew would take up the frames' own variance.
+                most = max(len(form.parameters) for form in lasting)
+                richest += [form for form in lasting if len(form.parameters) == most]
+    return effects, richest, untestable
+
+
+def simplest_form(kind: type[Effect], linear: Linearised) -> Effect:
+    """Return the simplest form of an effect, of every camera of a rig where lenses have it.
+
+    Raises Untestable where there is none.
+    """
+    first = [forms[0] for forms in _forms(kind, linear)]
+    own = [effect for effect in first if isinstance(effect, OfCameras)]
+    return together(own) if own else first[0]
+
+
+def _forms(kind: type[Effect], linear: Linearised) -> list[Sequence[Effect]]:
+    """Return the forms of an effect; what a lens has, each lens of a rig has for itself.
+
+    Raises Untestable where there is none.
+    """
+    scene, labels = linear.scene, linear.state.labels
+    of_lens = kind.stage in ('ray', 'image', 'detector') and not kind.of_target
+    if not isinstance(scene, RigScene) or not of_lens:
+        return [_catalogue_forms(kind, scene, linear.free)]
+    found: list[Sequence[Effect]] = []
+    reason = Untestable('no camera sees anything')
+    for _, camera, own in scene.parts:
+        try:
+            forms = _catalogue_forms(kind, own, linear.free)
+            found.append(by_camera(camera, labels[camera], forms))
+        except Untestable as why:
+            reason = why
+    if not found:
+        raise reason
+    return found
+
+
+def _catalogue_forms(kind: type[Effect], scene: Scene, free: Sequence[str]) -> Sequence[Effect]:
+    forms = kind.candidates(scene)
+    return [form.beside_intrinsics(scene) for form in forms] if free else forms
+
+
+def _common_forms(
+    effects: Sequence[Effect], at: Sequence[Index], cameras: int
+) -> list[tuple[Effect, Index]]:
+    """Return forms that every camera of a rig has alike, with the columns of each camera's own.
+
+    What lenses of one kind have in common they show together before one of them shows it.
+    """
+    alike: dict[str, list[tuple[OfCameras, Index]]] = {}
+    for effect, own in zip(effects, at, strict=True):
+        if isinstance(effect, OfCameras):
+            alike.setdefault(effect.parts[0][2].key, []).append((effect, own))
+    return [
+        (together([effect for effect, _ in forms]), np.concatenate([own for _, own in forms]))
+        for forms in alike.values() if len(forms) == cameras
+    ]
+
+
+def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:
+    """Return steps at the longest pauses between frames, where sessions are likely to change."""
+    plain = [step.parts[0][2] if isinstance(step, OfCameras) else step for step in steps]
+    starts = np.array([step.starts[0] for step in plain if isinstance(step, SessionStepEffect)])
+    pauses = np.diff(starts, prepend=starts[:1])
+    return [steps[i] for i in np.sort(np.argsort(-pauses, kind='stable')[:_LONGEST_PAUSES])]
+
+
+def smooth_fields(linear: Linearised) -> dict[str, Array]:
+    """Generic smooth fields (F, M, P) over each variable, at the image stage."""
+    scene, views = linear.scene, linear.data.views
+    m = scene.normalised()
+    scale = max(float(np.nanmax(np.abs(m[views.used]))), 1e-9)
+    x, y = np.moveaxis(np.nan_to_num(m / scale), -1, 0)
+    theta = np.nan_to_num(scene.theta / scene.theta_max)
+    distance = np.linalg.norm(scene.pose.into_body(views.points), axis=-1)
+    near = np.where(views.used, 1 / np.maximum(distance, 1e-6), 0.0)
+    near = near / max(near.max(), 1e-9)
+    radial, tangential = _polar(x, y)
+    fields = {
+        'theta': [direction * (theta**i)[..., None] for direction in (radial, tangential)
+                  for i in range(1, _CURVE_DEGREE + 1)],
+        'range': [
+            direction * (near**i * theta**j)[..., None]
+            for direction in (radial, tangential) for i in (1, 2) for j in (1, 2, 3)
+        ],
+        'pixel_phase': _pixel_phases(linear.linear.optical),
+    }
+    t = scene.times
+    if np.isfinite(t).all() and np.ptp(t) > 0:
+        when = (2 * (t - t.min()) / np.ptp(t) - 1)[:, None] * np.ones_like(x)
+        fields['time'] = [
+            field * (when**i)[..., None]
+            for field in _on_both_axes([np.ones_like(x), x, y]) for i in (1, 2, 3)
+        ]
+    return {
+        name: linear.whitened(np.stack(columns, axis=-1)) for name, columns in fields.items()
+    }
+
+
+def intrinsic_walks(linear: Linearised) -> tuple[Array, Array]:
+    """Smooth paths (F, M, P) of each camera's focal length and centre, in the order of time.
+
+    Cosines over the frames, each half period of three frames at least; and the precision (P,) of
+    the coefficient of each beside that of the slowest, as the square of the second derivative.
+    """
+    data, scene = linear.data, linear.scene
+    instant = scene.times if np.isfinite(scene.times).all() else scene.views.frame
+    _, place = np.unique(instant, return_inverse=True)
+    count = int(place.max()) + 1
+    waves = np.arange(1, min(_MAX_WAVES, count // 3) + 1)
+    path = np.cos(np.pi * waves * (place[:, None] + 0.5) / count)
+    mine = data.camera_of[:, None] == np.arange(data.cameras)
+    moves = (path[..., None] * mine[:, None]).reshape(len(path), -1)
+    growth = np.nan_to_num(scene.normalised())[..., None]
+    step = np.concatenate([growth, np.broadcast_to(np.eye(2), (*growth.shape[:-1], 2))], axis=-1)
+    columns = step[..., None] * moves[:, None, None, None]
+    roughness = np.tile(np.repeat(waves**4.0, data.cameras), step.shape[-1])
+    return linear.whitened(columns.reshape(*growth.shape[:-1], -1)), roughness
+
+
+def _polar(x: Array, y: Array) -> tuple[Array, Array]:
+    norm = np.maximum(np.hypot(x, y), 1e-9)
+    radial = np.stack([x / norm, y / norm], axis=-1)
+    return radial, np.stack([-radial[..., 1], radial[..., 0]], axis=-1)
+
+
+def _pixel_phases(uv: Array) -> list[Array]:
+    phase = 2 * np.pi * np.nan_to_num(uv)
+    columns = []
+    for harmonic in (1, 2):
+        for wave in (np.sin(harmonic * phase), np.cos(harmonic * phase)):
+            for axis in (0, 1):
+                column = np.zeros_like(wave)
+                column[..., axis] = wave[..., axis]
+                columns.append(column)
+    return columns
+
+
+def _on_both_axes(scalars: list[Array]) -> list[Array]:
+    """Return fields (..., 2): each scalar (...) along u, and along v."""
+    zero = np.zeros_like(scalars[0])
+    pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
+    return [np.stack(pair, axis=-1) for pair in pairs]
+
+
+def with_effect(state: State, effect: Effect, values: Array | None = None) -> State:
+    """Return the state with one more effect, joined with an earlier form of the same."""
+    start = np.zeros(len(effect.parameters)) if values is None else values
+    for i, (old, known) in enumerate(state.terms):
+        if old.name == effect.name:
+            joined = old.joined(effect)
+            both = transfer_values(old, known, joined) + transfer_values(effect, start, joined)
+            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
+    return replace(state, terms=(*state.terms, (effect, start)))
+
+
+def transfer_values(old: Effect, values: Array, new: Effect) -> Array:
+    """Return start values of a form of an effect from another form's, by parameter name."""
+    known = dict(zip((p.name for p in old.parameters), values, strict=True))
+    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])

@@ -1,0 +1,348 @@
+"""Sixth stage, the evaluation: what was found, measured on data that took no part in finding it.
+
+Held-out residuals, shares of variance, errors of parameters, gains with their intervals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.diagnosis.adjustment import fit, start_poses
+from fisheye_svp_ros.diagnosis.calibration import stated_parameters
+from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
+from fisheye_svp_ros.diagnosis.checks.medium import Medium
+from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
+from fisheye_svp_ros.diagnosis.cross_validation import (
+    Comparison,
+    HeldOut,
+    cross_validate,
+    fit_without_causes,
+    held_out_gain,
+    predict_other_data,
+)
+from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, rms_px
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
+from fisheye_svp_ros.diagnosis.problem import (
+    has_no_rig,
+    is_another_target,
+    rig_differs,
+    unpair_cameras,
+)
+from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.variance_budget import (
+    Component,
+    cause_squares,
+    component_significance,
+    noise_px,
+    stage_of,
+    variance_budget,
+)
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """How well a model describes the data it was fitted to and the data held out."""
+
+    rms_px: float
+    heldout_rms_px: float
+    chi2_per_dof: float | None = None
+
+
+@dataclass(frozen=True)
+class Intrinsic:
+    """One intrinsic before and after, each with its standard error under the null model.
+
+    given: as the lens had it, with the error that its file states or 0; before: fitted to these
+    data; after: with the causes.
+    """
+
+    given: float
+    given_stderr: float
+    before: float
+    before_stderr: float
+    after: float
+    after_stderr: float
+
+
+@dataclass(frozen=True)
+class HeldOutData:
+    """Other frames of the same cameras, posed, without outliers.
+
+    rig_differs: whether the cameras do not stand as in the data, so that each view was posed by
+    itself; another_target: whether landmarks of one number stand in other places.
+    """
+
+    data: Data
+    pose: Pose
+    outliers: Outliers
+    rig_differs: bool
+    another_target: bool
+
+    @classmethod
+    def of(cls, held_out: Observations, selection: Selection) -> HeldOutData:
+        """Pose other frames by the extended model, and set outliers aside.
+
+        These are no measure of a model; the same points are left out for all.
+        """
+        trained = selection.null.linear.data
+        another_target = is_another_target(trained.observations, held_out)
+        table = prepare(held_out)
+        if has_no_rig(trained):
+            table = unpair_cameras(table)
+        state = valid_state(selection.state, table, trained, another_target)
+        data, outliers = find_outliers(table, start_poses(table, state))
+        differs = rig_differs(data, state)
+        if differs:
+            table = unpair_cameras(table)
+            data, outliers = find_outliers(table, start_poses(table, state))
+        return cls(data, start_poses(data, state).pose, outliers, differs, another_target)
+
+
+def valid_state(state: State, test: Data, trained: Data, another_target: bool) -> State:
+    """Return the state without what trained frames or their target had, and the test has not."""
+    t, known = test.observations.t, trained.observations.t
+    return replace(state, terms=tuple(
+        term for term in state.terms if term[0].holds_for(t, known)
+        and not (another_target and term[0].place == 'target')))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Figures of a selection.
+
+    offsets: predicted, with what repeats in similar views; noise_px: of a coordinate; held_out:
+    other frames, None for frames left out in turn; medium: the cause that was found before the
+    selection, if there is one.
+    """
+
+    selection: Selection
+    fitted: FittedModel
+    offsets: PredictedOffsets
+    noise_px: float
+    held_out: HeldOutData | None
+    medium: Medium | None
+
+    @classmethod
+    def of(cls, selection: Selection, fitted: FittedModel, medium: Medium | None) -> Evaluation:
+        """Evaluate a selection; fitted: of its null model."""
+        views = similar_views(fitted.linear, fitted.residuals())
+        offsets = fitted.predicted_offsets()._replace(views=views)
+        noise = noise_px(selection.null)
+        if views is not None:
+            noise *= float(np.sqrt(1 - views.share))
+        held_out = selection.problem.inputs.held_out
+        test = None if held_out is None else HeldOutData.of(held_out, selection)
+        return cls(selection, fitted, offsets, noise, test, medium)
+
+    @property
+    def null(self) -> NullModel:
+        """The null model around the state with the causes."""
+        return self.selection.null
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """The intrinsics that were fitted."""
+        return self.selection.problem.free
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the causes that move predictions."""
+        return [effect.name for effect, _, _ in self.selection.causes]
+
+    @cached_property
+    def errors(self) -> Array:
+        """Standard errors of all that is shared."""
+        return self._errors_of(self.null)
+
+    def _errors_of(self, null: NullModel) -> Array:
+        return (standard_errors(null, jackknife=False) if self.selection.problem.options.quick
+                else total_errors(null))
+
+    def predict(
+        self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
+    ) -> HeldOut:
+        """Predict held-out frames without some causes, with or without random effects."""
+        test, selection = self.held_out, self.selection
+        if test is None:
+            return cross_validate(self.null, without, offsets).take(self.predicted)
+        if set(without) >= set(self.names):
+            state = selection.problem.base
+        elif without:
+            state = fit_without_causes(self.null, without, self.free)
+        else:
+            state = selection.state
+        state = valid_state(state, test.data, self.null.linear.data, test.another_target)
+        if offsets is not None and test.another_target:
+            offsets = offsets.of_image
+        return predict_other_data(
+            test.data, replace(state, pose=test.pose, rig=selection.state.rig), offsets)
+
+    @cached_property
+    def predicted(self) -> Mask:
+        """Which frames (F,) count where each is left out in turn: what any model predicts."""
+        with_causes, without = (
+            cross_validate(self.null, gone) for gone in ((), self.names))
+        return with_causes.predicted | without.predicted
+
+    @cached_property
+    def _base_prediction(self) -> HeldOut:
+        return self.predict(self.names)
+
+    @cached_property
+    def _given_prediction(self) -> HeldOut:
+        if self.medium is None:
+            return self._base_prediction
+        if self.held_out is None:
+            return self.medium.cross_validate().take(self.predicted)
+        return predict_other_data(
+            self.held_out.data, replace(self.medium.air.state, pose=self.held_out.pose))
+
+    @cached_property
+    def _cause_predictions(self) -> list[HeldOut]:
+        """Predictions with the first 0, 1, ... causes."""
+        return [self._base_prediction, *(
+            self.predict(self.names[i + 1 :]) for i in range(len(self.names))
+        )]
+
+    @cached_property
+    def _extended_prediction(self) -> HeldOut:
+        return self.predict(offsets=self.offsets)
+
+    @cached_property
+    def _lens_prediction(self) -> HeldOut:
+        return self.predict(self._not_of_lens)
+
+    @property
+    def _not_of_lens(self) -> list[str]:
+        return [name for name in self.names if stage_of(name) != 'lens']
+
+    @property
+    def _noise_square(self) -> float:
+        """Variance of whitened noise: 1 where the table states sigma, else as it was estimated."""
+        stated = np.isfinite(self.null.linear.data.observations.sigma).all()
+        return 1.0 if stated else self.null.variances.sigma**2
+
+    @property
+    def before(self) -> Linearised:
+        """The simulation as it was fitted."""
+        return self.selection.problem.linear if self.medium is None else self.medium.air
+
+    @cached_property
+    def base(self) -> FitQuality:
+        """The simulation as it was fitted."""
+        linear, full = self.before, self.null.full
+        freedom = full.rows - full.group_rank - len(self.free)
+        chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
+        return FitQuality(rms_px(linear), self._given_prediction.rms, chi2)
+
+    @cached_property
+    def named(self) -> FitQuality:
+        """All causes, without random effects."""
+        return FitQuality(rms_px(self.null.linear), self._cause_predictions[-1].rms)
+
+    @cached_property
+    def lens_only(self) -> FitQuality:
+        """Only what moves with the lens, fitted without the rest."""
+        linear = self.selection.problem.linear
+        if set(self._not_of_lens) < set(self.names):
+            state = fit_without_causes(self.null, self._not_of_lens, self.free)
+            data = self.null.linear.data
+            linear = Linearised(data, fit(data, state, self.free), self.free)
+        return FitQuality(rms_px(linear), self._lens_prediction.rms)
+
+    @cached_property
+    def extended(self) -> FitQuality:
+        """Causes and predicted random effects."""
+        residuals = self.fitted.residuals()
+        chi2 = float((residuals**2).sum()) / self._noise_square / self.null.full.rows
+        return FitQuality(
+            rms_px(self.null.linear, residuals), self._extended_prediction.rms, chi2)
+
+    @cached_property
+    def gain(self) -> Comparison:
+        """Of the best prediction over the simulation."""
+        return self._gain(self._given_prediction, self._extended_prediction)
+
+    def _gain(self, before: HeldOut, after: HeldOut) -> Comparison:
+        return held_out_gain(before, after, self.noise_px)
+
+    @cached_property
+    def gains(self) -> dict[str, Comparison]:
+        """What the lens alone, all causes, and then offsets of landmarks and image gain."""
+        offsets, named = self._extended_prediction, self._cause_predictions[-1]
+        if self.offsets.views is not None:
+            offsets = self.predict(offsets=self.offsets._replace(views=None))
+        return {
+            'lens': self._gain(self._given_prediction, self._lens_prediction),
+            'named': self._gain(self._given_prediction, named),
+            'local': self._gain(named, offsets),
+        }
+
+    def causes(self, components: Sequence[Component]) -> list[Cause]:
+        """Return the causes that move predictions, with what each adds."""
+        squares, predictions = self._squares, self._cause_predictions
+        named = sum(c.share for c in components if c.named_share)
+        total = sum(squares.values())
+        shares = {name: named * s / total if total else 0.0 for name, s in squares.items()}
+        held_out = [(after.rms, self._gain(before, after).value)
+                    for before, after in pairwise(predictions)]
+        causes = selected_causes(
+            EffectTests(self.null), self.selection.causes, self.errors, shares, held_out)
+        if self.medium is None:
+            return causes
+        gain = self._gain(self._given_prediction, self._base_prediction)
+        remaining = 1 - self.medium.share
+        fitted = replace(self.medium, state=self.selection.state)
+        return [fitted.cause(self._free_errors(), self._base_prediction.rms, gain),
+                *(replace(cause, share=remaining * cause.share) for cause in causes)]
+
+    def components(self, noise_causes: Mapping[str, float]) -> list[Component]:
+        """Return the variance budget; noise_causes: p-values of causes in the noise."""
+        null, tests = self.null, EffectTests(self.null)
+        p_values = component_significance(null) | {
+            effect.name: tests.test_removal(null.included, columns, effect).p_value
+            for effect, columns, _ in self.selection.causes} | dict(noise_causes)
+        parts = variance_budget(null, self._squares, p_values, self.offsets.views)
+        return parts if self.medium is None else self.medium.budget(parts)
+
+    @cached_property
+    def _squares(self) -> dict[str, float]:
+        return cause_squares(self.null, self.selection.causes)
+
+    def _free_errors(self) -> dict[str, float]:
+        """Return the standard errors of what was free from the start."""
+        rig = _count_rig_columns(self.selection.first, self.free)
+        return {name: float(self.errors[rig + i]) for i, name in enumerate(self.free)}
+
+    @cached_property
+    def intrinsics(self) -> dict[str, Intrinsic]:
+        """Free intrinsics before and after, with errors under the null model."""
+        if self.medium is not None:
+            return {}
+        selection, after = self.selection, self._free_errors()
+        given = stated_parameters(selection.problem.inputs.lenses)
+        before = self._errors_of(selection.first)
+        rig = _count_rig_columns(selection.first, self.free)
+        was, now = selection.problem.base.parameters, selection.state.parameters
+        return {
+            name: Intrinsic(
+                *given[name], was[name], float(before[rig + i]), now[name], after[name])
+            for i, name in enumerate(self.free)
+        }
+
+
+def _count_rig_columns(null: NullModel, free: Sequence[str]) -> int:
+    """Return how many of what is shared come before what was free from the start."""
+    return null.own - len(free) - sum(len(values) for _, _, values in null.terms)

@@ -1,0 +1,310 @@
+"""The model fitted under its null model: generalized least squares, residuals, predicted offsets.
+
+Fifth stage of a diagnosis: what random effects are predicted to be, and what is left beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse.linalg import eigsh
+from scipy.spatial import cKDTree
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import moved
+from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column_norms
+from fisheye_svp_ros.diagnosis.random_effects import (
+    MILLIMETRE,
+    NAMES,
+    Grid,
+    RandomEffects,
+    bump_values,
+    make_random_effects,
+)
+from fisheye_svp_ros.effects.target_map import at_landmarks
+from fisheye_svp_ros.mixed_model import (
+    Equations,
+    FactoredEquations,
+    Solution,
+    Variances,
+    factor_equations,
+    make_equations,
+    multiply_rows,
+    posterior_covariance,
+    predict_rows,
+    solve_equations,
+)
+
+_STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
+_MAX_RISE = 1.5  # of the sum of squares: what is random may take up a rise, but no more
+_MAX_STEPS = 4
+_CONVERGED = 3e-3  # of the noise: what a step moves predictions by
+_MIN_MODE, _MAX_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
+_PROBES = 24
+_PAIR_REACH = 80  # of the image: how near to each other points have the same place
+_MIN_PAIRS = 100
+
+
+class PredictedOffsets(NamedTuple):
+    """Predicted random effects of landmarks (L, 3), m, of the image (grids, (K, 2) px), of views.
+
+    views: what landmarks err by alike in similar views, where they do.
+    """
+
+    landmark: Index
+    offset: Array
+    grids: tuple[tuple[Grid, Array], ...]
+    views: SimilarViews | None = None
+
+    @property
+    def of_image(self) -> PredictedOffsets:
+        """What of them is valid for another target, too."""
+        return self._replace(offset=np.zeros_like(self.offset), views=None)
+
+    def apply(self, data: Data) -> Data:
+        """Return data with landmarks where they are predicted and the image field taken out.
+
+        What depends on the views takes poses, and stays.
+        """
+        views = data.views
+        points = views.points + at_landmarks(views, self.landmark, self.offset)
+        uv = views.uv.copy()
+        for grid, values in self.grids:
+            mine = views.used & (data.camera_of[:, None] == grid.camera)
+            shift = bump_values(views.uv, mine, grid.centres, grid.pitch) @ values
+            uv -= shift.reshape(uv.shape)
+        return replace(data, views=views._replace(points=points, uv=uv))
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """A linearized state under a null model, with its equations and their solution.
+
+    scale (K,): norms that the fixed columns of the model were divided by.
+    """
+
+    linear: Linearised
+    random: RandomEffects
+    factored: FactoredEquations
+    solution: Solution
+    scale: Array
+
+    @classmethod
+    def of(cls, null: NullModel) -> FittedModel:
+        """Solve the mixed-model equations of a null model for what is in the model."""
+        eq = null.equations.with_fixed(np.eye(len(null.scale), null.own))
+        return cls._solve(
+            null.linear, null.called_for, eq, null.variances, null.scale[: null.own])
+
+    @classmethod
+    def of_state(cls, linear: Linearised, variances: Variances) -> FittedModel:
+        """Solve the mixed-model equations of one linearization, with given variances."""
+        finest = bool(variances.alive[NAMES.index(FINEST_FIELD)])
+        random = make_random_effects(linear, finest).select(variances.alive)
+        scale = column_norms(linear.shared_columns)
+        border = np.concatenate(
+            [linear.shared_columns / scale, linear.residual[..., None]], axis=-1
+        )
+        eq = make_equations(random.columns, linear.frame_columns, border).select(variances.alive)
+        return cls._solve(linear, random, eq, variances, scale)
+
+    @classmethod
+    def _solve(
+        cls, linear: Linearised, random: RandomEffects, eq: Equations, variances: Variances,
+        scale: Array,
+    ) -> FittedModel:
+        # What the data leave open stays where it is.
+        f = factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight)
+        return cls(linear, random, f, solve_equations(f), scale)
+
+    @property
+    def state(self) -> State:
+        """The state around which the model is linear."""
+        return self.linear.state
+
+    @property
+    def pose_columns(self) -> Array:
+        """Columns (F, M, 6) of the frames' poses, as the equations have them."""
+        return self.linear.frame_columns / self.factored.equations.group_scale[:, None]
+
+    def predict_rows(self, e: Array, r: Array, values: Array) -> Array:
+        """Return what coefficients (E, k, C), (R, C) and fixed values (K, C) add to the rows."""
+        eq = self.factored.equations
+        rows = predict_rows(self.random.columns, self.pose_columns, *eq.split(e, r), eq.units)
+        return np.asarray(rows + self.linear.shared_columns @ (values / self.scale[:, None]))
+
+    def solve_rows(self, rows: Array) -> tuple[Array, Array, Array]:
+        """Return the coefficients (E, k, C), (R, C), (K, C) that rows (F, M, C) call for."""
+        e, r = self.factored.equations.join(
+            *multiply_rows(self.random.columns, self.pose_columns, rows))
+        x = np.einsum('fmk,fmc->kc', self.linear.shared_columns, rows, optimize=True)
+        return self.factored.solve(e, r, x / self.scale[:, None])
+
+    def residuals(self) -> Array:
+        """Return whitened residuals (F, M), every random effect at its prediction."""
+        solution = self.solution
+        remaining = self.linear.residual - self.predict_rows(
+            solution.e[..., None], solution.r[:, None], solution.values[:, None]
+        )[..., 0]
+        return np.asarray(remaining * self.linear.used)
+
+    def leverages(self) -> Array:
+        """Return the diagonal (F, M) of the hat matrix, from random signs.
+
+        Source: Hutchinson, A stochastic estimator of the trace of the influence matrix,
+        Communications in Statistics 19 (1990).
+        """
+        shape, used = self.linear.residual.shape, self.linear.used
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], (*shape, _PROBES)) * used[..., None]
+        hat = self.predict_rows(*self.solve_rows(signs))
+        return np.asarray(np.clip((signs * hat).mean(axis=-1), 0.0, 0.8))
+
+    def standardized_squares(self) -> Array:
+        """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
+        return np.asarray(
+            self.residuals()**2 / (1 - self.leverages()) / self.solution.variance)
+
+    def place_correlation(self) -> float:
+        """Return how alike points of different frames err on the same place, in standard errors.
+
+        Residuals with everything predicted that are finer than the image fields have room for.
+        """
+        linear = self.linear
+        remaining = self.residuals().reshape(*linear.residual.shape[:1], -1, 2)
+        uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
+        used = linear.used[:, ::2]
+        frame = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
+        at, errors = uv[used], remaining[used]
+        reach = float(np.ptp(at, axis=0).max()) / _PAIR_REACH
+        pairs = cKDTree(at).query_pairs(reach, output_type='ndarray')
+        pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]
+        if len(pairs) < _MIN_PAIRS:
+            return 0.0
+        products = (errors[pairs[:, 0]] * errors[pairs[:, 1]]).sum(axis=1)
+        typical = np.clip(products, *np.quantile(products, (0.005, 0.995)))
+        return float(typical.mean() / max(typical.std(), 1e-300) * np.sqrt(len(pairs)))
+
+    def predicted_offsets(self) -> PredictedOffsets:
+        """Return what the random effects of target and lens are predicted to be."""
+        eq, random = self.factored.equations, self.random
+        e, r = self.solution.e[..., None], self.solution.r[:, None]
+        offset = self._landmark_offsets(e, r)[..., 0]
+        in_target = np.einsum('la,lab->lb', offset, random.axes) * MILLIMETRE
+        shared, grids = eq.split(e, r)[2][:, 0], []
+        for grid in random.grids:
+            values, shared = np.split(shared, [2 * len(grid.centres)])
+            grids.append((grid, values.reshape(-1, 2)))
+        return PredictedOffsets(random.landmark, in_target, tuple(grids))
+
+    def target_modes(self, sigma: float) -> tuple[Array, Array]:
+        """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.
+
+        Along the axes of their boards; the mean square about zero, given the data, of predicted
+        offsets: of a sum of the modes, each with a factor of variance 1, and of what each landmark
+        has alone.  sigma: of the whitened noise.
+        """
+        square = self._offset_squares(sigma)
+        count = len(square)
+        if not square.any():
+            return np.zeros((count // 3, 3, 0)), np.zeros((count // 3, 3))
+        start = np.random.default_rng(0).standard_normal(count)  # the same modes every time
+        values, vectors = eigsh(square, min(_MAX_MODES, count - 1), v0=start)
+        kept = values > _MIN_MODE * np.trace(square)
+        modes = vectors[:, kept] * np.sqrt(values[kept])
+        alone = np.sqrt(np.maximum(np.diag(square) - (modes**2).sum(axis=1), 0.0))
+        return (MILLIMETRE * modes.reshape(count // 3, 3, -1), MILLIMETRE * alone.reshape(-1, 3))
+
+    def _offset_squares(self, sigma: float) -> Array:
+        """Return the mean squares (3 L, 3 L) of landmarks' offsets about zero, mm^2."""
+        posterior, eq = posterior_covariance(self.factored), self.factored.equations
+        shape, count = self.solution.e.shape, self.solution.e.size
+        mean = self._landmark_offsets(self.solution.e[..., None], self.solution.r[:, None])
+        width = posterior.root.shape[1]
+        root = self._landmark_offsets(
+            posterior.root[:count].reshape(*shape, width), posterior.root[count:])
+        root = np.concatenate([sigma * root, mean], axis=-1).reshape(mean.size, width + 1)
+        square = root @ root.T
+        if not eq.by_group:  # what a landmark's own block leaves open
+            present = (self.random.columns.unit_label >= 0)[eq.units]
+            own = 3 * eq.units[:, None] + np.arange(3)
+            square[own[:, :, None], own[:, None]] += np.where(
+                present[:, :, None] & present[:, None], sigma**2 * posterior.block, 0.0)
+        return np.asarray(square)
+
+    def _landmark_offsets(self, e: Array, r: Array) -> Array:
+        """Return what coefficients (E, k, C), (R, C) displace each landmark by: (L, 3, C)."""
+        eq, random = self.factored.equations, self.random
+        _, landmark, shared = eq.split(e, r)
+        offset = np.zeros((len(random.landmark), 3, r.shape[-1]))
+        if len(eq.units):
+            present = random.columns.unit_label[eq.units] >= 0
+            offset[eq.units] = np.where(present[..., None], landmark, 0.0)
+        at = random.grid_columns
+        for field in random.fields:
+            for axis in field.axes:
+                count = field.values.shape[1]
+                offset[:, axis] += field.values @ shared[at : at + count]
+                at += count
+        return offset
+
+
+def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> State:
+    """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance.
+
+    All steps are solved with the equations of the first: its columns change little.
+    """
+    fitted = FittedModel.of_state(Linearised(data, state, free), variances)
+    linear, eq = fitted.linear, fitted.factored.equations
+    e, r, values = fitted.solution.e, fitted.solution.r, fitted.solution.values
+    most = _MAX_RISE * float((linear.residual**2).sum())
+    for step in range(_MAX_STEPS):
+        frame, _, _ = eq.split(e, r)
+        change = frame[:, :6] / eq.group_scale, values / fitted.scale
+        moves = (linear.frame_columns @ change[0][..., None])[..., 0]
+        moves += linear.shared_columns @ change[1]
+        state, residual = limit_step(
+            data, free, partial(_after_step, data, state, free, change), most)
+        converged = np.sqrt((moves**2).mean()) < _CONVERGED * variances.sigma
+        if step == _MAX_STEPS - 1 or converged:
+            break
+        e, r, values = (part[..., 0] for part in fitted.solve_rows(residual[..., None]))
+    return state
+
+
+def _after_step(
+    data: Data, state: State, free: Sequence[str], change: tuple[Array, Array], fraction: float
+) -> State:
+    return moved(data, state, free, *(fraction * step for step in change))
+
+
+def limit_step(
+    data: Data, free: Sequence[str], after: Callable[[float], State], most: float = np.inf
+) -> tuple[State, Array]:
+    """Return the state after so much of a step that all points are still seen, and its residual.
+
+    A step far beyond where the columns hold may take points out of sight, or lead away from them.
+    after: makes a state of a part of the step, 1 for all of it; most: sum of squares allowed.
+    """
+    for fraction in _STEP_FRACTIONS:
+        state = after(fraction)
+        residual = Linearised(data, state, free).residual
+        squares = float((residual**2).sum())
+        if np.isfinite(squares) and squares <= most:
+            break
+    return state, residual
+
+
+def rms_px(linear: Linearised, whitened: Array | None = None) -> float:
+    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
+
+    Without any: of those of the fit itself.
+    """
+    weight, used = linear.row_weight, linear.used
+    rows = linear.residual if whitened is None else whitened
+    return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))

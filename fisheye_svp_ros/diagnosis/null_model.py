@@ -1,0 +1,332 @@
+"""Second stage, the null model: fixed what is legitimately free, random what has no name.
+
+Poses, rig, intrinsics and effects in the model are fixed columns;
+targets, frames and lenses have random effects whose variances come from the data.  Columns of
+everything that could be added stand beside them, so that one factorization serves all tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.effect_forms import (
+    EffectForms,
+    effect_forms,
+    intrinsic_walks,
+    smooth_fields,
+)
+from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
+from fisheye_svp_ros.diagnosis.random_effects import (
+    NAMES,
+    STAGE_OF,
+    RandomEffects,
+    make_random_effects,
+)
+from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import (
+    LAMBDA_ABSENT,
+    Equations,
+    FactoredEquations,
+    LeaveOneOut,
+    Variances,
+    eliminate,
+    estimate_variances,
+    factor_equations,
+    find_variances,
+    identifiable_basis,
+    initial_variances,
+    integrate_columns,
+    is_called_for,
+    leave_groups_out,
+    make_equations,
+    no_variances,
+)
+
+FINEST_FIELD = 'image_finest'
+_OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
+_FIELD_SIZES = (0.5, 2.0, 8.0, 32.0)  # what a bump adds to the variance where it is, over noise
+_WALK_SIZES = tuple(8.0 * 4.0**i for i in range(12))  # of the slowest wave of a walk
+_FRAME_STEPS = 6  # the likelihood is flat around the best variances
+
+PlacedEffect = tuple[Effect, Index, Array]  # an effect, its columns among shared ones, its values
+Alternative = tuple[float, Array]  # log determinant and information of the border
+
+
+@dataclass(frozen=True)
+class FixedColumns:
+    """The fixed columns that all frames share: of the model, and what could be added to it.
+
+    border (F, M, X + 1): normalized columns and, last, the residual; scale (X,): norms that they
+    were divided by.  The first `own` are in the model; the forms of the catalogue follow, then
+    smooth fields, by variable, and walks of the intrinsics with their roughness.
+    """
+
+    border: Array
+    scale: Array
+    own: int
+    forms: EffectForms
+    fields: dict[str, Index]
+    walks: Index
+    roughness: Array
+
+    @classmethod
+    def of(cls, linear: Linearised, left_out: Sequence[str]) -> FixedColumns:
+        """Return the columns of a linearized state, without the effects left out."""
+        forms = effect_forms(linear, left_out)
+        fields, (walks, roughness) = smooth_fields(linear), intrinsic_walks(linear)
+        columns = np.concatenate(
+            [linear.shared_columns, forms.columns, *fields.values(), walks], axis=-1)
+        scale = column_norms(columns)
+        border = np.concatenate([columns / scale, linear.residual[..., None]], axis=-1)
+        own = linear.shared_columns.shape[-1]
+        at, where = own + forms.columns.shape[-1], {}
+        for name, field in fields.items():
+            where[name] = np.arange(at, at + field.shape[-1])
+            at += field.shape[-1]
+        walks_at = np.arange(at, at + walks.shape[-1])
+        return cls(border, scale, own, forms, where, walks_at, roughness)
+
+
+@dataclass(frozen=True)
+class NullModel:
+    """A linearized state with its random effects, their variances, and all that could be added.
+
+    random, full: of all components; variances: of those that the data call for.
+    """
+
+    linear: Linearised
+    fixed: FixedColumns
+    random: RandomEffects
+    full: Equations
+    variances: Variances
+
+    @classmethod
+    def fit(
+        cls, data: Data, state: State, free: Sequence[str], before: Variances | None = None,
+        left_out: Sequence[str] = (), finest: bool = False,
+    ) -> NullModel:
+        """Linearize a state and estimate the variances of its random effects (REML).
+
+        before: variances to start from; left_out: effects; finest: with the finest image field.
+        """
+        bare = cls._linearize(data, state, free, left_out, finest)
+        return replace(bare, variances=find_variances(bare._all_free(), before))
+
+    @classmethod
+    def with_variances(
+        cls, data: Data, state: State, free: Sequence[str], variances: Variances | None = None
+    ) -> NullModel:
+        """Return the null model of known variances, without effects that could be added.
+
+        variances: None for nothing random.
+        """
+        finest = variances is not None and bool(variances.alive[NAMES.index(FINEST_FIELD)])
+        landmarks = len(np.unique(data.views.landmark[data.views.used]))
+        known = variances or no_variances(len(NAMES), landmarks)
+        bare = cls._linearize(data, state, free, tuple(CATALOGUE), finest, known.alive)
+        return replace(bare, variances=known)
+
+    @classmethod
+    def _linearize(
+        cls, data: Data, state: State, free: Sequence[str], left_out: Sequence[str],
+        finest: bool, alive: Mask | None = None,
+    ) -> NullModel:
+        """Return the model before any variance is known; alive: its components, None for all."""
+        linear = Linearised(data, state, free)
+        fixed, random = FixedColumns.of(linear, left_out), make_random_effects(linear, finest)
+        if alive is not None:
+            random = random.select(alive)
+        full = make_equations(random.columns, linear.frame_columns, fixed.border)
+        return cls(linear, fixed, random, full, initial_variances(full))
+
+    def relinearize(
+        self, data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
+    ) -> NullModel:
+        """Return the model around another state, the variances as they are."""
+        return replace(self._linearize(data, state, free, left_out, finest),
+                       variances=self.variances)
+
+    def calls_for_finest_field(self, data: Data, state: State, left_out: Sequence[str]) -> bool:
+        """Return whether a state calls for the finest image field beside these variances."""
+        alive = self.variances.alive | (np.array(NAMES) == FINEST_FIELD)
+        bare = self._linearize(data, state, self.linear.free, left_out, True, alive)
+        return is_called_for(bare._all_free(), self.variances, NAMES.index(FINEST_FIELD))
+
+    def _all_free(self) -> Equations:
+        """Return the equations with what is in the model and the whole catalogue free."""
+        generic = self.fixed.own + self.fixed.forms.generic
+        return self.equations_of(np.concatenate([self.included, generic]))
+
+    def equations_of(self, chosen: Index) -> Equations:
+        """Return the equations of all components with chosen columns as their whole border."""
+        columns = self.fixed.border[..., :-1]
+        return self.full.with_fixed(
+            identifiable_basis(self.linear.frame_columns, columns, chosen))
+
+    @property
+    def own(self) -> int:
+        """How many of the fixed columns are in the model."""
+        return self.fixed.own
+
+    @property
+    def included(self) -> Index:
+        """The fixed columns in the model."""
+        return np.arange(self.fixed.own)
+
+    @property
+    def scale(self) -> Array:
+        """The norms (X,) that the fixed columns were divided by."""
+        return self.fixed.scale
+
+    @property
+    def freedom(self) -> int:
+        """Numbers in the residual less all fixed coefficients."""
+        return self.full.rows - self.full.group_rank - self.own
+
+    @cached_property
+    def equations(self) -> Equations:
+        """The equations of the components that have a variance."""
+        return self.full.select(self.variances.alive)
+
+    @cached_property
+    def called_for(self) -> RandomEffects:
+        """The random effects that have a variance."""
+        return self.random.select(self.variances.alive)
+
+    @cached_property
+    def factored(self) -> FactoredEquations:
+        """The equations of the components that have a variance, factored."""
+        return factor_equations(self.equations, self.variances.lam, self.variances.weight)
+
+    @cached_property
+    def information(self) -> Array:
+        """Information (X + 1, X + 1) of the border, its last row and column the score."""
+        return self.factored.information / self.variances.sigma**2
+
+    @cached_property
+    def leave_one_out(self) -> LeaveOneOut:
+        """Each frame, seen from all the others."""
+        return leave_groups_out(self.factored, self.called_for.columns, self.linear.frame_columns,
+                                self.fixed.border)
+
+    def information_without_frames(self, at: Index) -> Array:
+        """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
+        frames = self.leave_one_out.information[:, at[:, None], at]
+        return self.information[at[:, None], at] - frames / self.variances.sigma**2
+
+    @property
+    def terms(self) -> list[PlacedEffect]:
+        """Each effect in the model, its columns among what is shared, and its values."""
+        terms = [t for t in self.linear.state.terms if t[0].stage != 'noise']
+        start = self.own - sum(len(values) for _, values in terms)
+        placed = []
+        for effect, values in terms:
+            placed.append((effect, np.arange(start, start + len(values)), values))
+            start += len(values)
+        return placed
+
+    @property
+    def kinds(self) -> set[str]:
+        """Names of the effects in the model, for each camera of a rig that has one for itself."""
+        return {kind for effect, _ in self.linear.state.terms for kind in effect.kinds}
+
+    def form_columns(self, form: int) -> Index:
+        """Return the border's columns of a form."""
+        return self.fixed.forms.at[form] + self.own
+
+    def prior_precision(self, columns: Index, effect: Effect) -> Array:
+        """Return precisions (P,) of an effect's normalized columns: it is hardly beyond large."""
+        large = np.array([parameter.large for parameter in effect.parameters])
+        return np.asarray(1 / (large * self.scale[columns]) ** 2)
+
+    def columns_and_residual(self, columns: Index) -> Index:
+        """Return what is in the model, further columns and, last, the residual of the border."""
+        return np.unique(np.concatenate([self.included, columns, [len(self.scale)]]))
+
+    def residual_combination(self, included: Index) -> Array:
+        """Return the combination (X + 1,) of the border that is the residual with only these.
+
+        An effect whose columns are not among those included has its displacement in it.
+        """
+        combination = np.zeros(len(self.scale) + 1)
+        combination[-1] = 1.0
+        for _, columns, values in self.terms:
+            gone = ~np.isin(columns, included)
+            combination[columns[gone]] = (values * self.scale[columns])[gone]
+        return combination
+
+    def restrict_information(
+        self, information: Array, included: Index, at: Index | None = None
+    ) -> Array:
+        """Return information (..., m, m) as if only the included effects were fitted.
+
+        at (m,): what it is of, the residual last; None for the whole border.
+        """
+        combination = self.residual_combination(included)
+        combination = combination if at is None else combination[at]
+        restricted = information.copy()
+        restricted[..., -1] = information @ combination
+        restricted[..., -1, :] = restricted[..., -1]
+        restricted[..., -1, -1] = restricted[..., -1] @ combination
+        return restricted
+
+    def remaining_information(self, information: Array, included: Index) -> Array:
+        """Return the information with what is included, and no more, fitted and eliminated."""
+        return eliminate(self.restrict_information(information, included), included)
+
+    @cached_property
+    def field_alternatives(self) -> list[Alternative]:
+        """This model, and the same with smooth image fields of several sizes."""
+        kind = NAMES.index('image_broad')
+        alternatives = [(self.factored.log_determinant, self.factored.information)]
+        own = initial_variances(self.full, 1.0).lam[kind]
+        if own >= LAMBDA_ABSENT:
+            return alternatives
+        alive = self.variances.alive | (np.arange(len(NAMES)) == kind)
+        eq = self.full.select(alive).free_component(kind)
+        f = factor_equations(eq, self.variances.lam, self.variances.weight)
+        count = len(f.information) - len(self.scale) - 1
+        for size in _FIELD_SIZES:
+            prior = own * self.full.rows / count / size
+            logs, information = integrate_columns(f, np.arange(count), prior)
+            alternatives.append((logs, information[count:, count:]))
+        return alternatives
+
+    @cached_property
+    def walk_alternatives(self) -> list[Alternative]:
+        """The same with smooth walks of the intrinsics of several sizes."""
+        return [integrate_columns(self.factored, self.fixed.walks, self.fixed.roughness / size)
+                for size in _WALK_SIZES]
+
+    @cached_property
+    def frame_alternatives(self) -> tuple[FactoredEquations, FactoredEquations]:
+        """The equations without random effects of frames, and with these estimated anew.
+
+        Beside the whole catalogue its effects that change with time take a part of them.
+        """
+        lam = np.where(_OF_FRAMES, LAMBDA_ABSENT, self.variances.lam)
+        eq = self.equations_of(self.included)
+        start = np.where(_OF_FRAMES, initial_variances(eq).lam, self.variances.lam)
+        anew, _ = estimate_variances(eq, replace(self.variances, lam=start), _FRAME_STEPS)
+        without, estimated = (
+            factor_equations(self.full.select(now.alive), now.lam, now.weight)
+            for now in (replace(self.variances, lam=lam), anew))
+        return without, estimated
+
+
+def with_ordinary_landmarks(null: NullModel, landmarks: Sequence[int]) -> Variances:
+    """Return the variances with the offsets of some landmarks drawn as those of most are."""
+    mine = np.isin(null.random.landmark, landmarks)
+    return replace(null.variances, weight=np.where(mine, 1.0, null.variances.weight))
+
+
+def column_norms(columns: Array) -> Array:
+    """Return the norms (K,) of columns (F, M, K), 1 for those that are zero."""
+    norms = np.sqrt((columns**2).sum(axis=(0, 1)))
+    return np.where(norms > 0, norms, 1.0)

@@ -1,0 +1,288 @@
+"""Fourth stage, the selection of causes: rounds of null model, tests and refit until none changes.
+
+A round adds the effects that are accepted and removes those that are no longer needed
+(`stepwise`); where nothing changes, single landmarks are asked for, then outliers, noise and the
+finest image field are revised once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.adjustment import fit as fit_least_squares
+from fisheye_svp_ros.diagnosis.effect_forms import simplest_form, with_effect
+from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, limit_step, refit
+from fisheye_svp_ros.diagnosis.model import Data, State
+from fisheye_svp_ros.diagnosis.null_model import (
+    NullModel,
+    PlacedEffect,
+    with_ordinary_landmarks,
+)
+from fisheye_svp_ros.diagnosis.outliers import (
+    NoiseGrowth,
+    Outliers,
+    noise_growth,
+    reinstate_outliers,
+    reject_outliers,
+    with_noise_growth,
+)
+from fisheye_svp_ros.diagnosis.problem import Problem, Progress
+from fisheye_svp_ros.diagnosis.stepwise import (
+    TraceStep,
+    add_effects,
+    eliminate_effects,
+    find_single_landmarks,
+)
+from fisheye_svp_ros.effects.base import Effect, Untestable
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
+
+_MAX_ROUNDS = 6
+_REFITS_AFTER_REVISION = 2
+_PROGRESS_DECAY = 0.6  # of the work left before a round, what is left after it
+_FIELD_TEST_SIGMAS = 4.0  # standard errors
+_LINEAR_LIMIT = 25.0  # a misfit so many times the noise's is not linear: one cause a round
+_LEAST_SQUARES_LIMIT = 400.0  # and so many: its columns lead nowhere, least squares find the way
+_MAX_EFFECTS = 20  # in one round
+
+
+class Revision(NamedTuple):
+    """Data revised once the causes are known: outliers, and noise that grows with the angle."""
+
+    outliers: Outliers
+    growth: NoiseGrowth | None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The causes that were found, in the null model around the state with them.
+
+    first: the null model of the simulation, before any cause; trace: what was tried.
+    """
+
+    problem: Problem
+    first: NullModel
+    null: NullModel
+    revision: Revision
+    trace: tuple[TraceStep, ...]
+
+    @property
+    def state(self) -> State:
+        """The state with its causes."""
+        return self.null.linear.state
+
+    @property
+    def causes(self) -> list[PlacedEffect]:
+        """What was found: effects, their columns among what is shared, values."""
+        return [term for term in self.null.terms if term[0] not in self.problem.given_effects]
+
+
+@dataclass(frozen=True)
+class _Search:
+    """A search between two rounds; variances: to start from; revision: None before it is made."""
+
+    data: Data
+    state: State
+    variances: Variances | None
+    revision: Revision | None
+    finest: bool
+    trace: tuple[TraceStep, ...]
+    refits_left: int
+
+    def fit(self, problem: Problem) -> NullModel:
+        return NullModel.fit(self.data, self.state, problem.free, self.variances,
+                             problem.options.left_out, self.finest)
+
+    @property
+    def removed(self) -> set[str]:
+        """The effects that were given up: they are not asked for again."""
+        return {step.name for step in self.trace if step.removed}
+
+
+def select_causes(problem: Problem, progress: Progress) -> Selection:
+    """Add causes to a fitted state until none is left that is significant and predicts better."""
+    search = _Search(problem.data, _with_included(problem), None, None, False, (),
+                     1 if problem.options.quick else _MAX_ROUNDS)
+    first: NullModel | None = None
+    for turn in range(_MAX_ROUNDS):
+        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}',
+                 0.8 - 0.75 * _PROGRESS_DECAY**turn)
+        null = search.fit(problem)
+        first, before = first or null, replace(search, variances=null.variances)
+        search = _change_effects(problem, before, null, _max_effects(null, turn))
+        if search.state is before.state:
+            search = _revise(problem, search, null)
+        if search.state is before.state and search.finest == before.finest:
+            break
+        if search.state is not before.state:
+            search = replace(search, state=_refit(problem, search, null),
+                             refits_left=search.refits_left - 1)
+        if not search.refits_left:
+            break
+    assert first is not None
+    search, null = _finish(problem, search, null)
+    revision = search.revision or Revision(problem.outliers, None)
+    return Selection(problem, first, null, revision, search.trace)
+
+
+def _change_effects(problem: Problem, search: _Search, null: NullModel, most: int) -> _Search:
+    """Remove effects and add others; where none changes, single landmarks that stand out."""
+    tests, options = EffectTests(null), problem.options
+    included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
+    search = replace(search, trace=(*search.trace, *steps))
+    choice = add_effects(tests, included, most, search.removed, options.quick)
+    search = replace(search, trace=(*search.trace, *choice.trace))
+    gone = [step.name for step in steps]
+    if gone or choice.forms:
+        return replace(search, state=_change_state(null, included, gone, choice.forms))
+    name = LandmarkSurveyEffect.name
+    if name in options.left_out or any(e.name == name for e, _ in search.state.terms):
+        return search
+    found = find_single_landmarks(tests)
+    if found is None:
+        return search
+    effect, offset, step = found
+    return replace(
+        search, state=with_effect(search.state, effect, offset), trace=(*search.trace, step),
+        # Their random offsets must not stand in for them.
+        variances=with_ordinary_landmarks(null, effect.landmarks))
+
+
+def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
+    """Revise outliers and noise once the causes are known, and ask for the finest image field."""
+    if problem.options.quick or (search.revision and search.finest):
+        return search
+    fitted = FittedModel.of(null)
+    if search.revision is None:
+        search = _revise_outliers(problem, search, fitted)
+    if not search.finest and fitted.place_correlation() > _FIELD_TEST_SIGMAS:
+        # Points of different frames err alike where they fall on the same place.
+        search = replace(search, finest=null.calls_for_finest_field(
+            search.data, search.state, problem.options.left_out))
+    return search
+
+
+def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> _Search:
+    """Reinstate what the causes explain, reject what is too far off for the noise.
+
+    Whether that grows with the angle is asked before.
+    """
+    squares, growth = fitted.standardized_squares(), None
+    if 'noise_vs_angle' not in problem.options.left_out:
+        growth = noise_growth(fitted, squares)
+        squares = squares / growth.variance
+        if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
+            growth = None
+    data, kept = reinstate_outliers(search.data, fitted, problem.outliers)
+    data, outliers = reject_outliers(data, fitted, kept, squares)
+    changed = len(kept.rows) < len(problem.outliers.rows) or len(outliers.rows) > len(kept.rows)
+    state = search.state
+    if growth is not None:
+        state = with_noise_growth(state, growth.value)
+    elif changed:
+        state = replace(state)  # the same, to be fitted to other data
+    return replace(search, data=data, state=state, revision=Revision(outliers, growth),
+                   refits_left=_REFITS_AFTER_REVISION)
+
+
+def _refit(problem: Problem, search: _Search, null: NullModel) -> State:
+    state = search.state
+    if _misfit(null) > _LEAST_SQUARES_LIMIT:
+        state = fit_least_squares(search.data, state, problem.free)
+    assert search.variances is not None
+    return refit(search.data, state, problem.free, search.variances)
+
+
+def _finish(
+    problem: Problem, search: _Search, null: NullModel
+) -> tuple[_Search, NullModel]:
+    """Fit once more with the last variances, without what they no longer call for."""
+    free, options = problem.free, problem.options
+    changed = search.state is not null.linear.state
+    if changed and not options.quick:
+        null = search.fit(problem)
+    while True:
+        # The last variances weigh the last fit.
+        state = refit(search.data, search.state, free, null.variances)
+        null = null.relinearize(search.data, state, free, options.left_out, search.finest)
+        if not changed:
+            return search, null  # all that is in the model was asked for beside these variances
+        included, steps = eliminate_effects(
+            EffectTests(null), _known_effects(problem), options.quick)
+        if not steps:
+            return search, null
+        gone = [step.name for step in steps]
+        search = replace(
+            search, state=_change_state(null, included, gone, ()), variances=null.variances,
+            trace=(*search.trace, *steps))
+        null = search.fit(problem)
+
+
+def _known_effects(problem: Problem) -> tuple[str, ...]:
+    """Return what is not asked for: what the lens came with and what the user includes."""
+    return (*problem.options.included, *(effect.name for effect in problem.given_effects))
+
+
+def _max_effects(null: NullModel, turn: int) -> int:
+    """Return how many causes may be taken in at once."""
+    return 1 if _misfit(null) > _LINEAR_LIMIT and not turn else _MAX_EFFECTS
+
+
+def _misfit(null: NullModel) -> float:
+    """Return the mean square of the residuals over that of the noise."""
+    return float((null.linear.residual**2).mean()) / null.variances.sigma**2
+
+
+def _change_state(
+    null: NullModel, included: Index, gone: Sequence[str], forms: Sequence[int]
+) -> State:
+    """Return the state without some effects and with chosen forms of others."""
+    kept = null.linear.state.without(gone)
+    estimated = _estimate_forms(null, included, forms)
+
+    def after(fraction: float) -> State:
+        return reduce(lambda state, one: with_effect(state, one[0], fraction * one[1]),
+                      estimated, kept)
+
+    return limit_step(null.linear.data, null.linear.free, after)[0]
+
+
+def _estimate_forms(
+    null: NullModel, included: Index, forms: Sequence[int]
+) -> list[tuple[Effect, Array]]:
+    """Return chosen forms with their joint estimates."""
+    columns = [null.form_columns(form) for form in forms]
+    every = np.concatenate([included, *columns])
+    information = null.restrict_information(null.information, included)
+    inverse, _ = pseudo_inverse(information[np.ix_(every, every)], 1e-12)
+    values = (inverse @ information[every, -1]) / null.scale[every]
+    estimated, at = [], len(included)
+    for form, mine in zip(forms, columns, strict=True):
+        estimated.append((null.fixed.forms.effects[form], values[at : at + len(mine)]))
+        at += len(mine)
+    return estimated
+
+
+def _with_included(problem: Problem) -> State:
+    """Return the fitted state with the causes that the user knows of, in their simplest forms.
+
+    Raises ObservationError for one that the data cannot hold.
+    """
+    state = problem.base
+    if not problem.options.included:
+        return state
+    for name in problem.options.included:
+        try:
+            state = with_effect(state, simplest_form(CATALOGUE[name], problem.linear))
+        except Untestable as why:
+            raise ObservationError(f'{problem.observations.source}: {name}: {why}') from why
+    return fit_least_squares(problem.data, state, problem.free)

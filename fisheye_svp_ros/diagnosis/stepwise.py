@@ -1,0 +1,306 @@
+"""Stepwise selection: effects added by score test and held-out gain, others eliminated.
+
+This is where a cause is accepted (`add_effects`) and where it is given up (`eliminate_effects`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, takewhile
+
+import numpy as np
+from scipy import optimize, special, stats
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.effect_tests import (
+    SIGNIFICANCE,
+    Candidate,
+    EffectTests,
+    HeldOutGain,
+)
+from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, OF_LANDMARKS
+from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
+from fisheye_svp_ros.mixed_model import (
+    LAMBDA_ABSENT,
+    factor_equations,
+    initial_variances,
+    solve_equations,
+    unit_covariances,
+    unit_labels,
+)
+
+# What is named is surer than significant: a local error now and then has the form of an effect.
+NAMED_P = 0.002
+REMOVED = 'removed:'
+_RARITY_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
+# So many landmarks are no single ones any more: of those that are exact, and of those that err
+# from landmark to landmark anyway.
+_MAX_SHARE, _MAX_BESIDE_BULK = 0.12, 3
+_OUTWEIGHED_RATIO = 10.0  # times smaller a statistic may be the doing of the largest
+_TAIL_FREEDOMS = (3.0, 5.0, 8.0, 12.0, 20.0, 40.0, 1e6)  # degrees of freedom, the last: normal
+_TAIL_GAIN = 2.0  # what longer tails add to the log likelihood if they are no chance
+
+
+@dataclass(frozen=True)
+class TraceStep:
+    """One line of the trace: what was tried, its evidence, and what came of it."""
+
+    effect: str
+    statistic: float
+    rank: int
+    p_value: float
+    corrected: float
+    held_out: float
+    held_out_stderr: float
+    accepted: bool
+    why: str
+
+    @property
+    def name(self) -> str:
+        """The name of the effect, without that of its form."""
+        return self.effect.partition('(')[0]
+
+    @property
+    def removed(self) -> bool:
+        """Whether an effect was given up that had been taken in."""
+        return self.why.startswith(REMOVED)
+
+
+@dataclass
+class ForwardSelection:
+    """The forms that were chosen, in order, and the trace."""
+
+    forms: list[int]
+    trace: list[TraceStep]
+
+
+def add_effects(
+    tests: EffectTests, included: Index, most: int, refused: Container[str], quick: bool
+) -> ForwardSelection:
+    """Add forms for as long as one is significant and predicts held-out frames better.
+
+    included: the border's columns in the model; refused: effects that are not asked again; quick:
+    do without held-out frames.
+    """
+    choice, failed = ForwardSelection([], []), set()
+    while len(choice.forms) < most:
+        remaining = (c for c in tests.significant_candidates(included)
+                     if c.form not in failed and c.effect.name not in refused)
+        best = _next_candidate(remaining)
+        if best is None:
+            break
+        columns = tests.null.form_columns(best.form)
+        gain = HeldOutGain(np.inf, 0.0)
+        if not (best.effect.per_frame or quick):
+            gain = tests.held_out_gain(included, columns, best.effect)
+        choice.trace.append(_trace_step(best, gain))
+        if gain.convincing:
+            included = np.concatenate([included, columns])
+            choice.forms.append(best.form)
+        else:
+            failed.add(best.form)
+    return choice
+
+
+def _next_candidate(remaining: Iterator[Candidate]) -> Candidate | None:
+    """Return the first that is sure enough to be named, or what is likelier than it."""
+    weaker: list[Candidate] = []
+    for candidate in remaining:
+        if candidate.corrected < NAMED_P:
+            return _commoner_candidate(candidate, chain(weaker, remaining))
+        weaker.append(candidate)
+    return None
+
+
+def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candidate:
+    """Return what stands for the best candidate: a part of it, or a look-alike, more common."""
+    if best.effect.asked_after:
+        return next((c for c in others if c.effect.name in best.effect.asked_after), best)
+    near = takewhile(lambda c: c.criterion > best.criterion - _RARITY_ODDS, others)
+    if not best.effect.rarer_than:
+        return best
+    size = len(best.effect.parameters)
+    return next((c for c in near if c.effect.name == best.effect.rarer_than
+                 and len(c.effect.parameters) == size), best)
+
+
+def _trace_step(candidate: Candidate, gain: HeldOutGain) -> TraceStep:
+    score = candidate.score
+    why = 'significant and predicts better' if gain.convincing else 'does not predict better'
+    return TraceStep(
+        candidate.effect.key, score.statistic, score.rank, score.p_value, candidate.corrected,
+        gain.value, gain.stderr, gain.convincing, why,
+    )
+
+
+def eliminate_effects(
+    tests: EffectTests, known: Sequence[str], quick: bool
+) -> tuple[Index, list[TraceStep]]:
+    """Return the columns of what is still needed, given the others, and why the rest is not.
+
+    The weakest goes first: what is no longer significant, then what held-out frames no longer
+    support.  known: effects that stay whatever the tests say.
+    """
+    included = tests.null.included
+    gone: list[TraceStep] = []
+    while True:
+        weakest: tuple[float, Index, TraceStep] | None = None
+        for effect, columns, _ in tests.null.terms:
+            if effect.name in known or not np.isin(columns, included).all():
+                continue
+            step = _test_removal(tests, included, effect, columns, quick)
+            if step is not None and (weakest is None or step.corrected > weakest[0]):
+                weakest = step.corrected, columns, step
+        if weakest is None:
+            return included, gone
+        gone.append(weakest[2])
+        included = np.setdiff1d(included, weakest[1])
+
+
+def _test_removal(
+    tests: EffectTests, included: Index, effect: Effect, columns: Index, quick: bool
+) -> TraceStep | None:
+    """Return why an effect is not needed beside everything else that is included, if so."""
+    score = tests.test_removal(included, columns, effect)
+    corrected = min(1.0, score.p_value * tests.effect_count)
+    gain, why = HeldOutGain(np.nan, np.nan), f'{REMOVED} the other causes explain it'
+    if corrected < SIGNIFICANCE:
+        if quick or effect.per_frame:
+            return None
+        gain = tests.held_out_gain(np.setdiff1d(included, columns), columns, effect)
+        if gain.sufficient:
+            return None
+        why = f'{REMOVED} it does not predict better any more'
+    return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
+                     gain.value, gain.stderr, False, why)
+
+
+def find_single_landmarks(
+    tests: EffectTests
+) -> tuple[LandmarkSurveyEffect, Array, TraceStep] | None:
+    """Return landmarks that stand out against the variance of all, their offsets and the test.
+
+    None where there is none, or where so many do that they are no single ones.
+    """
+    statistic, rank, offset = test_landmarks(tests)
+    null = tests.null
+    count, bulk = len(statistic), null.variances.alive[OF_LANDMARKS].any()
+    p = np.asarray(special.chdtrc(np.maximum(rank, 1), statistic))
+    number = 2 * count * tests.effect_count
+    standing_out = found = np.flatnonzero((rank > 0) & (p * number < SIGNIFICANCE))
+    most = _MAX_BESIDE_BULK if bulk else max(3, int(_MAX_SHARE * count))
+    if found.size > most:
+        # A landmark that is far off makes others seem so.
+        found = found[statistic[found] > statistic[found].max() / _OUTWEIGHED_RATIO]
+    if found.size > most:
+        return None
+    if bulk and found.size:
+        p = bulk_p_values(statistic, rank, standing_out)
+        found = found[p[found] * number < SIGNIFICANCE]
+    if not found.size:
+        return None
+    found = found[np.argsort(p[found], kind='stable')]
+    ids = null.random.landmark[found]
+    effect = LandmarkSurveyEffect(tuple(int(i) for i in ids))
+    step = TraceStep(
+        effect.key, float(statistic[found].sum()), int(rank[found].sum()), float(p[found[0]]),
+        float(p[found[0]] * number), np.nan, np.nan, True,
+        'further off than the bulk of landmarks',
+    )
+    return effect, offset[found].ravel(), step
+
+
+def bulk_p_values(statistic: Array, rank: Array, found: Index) -> Array:
+    """Return p-values (L,) beside landmarks whose offsets have tails as long as the others' have.
+
+    An F distribution of the statistics, its median theirs, its denominator's degrees of freedom
+    the likeliest for those that do not stand out: one that is far off is no bulk, and of those
+    that scatter by very different amounts the largest is no single one.  One far beyond them all
+    is in no tail of theirs, and makes others seem off.
+    """
+    one, others = np.maximum(rank, 1), np.setdiff1d(np.flatnonzero(rank > 0), found)
+    if not others.size:
+        return np.asarray(stats.chi2.sf(statistic, one))
+    size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
+    fits = []
+    for freedom in _TAIL_FREEDOMS:
+        scale = max(float(np.median(of / stats.f.median(size, freedom))), 1.0)
+        density = np.asarray(stats.f.logpdf(of / scale, size, freedom))
+        fits.append((float(density.sum() - len(of) * np.log(scale)), scale, freedom))
+    normal, best = fits[-1], max(fits)
+    _, scale, freedom = best if best[0] > normal[0] + _TAIL_GAIN else normal
+    beyond = statistic > _OUTWEIGHED_RATIO * statistic[others].max()
+    freedom_of_each = np.where(beyond, normal[2], freedom)
+    return np.asarray(stats.f.sf(statistic / one / scale, one, freedom_of_each))
+
+
+def test_landmarks(tests: EffectTests) -> tuple[Array, Array, Array]:
+    """Test the offset of every landmark: statistics, ranks (L,) and offsets (L, 3), m.
+
+    Against the variance of the bulk, so scaled that the median landmark is an ordinary one.
+    """
+    null, landmarks = tests.null, tests.null.random.columns.components.of_units
+    lam = null.variances.lam.copy()
+    tiny = initial_variances(null.full, 1e-7).lam
+    lam[landmarks] = np.where(lam < LAMBDA_ABSENT, lam, tiny)[landmarks]
+    eq = null.equations_of(null.included).select(lam < LAMBDA_ABSENT)
+    f = factor_equations(eq, lam, null.variances.weight)
+    solution = solve_equations(f)
+    _, landmark, _ = eq.split(solution.e, solution.r)
+    label = unit_labels(eq)
+    table = np.where(label >= 0, lam[label], LAMBDA_ABSENT)
+    prior = table * null.variances.weight[eq.units, None]
+    precise = np.linalg.inv(unit_covariances(f))
+    pull = (precise @ landmark[..., None])[..., 0]
+    information = precise - prior[:, :, None] * np.eye(3)
+    views = _count_views(null.random.columns.unit, len(null.random.landmark))
+    often = views[eq.units] >= MIN_VIEWS
+    bulk = np.where(null.variances.alive[label], 1 / table, 0.0)
+    statistic, rank, offset = _test_against_bulk(
+        information, pull, bulk, often, null.variances.sigma**2
+    )
+    axes = null.random.axes[eq.units]
+    return statistic, rank, np.einsum('la,lab->lb', offset, axes) * MILLIMETRE
+
+
+def _count_views(unit: Index, landmarks: int) -> Index:
+    """Return in how many frames each landmark (L,) is seen; unit (F, N): that of each point."""
+    views = np.zeros(landmarks, dtype=np.int64)
+    for frame in unit:
+        views[np.unique(frame[frame >= 0])] += 1
+    return views
+
+
+def _test_against_bulk(
+    information: Array, pull: Array, bulk: Array, often: Mask, variance: float
+) -> tuple[Array, Array, Array]:
+    """Return statistics, ranks and least-squares offsets, in the boards' axes, of landmarks."""
+    values, vectors = np.linalg.eigh(information)
+    kept = (values > 1e-4 * values[:, -1:]) & (values > 0) & often[:, None]
+    inverse = np.where(kept, 1 / np.where(kept, values, 1.0), 0.0)
+    least = (vectors * inverse[:, None]) @ np.swapaxes(vectors, -1, -2)
+    offset = (least @ pull[..., None])[..., 0]
+    rank = kept.sum(axis=1)
+
+    def statistic(scale: float) -> Array:
+        spread = least + scale * bulk[:, :, None] * np.eye(3)
+        inside = np.swapaxes(vectors, -1, -2) @ spread @ vectors
+        mask = kept[:, :, None] & kept[:, None, :]
+        inside = np.where(mask, inside, np.eye(3))
+        way = np.where(kept, (np.swapaxes(vectors, -1, -2) @ offset[..., None])[..., 0], 0.0)
+        solved = np.linalg.solve(inside, way[..., None])[..., 0]
+        return np.asarray((way * solved).sum(axis=1) / variance)
+
+    if not bulk.any() or not (rank > 0).any():
+        return statistic(0.0), rank, offset
+    mine = rank > 0
+    typical = special.chdtri(rank[mine], 0.5)
+
+    def off(log_scale: float) -> float:
+        return float(np.median(statistic(np.exp(log_scale))[mine] / typical) - 1)
+
+    low, high = off(0.0), off(7.0)
+    scale = 0.0 if low <= 0 else 7.0 if high >= 0 else optimize.brentq(off, 0.0, 7.0, xtol=0.05)
+    return statistic(np.exp(scale)), rank, offset

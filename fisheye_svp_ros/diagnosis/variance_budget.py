@@ -1,0 +1,271 @@
+"""The variance budget: of so many px^2, how much is lens, target, frame and noise; what remains.
+
+Random components and what has a name, with p-values; then whether residuals still depend on
+anything, without a model of what.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy import special
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
+from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.null_model import NullModel, PlacedEffect
+from fisheye_svp_ros.diagnosis.outliers import Outliers
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import (
+    component_p_values,
+    component_traces,
+    eliminate,
+    factor_equations,
+    no_variances,
+    pseudo_inverse,
+)
+
+REPEATED = 'frame_similar'
+STAGES = ('lens', 'target', 'frame', 'noise')
+_OF_FRAMES = {'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
+              'dot_centroid', 'detector_bias'}
+_OF_STAGE = {'target': 'target', 'noise': 'noise'}
+_VARIABLE_OF = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
+_SIGMA_TOLERANCE = 1.2  # a stated sigma is an estimate, too: of a detector, or of a person
+_MIN_FREEDOM = 200  # numbers beyond the poses' own: of fewer no test of structure says anything
+
+
+class Component(NamedTuple):
+    """One part of the misfit.
+
+    sd_px: of a coordinate; share: of all, named_share: what of it has a name; p_value: of its
+    being there at all.
+    """
+
+    name: str
+    stage: str
+    sd_px: float
+    share: float
+    named_share: float
+    p_value: float
+
+
+def stage_of(effect: str) -> str:
+    """Return the stage of the budget that an effect belongs to."""
+    if effect in _OF_FRAMES:
+        return 'frame'
+    return _OF_STAGE.get(CATALOGUE[effect].stage, 'lens')
+
+
+def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, float]:
+    """Return the mean squared displacement of each cause, px^2, poses and intrinsics taken out.
+
+    What causes do together is shared between them by Shapley's value: the mean, over all orders,
+    of what each adds to those before it.  None is negative, even where two undo each other, and
+    the sum is what all of them do.
+
+    Source: Lindeman, Merenda and Gold, Introduction to Bivariate and Multivariate Analysis (1980),
+    section 4.3.
+    """
+    nothing = no_variances(len(NAMES), len(null.variances.weight))
+    f = factor_equations(
+        null.full.select(nothing.alive), nothing.lam, null.variances.weight)
+    every = np.zeros(null.own)
+    named = [columns for _, columns, _ in causes]
+    for _, columns, values in causes:
+        every[columns] = values * null.scale[columns]
+    rest = np.setdiff1d(null.included, _join_columns(named))
+    remaining = eliminate(f.information, rest)[: null.own, : null.own]
+    signal = remaining @ every
+
+    @cache
+    def explained_square(some: tuple[int, ...]) -> float:
+        mine = _join_columns([named[one] for one in some])
+        inverse, _ = pseudo_inverse(remaining[np.ix_(mine, mine)])
+        return float(signal[mine] @ inverse @ signal[mine])
+
+    px2, count = _px2(null), len(causes)
+    squares = {}
+    for one, (effect, _, _) in enumerate(causes):
+        others = [other for other in range(count) if other != one]
+        added = [np.mean([explained_square(tuple(sorted((*some, one)))) - explained_square(some)
+                          for some in combinations(others, size)]) for size in range(count)]
+        squares[effect.name] = max(float(np.mean(added)), 0.0) * px2
+    return squares
+
+
+def _join_columns(columns: Sequence[Index]) -> Index:
+    return np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+
+
+def _px2(null: NullModel) -> float:
+    """Return the factor from whitened squares to px^2 a point."""
+    weight = null.linear.weight[null.linear.weight > 0]
+    return float(2 / null.full.rows * np.mean(1 / weight**2))
+
+
+def variance_budget(
+    null: NullModel, squares: Mapping[str, float], p_values: Mapping[str, float],
+    repeated: SimilarViews | None = None,
+) -> list[Component]:
+    """Return all parts: what is named, random components, noise.
+
+    squares: of the effects that were found (`cause_squares`); p_values: of effects and of the
+    random components that are there, by name; repeated: what of the noise comes again in similar
+    views.
+    """
+    px2, variances = _px2(null), null.variances
+    traces = component_traces(null.full, variances)
+    parts: list[tuple[str, str, float, bool, float]] = []
+    for stage in STAGES[:3]:
+        there = [name for name in squares if stage_of(name) == stage]
+        if there:
+            size = sum(squares[name] for name in there)
+            parts.append((f'named_{stage}', stage, size, True, min(p_values[n] for n in there)))
+    for name, tau, trace in zip(NAMES, variances.tau, traces, strict=True):
+        if trace > 0:
+            size = float(tau**2 * trace) * px2
+            parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
+    noise = variances.sigma**2 * null.freedom * px2
+    if repeated is not None:
+        parts.append((REPEATED, 'frame', repeated.share * noise, False, repeated.p_value))
+        noise *= 1 - repeated.share
+    parts.append(('noise', 'noise', noise, False, 0.0))
+    total = sum(size for _, _, size, _, _ in parts)
+    return [
+        Component(name, stage, float(np.sqrt(size / 2)), size / total, known * size / total, p)
+        for name, stage, size, known, p in parts
+    ]
+
+
+def component_significance(null: NullModel) -> dict[str, float]:
+    """Return the p-values of the random components that have a variance, by name."""
+    p_values = component_p_values(null.equations_of(null.included), null.variances)
+    return {name: float(p) for name, p, alive in
+            zip(NAMES, p_values, null.variances.alive, strict=True) if alive}
+
+
+def significant_components(components: list[Component]) -> list[Component]:
+    """Return the random components that are there beyond chance."""
+    held = [c for c in components if c.name in (*NAMES, REPEATED)]
+    return [c for c in held if c.p_value * len(NAMES) < SIGNIFICANCE]
+
+
+def stage_shares(components: list[Component]) -> dict[str, tuple[float, float]]:
+    """Return the share of each stage and what of it has a name."""
+    return {
+        stage: (
+            sum(c.share for c in components if c.stage == stage),
+            sum(c.named_share for c in components if c.stage == stage),
+        )
+        for stage in STAGES
+    }
+
+
+def noise_px(null: NullModel) -> float:
+    """Return the standard deviation of the noise of one coordinate, px."""
+    weight = null.linear.weight[null.linear.weight > 0]
+    return float(null.variances.sigma * np.sqrt(np.mean(1 / weight**2)))
+
+
+class Structure(NamedTuple):
+    """One variable that residuals may depend on: the test's p-value (corrected) and its share.
+
+    share: the part of the misfit that goes with it.
+    """
+
+    variable: str
+    p_value: float
+    share: float
+
+
+def remaining_structure(
+    tests: EffectTests, fitted: FittedModel, components: Sequence[Component], known_noise: bool
+) -> list[Structure]:
+    """Return the variables that residuals depend on beyond chance.
+
+    Random components by the variable they live on; smooth fields over others, tested beside the
+    components; the scatter.  known_noise: whether the table states sigma, so that the size itself
+    can be tested.
+    """
+    found: dict[str, Structure] = {}
+    for part in components:
+        name = _VARIABLE_OF[part.name.partition('_')[0]]
+        old = found.get(name, Structure(name, 1.0, 0.0))
+        found[name] = Structure(name, min(old.p_value, part.p_value), old.share + part.share)
+    if tests.null.freedom < _MIN_FREEDOM:
+        return list(found.values())
+    p_values = [*_field_tests(tests), *_scatter_tests(fitted, known_noise)]
+    p_values.append(('image', float(special.ndtr(-fitted.place_correlation())), 0.0))
+    for name, p, share in p_values:
+        corrected = min(1.0, p * len(p_values))
+        if corrected < SIGNIFICANCE and name not in found:
+            found[name] = Structure(name, corrected, share)
+    return list(found.values())
+
+
+def _field_tests(tests: EffectTests) -> Iterator[tuple[str, float, float]]:
+    null = tests.null
+    remaining = eliminate(null.information, null.included)
+    total = float((null.linear.residual**2).sum())
+    for name, columns in null.fixed.fields.items():
+        score = tests.adjust_p_value(tests.score(remaining, columns), null.included, columns)
+        explained = (score.statistic - score.rank) * null.variances.sigma**2
+        yield name, score.p_value, max(explained, 0.0) / total
+
+
+def _scatter_tests(fitted: FittedModel, known_noise: bool) -> Iterator[tuple[str, float, float]]:
+    """Tests of the size of residuals, not of their sign."""
+    linear = fitted.linear
+    e2 = fitted.standardized_squares()
+    used = linear.used
+    # A normal quantile of the heaviest numbers: points in pairs, leverages estimated.
+    largest = float(e2[used].max())
+    p = min(1.0, used.sum() * float(special.chdtrc(1, largest)))
+    yield 'outliers', p, largest / float(e2.sum())
+    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
+    yield 'scatter_vs_theta', _trend_p_value(e2[used], theta[used] ** 2), 0.0
+    labels = np.broadcast_to(np.arange(used.shape[0])[:, None], used.shape)[used]
+    if labels.any():
+        yield 'scatter_vs_frame', _group_p_value(e2[used], labels), 0.0
+    if known_noise:
+        eq = fitted.factored.equations
+        freedom = eq.rows - eq.group_rank - len(fitted.solution.values)
+        squares = fitted.solution.variance * freedom
+        larger = special.chdtrc(freedom, squares / _SIGMA_TOLERANCE**2)
+        smaller = special.chdtr(freedom, squares * _SIGMA_TOLERANCE**2)
+        yield 'size', 2 * float(min(larger, smaller)), 0.0
+
+
+def _trend_p_value(e2: Array, z: Array) -> float:
+    """Koenker's studentised Breusch-Pagan test of e2 against one variable."""
+    centred = e2 - e2.mean(), z - z.mean()
+    spread = float((centred[0] ** 2).sum() * (centred[1] ** 2).sum())
+    r2 = float((centred[0] * centred[1]).sum()) ** 2 / max(spread, 1e-300)
+    return float(special.chdtrc(1, len(e2) * r2))
+
+
+def _group_p_value(e2: Array, labels: Index) -> float:
+    """Koenker's test against group membership."""
+    counts = np.bincount(labels)
+    sums = np.bincount(labels, weights=e2 - e2.mean())
+    explained = float((sums**2 / np.maximum(counts, 1)).sum())
+    statistic = explained / max(float(e2.var()), 1e-300)
+    return float(special.chdtrc(int((counts > 0).sum()) - 1, statistic))
+
+
+def add_outliers(
+    left: list[Structure], outliers: Outliers, observations: int
+) -> list[Structure]:
+    """Return what remains, with outliers that are no mere wrong ids."""
+    far = len(outliers.rows) - outliers.swapped
+    if not far:
+        return left
+    rest = [s for s in left if s.variable != 'outliers']
+    return [*rest, Structure('outliers', 0.0, far / observations)]
