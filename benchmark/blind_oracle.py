@@ -11,7 +11,7 @@ from benchmark.blind_hidden import Hidden
 from benchmark.blind_projection import Nuisance, basis
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.choice import SIGNIFICANCE
+from fisheye_svp_ros.diagnosis import SIGNIFICANCE
 from fisheye_svp_ros.diagnosis.model import Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.evidence import block_basis
 from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows
+from fisheye_svp_ros.mixed_model import group_basis
 
 IDENTIFIABLE = 1e-4  # of a column's norm: what is left less cannot be told from what is free
 
@@ -20,7 +20,7 @@ class Nuisance:
     def __init__(self, linear: Linearised) -> None:
         self.shape = linear.residual.shape
         self.rows = int(linear.used.sum())
-        self._blocks = block_basis(linear.frame_columns)
+        self._blocks = group_basis(linear.frame_columns)
         norms = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
         self._shared = basis(self.outside_blocks(linear.shared_columns), norms)
         blocks = int((np.abs(self._blocks).sum(axis=1) > 0).sum())

@@ -15,10 +15,9 @@ from benchmark.blind_oracle import LinearScene, oracle_finds
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import Needs, Scene, World, draw_scene
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.doubt import confident
-from fisheye_svp_ros.diagnosis.evidence import gather_evidence, swept
+from fisheye_svp_ros.diagnosis import Diagnosis, EffectTests, NullModel, diagnose
 from fisheye_svp_ros.diagnosis.model import intrinsic_names
+from fisheye_svp_ros.mixed_model import eliminate
 
 MODES = ('one', 'clean', 'outside', 'two', 'background')
 _WEAKEST = 0.02  # an effect of which what is free leaves less than this is drawn again
@@ -282,15 +281,14 @@ def _null_p_values(found: Diagnosis, free: bool) -> dict[str, float]:
     """Return the p-value of the simplest form of each effect beside the null model."""
     linear = found.before
     names = intrinsic_names(linear.state.lens) if free else ()
-    evidence = gather_evidence(linear.data, linear.state, names)
-    own = np.arange(evidence.own)
-    left = swept(evidence.information, own)
+    null = NullModel.fit(linear.data, linear.state, names)
+    tests, left = EffectTests(null), eliminate(null.information, null.included)
     values: dict[str, float] = {}
-    for form, effect in enumerate(evidence.forms.effects):
+    for form, effect in enumerate(null.fixed.forms.effects):
         if effect.name in values:
             continue  # the simplest form stands first
-        columns = evidence.columns_of(form)
-        result = confident(evidence, evidence.score(left, columns), own, columns)
+        columns = null.form_columns(form)
+        result = tests.adjust_p_value(tests.score(left, columns), null.included, columns)
         wrong = [
             value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
             if parameter.positive

@@ -25,15 +25,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.adjustment import fit_poses, start_poses
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.lens_errors import (
+from fisheye_svp_ros.diagnosis import (
+    Diagnosis,
+    ErrorParts,
     LensErrors,
     depth_errors,
+    diagnose,
     localize_with_errors,
+    pose_maps,
 )
+from fisheye_svp_ros.diagnosis.adjustment import fit_poses, start_poses
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
-from fisheye_svp_ros.diagnosis.uncertainty import ErrorParts, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations

@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import Points, find_points
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import replacing, write_text
 from fisheye_svp_ros.optics.camera import project
@@ -184,7 +183,7 @@ def judged(guide: Guide, lens: Lens) -> dict[str, Any]:
     table = observations_of(guide.session.taken, guide.session.points)
     fitted = calibrate(table, 'kannala_brandt', SIZE).adjusted.lens
     found = diagnose(table, fitted)
-    bare = diagnose(table, fitted, wanted=Wanted(left_out=('flat_port',)))
+    bare = diagnose(table, fitted, options=DiagnosisOptions(left_out=('flat_port',)))
     e0 = [c.parameters['e0'] for c in bare.causes if c.effect == 'viewpoint_shift']
     true = lens.viewpoint_shift.e0
     return {

@@ -25,8 +25,7 @@ import numpy as np
 
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
@@ -108,7 +107,8 @@ def trial(number: int) -> dict[str, Any]:
     table, shift, bend = photographed(number)
     lens = calibrate(table, 'kannala_brandt', SIZE).adjusted.lens
     found = diagnose(table, lens).to_dict()
-    asked = diagnose(table, lens, wanted=Wanted(included=('viewpoint_shift',))).to_dict()
+    options = DiagnosisOptions(included=('viewpoint_shift',))
+    asked = diagnose(table, lens, options=options).to_dict()
     e0 = next(c for c in asked['causes'] if c['effect'] == 'viewpoint_shift')['parameters']['e0']
     return {
         'number': number, 'e0_mm': 1e3 * shift, 'bend_mm': 1e3 * bend, 'points': len(table),

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect

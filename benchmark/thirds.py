@@ -22,8 +22,7 @@ import numpy as np
 
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.wanted import Wanted, can_be_taken_in
+from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, can_be_included, diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.scene.observations import Observations
@@ -46,13 +45,13 @@ class Part(NamedTuple):
 def diagnosed(table: Observations, size: tuple[int, int], causes: tuple[str, ...]) -> Diagnosis:
     """Calibrate and diagnose a table, some causes taken in without a test."""
     lens = calibrate(table, 'kannala_brandt', size).adjusted.lens
-    return diagnose(table, lens, wanted=Wanted(included=causes))
+    return diagnose(table, lens, options=DiagnosisOptions(included=causes))
 
 
 def named(path: Path, size: tuple[int, int]) -> tuple[str, ...]:
     """Return the causes of a whole set that can be taken in without a test."""
     found = diagnosed(read_observations(path), size, (SHIFT,)).causes
-    return tuple(cause.effect for cause in found if can_be_taken_in(cause.effect))
+    return tuple(cause.effect for cause in found if can_be_included(cause.effect))
 
 
 def estimates(part: Part) -> Array:

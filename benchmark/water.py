@@ -23,12 +23,12 @@ import numpy as np
 
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.calibration import (
-    calibrated_without_gross_errors,
-    trust,
-    with_stderr,
+from fisheye_svp_ros.diagnosis import (
+    assess_lens,
+    calibrate_without_outliers,
+    diagnose,
+    with_covariance,
 )
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
@@ -169,10 +169,10 @@ def _calibrated(lens: Lens, rng: np.random.Generator, free: bool, rough: bool) -
 
 def _calibrated_in_air(table: Observations, size: tuple[int, int]) -> Lens:
     """Return the lens file that `calibrate` writes of photographs in air."""
-    result, kept, _ = calibrated_without_gross_errors(
+    result, kept, _ = calibrate_without_outliers(
         table, lambda rows: calibrate(rows, 'kannala_brandt', size))
     found = result.adjusted
-    return with_stderr(found.lens, trust(kept, found.lens, found.names))
+    return with_covariance(found.lens, assess_lens(kept, found.lens, found.names))
 
 
 def _central(lens: Lens, points: Array) -> Array:

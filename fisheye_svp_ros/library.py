@@ -260,7 +260,7 @@ def localize(
     """
     table, known = _table(observations), load_lens(lens)
     if model_error:
-        from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
+        from fisheye_svp_ros.diagnosis import LensErrors, localize_with_errors
 
         measured, _ = localize_with_errors(LensErrors.of(known), table)
     else:
@@ -284,16 +284,20 @@ def calibrate(
     Gross errors are set aside, and standard errors are honest, as those of the command.
     progress: called with each stage and the share that is done.
     """
-    from fisheye_svp_ros.diagnosis import calibration
+    from fisheye_svp_ros.diagnosis import (
+        assess_lens,
+        calibrate_without_outliers,
+        with_covariance,
+    )
 
     progress('fitting the lens', 0.0)
-    found, kept, _ = calibration.calibrated_without_gross_errors(
+    found, kept, _ = calibrate_without_outliers(
         _table(observations),
         lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
     adjusted = found.adjusted
     progress('estimating standard errors', 0.3)
-    trusted = calibration.trust(kept, adjusted.lens, adjusted.names)
-    return Calibrated(calibration.with_stderr(adjusted.lens, trusted), tuple(adjusted.names),
+    trusted = assess_lens(kept, adjusted.lens, adjusted.names)
+    return Calibrated(with_covariance(adjusted.lens, trusted), tuple(adjusted.names),
                       trusted.covariance, found.sigma, found.left_out, bool(adjusted.converged))
 
 
@@ -336,7 +340,7 @@ def stereo_depth(
     frame = np.broadcast_to(one.frame[:, None], both.shape)
     covariance = None
     if model_error:
-        from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, depth_errors
+        from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
 
         errors = [LensErrors.of(load_lens(lens)) for lens in (left, right)]
         covariance = depth_errors(errors[0], errors[1], rig, solved.points).total
@@ -383,12 +387,12 @@ def diagnose(
     progress: called with each stage and the share that is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
-    from fisheye_svp_ros.diagnosis.diagnosis import diagnose as find_causes
-    from fisheye_svp_ros.diagnosis.inputs import posable
+    from fisheye_svp_ros.diagnosis import diagnose as find_causes
+    from fisheye_svp_ros.diagnosis import posable_observations
 
     known = load_lens(lens)
-    table, _ = posable(_table(observations), known)
-    test = None if held_out is None else posable(_table(held_out), known)[0]
+    table, _ = posable_observations(_table(observations), known)
+    test = None if held_out is None else posable_observations(_table(held_out), known)[0]
     found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
                         progress=progress)
     return Diagnosed(found.verdict, found.to_dict(), found.lens)

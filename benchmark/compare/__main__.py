@@ -32,12 +32,15 @@ from benchmark.compare.sets import (  # noqa: E402
     table_set,
 )
 from fisheye_svp_ros.arrays import Array, Mask  # noqa: E402
+from fisheye_svp_ros.diagnosis import (  # noqa: E402
+    Diagnosis,
+    PredictedOffsets,
+    diagnose,
+    posable_observations,
+    predict_other_data,
+)
 from fisheye_svp_ros.diagnosis.adjustment import start_poses  # noqa: E402
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose  # noqa: E402
-from fisheye_svp_ros.diagnosis.inputs import posable  # noqa: E402
 from fisheye_svp_ros.diagnosis.model import prepare  # noqa: E402
-from fisheye_svp_ros.diagnosis.prediction import on_other_data  # noqa: E402
-from fisheye_svp_ros.diagnosis.refit import Local  # noqa: E402
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
 from fisheye_svp_ros.library import Localized  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
@@ -90,8 +93,8 @@ def compared(data: Set) -> list[Row]:
     """Return the rows of a set."""
     with timed() as fitting:
         lens = fsvp.calibrate(data.train, 'kannala_brandt', data.size).lens
-    data = replace(data, test=posable(data.test, lens)[0])
-    train, _ = posable(data.train, lens)
+    data = replace(data, test=posable_observations(data.test, lens)[0])
+    train, _ = posable_observations(data.train, lens)
     with timed() as naming:
         found = diagnose(train, lens, held_out=data.test)
     gross = {(row['frame'], row['landmark']) for row in found.gross
@@ -108,7 +111,7 @@ def compared(data: Set) -> list[Row]:
         Row('ours, `diagnose`: named', found.named.heldout_rms_px, _whole(found, data.test),
             count, np.nan, ours=True),
         Row('ours, `diagnose`: extended', found.extended.heldout_rms_px,
-            _whole(found, data.test, found.local), count, np.nan, ours=True),
+            _whole(found, data.test, found.offsets), count, np.nan, ours=True),
         *(_row(name, data, fair, start, lens.fx) for name in PEERS),
     ]
 
@@ -118,12 +121,12 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
                          test.uv, start.pose))
 
 
-def _whole(found: Diagnosis, test: Observations, local: Local | None = None) -> float:
+def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
     """Return the rms of all held-out points, gross errors among them."""
     data, known = prepare(test), found.after.data.observations.t
     terms = tuple(e for e in found.after.state.terms if e[0].holds_for(test.t, known))
     solved = start_poses(data, replace(found.after.state, terms=terms))
-    return on_other_data(data, solved, local).rms
+    return predict_other_data(data, solved, local).rms
 
 
 def _row(name: str, data: Set, fair: Mask, start: Localized, focal: float) -> Row:

@@ -12,9 +12,8 @@ from benchmark.speed.engines import use
 from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
+from fisheye_svp_ros.diagnosis import NullModel, diagnose
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.evidence import gather_evidence
 from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -102,7 +101,7 @@ def _evidence(count: int) -> Callable[[], Any]:
     data = prepare(_seen(30))
     state = fit(data, start(data, shift_lens().svp()), ())
     left_out = list(CATALOGUE)[count:]
-    return lambda: gather_evidence(data, state, (), left_out=left_out)
+    return lambda: NullModel.fit(data, state, (), left_out=left_out)
 
 
 def _diagnosis(count: int) -> Callable[[], Any]:

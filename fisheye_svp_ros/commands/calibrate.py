@@ -120,11 +120,7 @@ def _calibrated(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
-    from fisheye_svp_ros.diagnosis.calibration import (
-        calibrated_without_gross_errors,
-        trust,
-        with_stderr,
-    )
+    from fisheye_svp_ros.diagnosis import assess_lens, calibrate_without_outliers, with_covariance
 
     port = port_of(args)
     note_huge(table)
@@ -136,15 +132,15 @@ def _calibrated(
         return calibrate(rows, args.model, size, args.free, name, port)
 
     with progress('calibrating'):
-        result, kept, gross = calibrated_without_gross_errors(table, fitted)
+        result, kept, gross = calibrate_without_outliers(table, fitted)
     note_gross_errors(table, gross)
     try:
         with stages('how far it may be trusted'):
-            trusted = trust(kept, result.adjusted.lens, result.adjusted.names)
+            trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
         raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
                             f'({cause}); is what the camera looked through another?') from cause
-    lens = with_stderr(result.adjusted.lens, trusted)
+    lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model)
 
 
@@ -158,7 +154,7 @@ def _rig(
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
-    from fisheye_svp_ros.diagnosis.moments import FEWEST, LOOSE
+    from fisheye_svp_ros.diagnosis import MAX_RIG_RATIO, MIN_SHARED_FRAMES
 
     left, right = (ForwardModel(lenses[name]) for name in names)
     try:
@@ -173,10 +169,10 @@ def _rig(
     frames, rms = len(both.frames), rms_px(np.concatenate(
         [residual.reshape(-1, 2) for residual in (fitted.left_residual, fitted.right_residual)]))
     own = max((lenses[name].calibration or {})['rms_px'] for name in names)
-    if rms > LOOSE * own:
+    if rms > MAX_RIG_RATIO * own:
         say(f'rig: with it {rms:.2f} px are left, where the cameras alone leave {own:.2f} px at '
             'most: they moved, were not photographed at the same moments, or a lens is wrong')
-    if frames < FEWEST:
+    if frames < MIN_SHARED_FRAMES:
         say(f'rig: {frames} of the frames alone show it; photograph the target with both cameras '
             'at once more often')
     place = 1000 * fitted.rig.position[0]
@@ -191,11 +187,9 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
 
     Raises ObservationError where there is no such frame, or no rig explains most of them.
     """
+    from fisheye_svp_ros.diagnosis import FRAME, find_outliers, is_unrelated, posable_observations
     from fisheye_svp_ros.diagnosis.adjustment import start
-    from fisheye_svp_ros.diagnosis.inputs import posable
     from fisheye_svp_ros.diagnosis.model import prepare
-    from fisheye_svp_ros.diagnosis.moments import unrelated
-    from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
 
     def shared(table: Observations) -> Observations:
         one, other = (table.frame[table.camera == camera] for camera in (0, 1))
@@ -204,18 +198,18 @@ def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observation
     first, second = map(observations.cameras.index, lenses)
     pair = observations.take(np.isin(observations.camera, (first, second)))
     pair = replace(pair, cameras=tuple(lenses), camera=(pair.camera == second).astype(np.int64))
-    both = shared(posable(pair, lenses)[0])
+    both = shared(posable_observations(pair, lenses)[0])
     if not len(both):
         raise ObservationError(f'{observations.source}: no frame was seen by both cameras; '
                                'photographs of one moment must have one frame number')
     data, (left, right) = prepare(both), lenses.values()
     state = start(data, left, [right])
-    if unrelated(data, state):
+    if is_unrelated(data, state):
         raise ObservationError(
             f'{observations.source}: none explains where {" and ".join(lenses)} stand in most '
             'frames; photographs of one moment must have one frame number, others different ones, '
             'and points be numbered from the same end')
-    _, gross = find_gross_errors(data, state)
+    _, gross = find_outliers(data, state)
     torn = sorted({int(both.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
                    if why == FRAME})
     if torn:

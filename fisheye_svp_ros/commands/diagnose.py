@@ -29,9 +29,7 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-    from fisheye_svp_ros.diagnosis.known_truth import Compared
-    from fisheye_svp_ros.diagnosis.points import PointResiduals
+    from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, PointResiduals
     from fisheye_svp_ros.planning.plan import NextViews
 
 
@@ -72,11 +70,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
-    from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-    from fisheye_svp_ros.diagnosis.inputs import free_names, poses_by_frame, rig_lenses
-    from fisheye_svp_ros.diagnosis.known_truth import known_errors
-    from fisheye_svp_ros.diagnosis.two_sets import diagnose_against
-    from fisheye_svp_ros.diagnosis.wanted import Wanted
+    from fisheye_svp_ros.diagnosis import (
+        DiagnosisOptions,
+        diagnose,
+        diagnose_against,
+        free_parameters,
+        known_errors,
+        poses_by_frame,
+        rig_lenses,
+    )
     from fisheye_svp_ros.reporting.progress import stages
 
     if (args.number or args.room) and not args.count:
@@ -87,7 +89,7 @@ def run(args: argparse.Namespace) -> None:
     free = True if args.free == 'intrinsics' else None
     observations, lens = _read(args.observations, args, given)
     held_out = _read(args.held_out, args, given)[0] if args.held_out else None
-    names = free_names(rig_lenses(observations, lens), free)
+    names = free_parameters(rig_lenses(observations, lens), free)
     poses = None
     if args.poses:
         poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
@@ -95,7 +97,7 @@ def run(args: argparse.Namespace) -> None:
     with stages('diagnosing') as progress:
         settings: dict[str, Any] = {
             'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
-            'wanted': Wanted(tuple(args.included), tuple(args.left_out), args.quick),
+            'options': DiagnosisOptions(tuple(args.included), tuple(args.left_out), args.quick),
             'progress': progress,
         }
         try:
@@ -141,7 +143,7 @@ def _read(
     path: str, args: argparse.Namespace, given: Lenses
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
-    from fisheye_svp_ros.diagnosis.inputs import posable, without_copies
+    from fisheye_svp_ros.diagnosis import posable_observations, remove_copies
 
     table, sizes = measured(path, args)
     note_huge(table)
@@ -152,15 +154,15 @@ def _read(
     check_sizes(path, sizes, lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
     lens = given[''] if one else lenses
-    observations, left_out = posable(table, lens)
+    observations, left_out = posable_observations(table, lens)
     note_left_out(table, left_out)
-    observations, again = without_copies(observations)
+    observations, again = remove_copies(observations)
     note_copies(table, again)
     return observations, lens
 
 
 def _print(
-    diagnosis: Diagnosis, known: Mapping[str, Compared], folder: Path | None,
+    diagnosis: Diagnosis, known: Mapping[str, Comparison], folder: Path | None,
     wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.reporting import diagnosis_text as text
@@ -195,15 +197,15 @@ def _print(
 
 
 def _write(
-    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Compared], free: bool,
+    args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Comparison], free: bool,
     wanted: NextViews | None,
 ) -> None:
-    from fisheye_svp_ros.diagnosis.points import point_residuals
+    from fisheye_svp_ros.diagnosis import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
 
     folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
-    truth = {name: compared._asdict() for name, compared in known.items()}
+    truth = {name: compared.to_dict() for name, compared in known.items()}
     document = {**diagnosis.to_dict(), 'known_truth': truth}
     if wanted:
         document['next'] = wanted.to_list()

@@ -50,8 +50,11 @@ def run(args: argparse.Namespace) -> None:
         table = observations.take(observations.camera == camera)
         with progress('localizing'):
             if args.model_error:
-                from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, localize_with_errors
-                from fisheye_svp_ros.diagnosis.uncertainty import pose_summary
+                from fisheye_svp_ros.diagnosis import (
+                    LensErrors,
+                    localize_with_errors,
+                    pose_summary,
+                )
 
                 measured, parts = localize_with_errors(LensErrors.of(lens), table)
                 uncertainty = pose_summary(parts)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.scene.photograph_names import frame_name, list_frames
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.noise import Gross
+    from fisheye_svp_ros.diagnosis import Outliers
     from fisheye_svp_ros.scene.observations import Observations
 
 _ALIKE = 3  # frames whose reasons differ by numbers alone; of more the first speaks for all
@@ -53,7 +53,7 @@ def note_huge(table: Observations) -> None:
         say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
 
 
-def note_gross_errors(table: Observations, gross: Gross) -> None:
+def note_gross_errors(table: Observations, gross: Outliers) -> None:
     """Say how many rows of a table are set aside, and which are furthest off."""
     if len(gross.rows):
         worst = ', '.join(

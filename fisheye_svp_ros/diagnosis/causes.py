@@ -19,7 +19,7 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_entry
 
 # An effect is confounded with another unless, with it in the model, the other is still needed.
-_CONFOUNDED_P = 0.002
+CONFOUNDED_P = 0.002
 _CONFOUNDED_SHARE = 0.3  # of the statistic, that the other explains by itself
 
 
@@ -92,7 +92,7 @@ def _confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[s
             continue
         both = np.concatenate([rest, tests.null.form_columns(other.form)])
         own = tests.score_beside(both, columns)
-        if own.p_value > _CONFOUNDED_P:
+        if own.p_value > CONFOUNDED_P:
             same.append(other.effect.name)
     return same
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +32,7 @@ from fisheye_svp_ros.diagnosis.problem import (
     dither,
     has_no_rig,
 )
-from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
+from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.stepwise import TraceStep
 from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors
 from fisheye_svp_ros.diagnosis.variance_budget import (
@@ -53,29 +52,49 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 
 
-class CrossChecks(NamedTuple):
-    """What other cameras and another data set say: of each two cameras, and of the other set."""
+class Figures(NamedTuple):
+    """How well each model describes the data: rms of the fit and held out.
 
-    cameras: tuple[TwoCameras, ...] = ()
-    datasets: TwoDatasets | None = None
+    base: the simulation as it was fitted; named: all causes, without random effects; lens_only:
+    what moves with the lens; extended: causes and predicted random effects; gain: of the last
+    over the first, on held-out data.
+    """
+
+    base: FitQuality
+    named: FitQuality
+    lens_only: FitQuality
+    extended: FitQuality
+    gain: Comparison
+
+
+class Record(NamedTuple):
+    """What else was tried: steps, what could not be tested and why, outliers, cross-checks.
+
+    cameras: what each two cameras of a rig say of each other; against: what another data set says.
+    """
+
+    trace: list[TraceStep]
+    untestable: dict[str, str]
+    gross: list[dict[str, Any]]
+    cameras: list[TwoCameras]
+    against: TwoDatasets | None = None
 
 
 @dataclass(frozen=True)
 class Diagnosis:
     """The answer: what was found, what remains, and the lenses with it.
 
-    causes: confirmed, those in the noise last; errors: of poses and image points by the extended
-    lenses.
+    causes: confirmed, those in the noise last.
     """
 
     evaluation: Evaluation
+    figures: Figures
     components: list[Component]
     causes: list[Cause]
     remaining: list[Structure]
     advice: list[Advice]
-    errors: ModelErrors
     lenses: dict[str, Lens]
-    checks: CrossChecks
+    record: Record
 
     @property
     def problem(self) -> Problem:
@@ -107,27 +126,27 @@ class Diagnosis:
     @property
     def base(self) -> FitQuality:
         """The simulation as it was fitted."""
-        return self.evaluation.base
+        return self.figures.base
 
     @property
     def named(self) -> FitQuality:
         """All causes, without random effects."""
-        return self.evaluation.named
+        return self.figures.named
 
     @property
     def lens_only(self) -> FitQuality:
         """Only what moves with the lens."""
-        return self.evaluation.lens_only
+        return self.figures.lens_only
 
     @property
     def extended(self) -> FitQuality:
         """Causes and predicted random effects."""
-        return self.evaluation.extended
+        return self.figures.extended
 
     @property
     def gain(self) -> Comparison:
         """Of the best prediction over the simulation, held out."""
-        return self.evaluation.gain
+        return self.figures.gain
 
     @property
     def intrinsics(self) -> dict[str, Intrinsic]:
@@ -142,22 +161,17 @@ class Diagnosis:
     @property
     def trace(self) -> list[TraceStep]:
         """What was tried, and what came of it."""
-        return list(self.evaluation.selection.trace)
+        return self.record.trace
 
     @property
     def untestable(self) -> dict[str, str]:
         """Effects that the data cannot test, and why."""
-        return EffectTests(self.evaluation.selection.first).untestable
+        return self.record.untestable
 
-    @cached_property
+    @property
     def gross(self) -> list[dict[str, Any]]:
         """Outliers by frame and landmark, the farthest first."""
-        rows = outlier_rows(
-            self.problem.observations, self.evaluation.selection.revision.outliers)
-        table, test = self.problem.inputs.held_out, self.evaluation.held_out
-        if table is not None and test is not None:
-            rows += outlier_rows(table, test.outliers, 'held out: ')
-        return rows
+        return self.record.gross
 
     @property
     def before(self) -> Linearised:
@@ -169,20 +183,25 @@ class Diagnosis:
         """The extended model, for whoever draws it."""
         return self.evaluation.null.linear
 
-    @cached_property
-    def uncertainty(self) -> dict[str, dict[str, float]]:
-        """How far off poses and image points are by the extended lenses: a summary."""
-        return self.errors.summary(self.after)
+    @property
+    def errors(self) -> ModelErrors:
+        """What is known of the errors of the extended model."""
+        return self.evaluation.model_errors
 
     @property
-    def cameras(self) -> tuple[TwoCameras, ...]:
+    def uncertainty(self) -> dict[str, dict[str, float]]:
+        """How far off poses and image points are by the extended lenses: a summary."""
+        return self.evaluation.uncertainty
+
+    @property
+    def cameras(self) -> list[TwoCameras]:
         """What each two cameras of a rig say of each other."""
-        return self.checks.cameras
+        return self.record.cameras
 
     @property
     def against(self) -> TwoDatasets | None:
         """What another data set of the camera says."""
-        return self.checks.datasets
+        return self.record.against
 
     @property
     def lens(self) -> Lens:
@@ -306,7 +325,7 @@ def diagnose_against(
         found = diagnose_one(observations, options.without(*gone), 0.7, 0.85,
                              'without what the other set refutes: ', **settings)
         datasets = replace(datasets, withdrawn=gone)
-    return replace(found, checks=found.checks._replace(datasets=datasets))
+    return replace(found, record=found.record._replace(against=datasets))
 
 
 def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
@@ -324,34 +343,47 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     selection, cameras = agree_on_target(selection, progress)
     progress('measuring the gain on held-out data', 0.8)
     evaluation = Evaluation.of(selection, FittedModel.of(selection.null), medium)
-    return _conclude(evaluation, CrossChecks(tuple(cameras)))
+    return _conclude(evaluation, cameras)
 
 
-def _conclude(evaluation: Evaluation, checks: CrossChecks) -> Diagnosis:
+def _conclude(evaluation: Evaluation, cameras: list[TwoCameras]) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
-    selection, null = evaluation.selection, evaluation.null
+    selection, linear = evaluation.selection, evaluation.null.linear
     problem, observations = selection.problem, selection.problem.observations
     noise_causes = growth_cause(selection.revision.growth)
     noise_causes += table_causes(observations, selection.revision.outliers, problem.step)
     components = evaluation.components({c.effect: c.p_value for c in noise_causes})
     causes = evaluation.causes(components) + noise_causes
     significant = significant_components(components)
-    errors = ModelErrors.of(null, evaluation.fitted)
-    misfit = errors.summary(null.linear)['image_px']['misfit']
     lenses = with_uncertainty(
-        errors, null.linear, evaluation.noise_px, misfit,
+        evaluation.model_errors, linear, evaluation.noise_px,
+        evaluation.uncertainty['image_px']['misfit'],
         lambda state: extended_lenses(problem.inputs.lenses, state, observations))
-    remaining = _remaining(selection, evaluation, noise_causes, significant)
     return Diagnosis(
-        evaluation, components, causes, remaining, advise(evaluation, causes, significant), errors,
-        lenses, checks)
+        evaluation,
+        Figures(evaluation.base, evaluation.named, evaluation.lens_only, evaluation.extended,
+                evaluation.gain),
+        components, causes, _remaining(evaluation, noise_causes, significant),
+        advise(evaluation, causes, significant), lenses,
+        Record(list(selection.trace), EffectTests(selection.first).untestable,
+               _outliers(evaluation), cameras))
+
+
+def _outliers(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Return the outliers of the data and of held-out data, as diagnosis.json has them."""
+    selection = evaluation.selection
+    rows = outlier_rows(selection.problem.observations, selection.revision.outliers)
+    table, test = selection.problem.inputs.held_out, evaluation.held_out
+    if table is not None and test is not None:
+        rows += outlier_rows(table, test.outliers, 'held out: ')
+    return rows
 
 
 def _remaining(
-    selection: Selection, evaluation: Evaluation, noise_causes: Sequence[Cause],
-    components: Sequence[Component],
+    evaluation: Evaluation, noise_causes: Sequence[Cause], components: Sequence[Component]
 ) -> list[Structure]:
     """Return what residuals still depend on."""
+    selection = evaluation.selection
     observations = selection.problem.observations
     # The weights are relative where the noise itself is a cause: sigma is no longer tested.
     stated = bool(np.isfinite(observations.sigma).all()) and not noise_causes

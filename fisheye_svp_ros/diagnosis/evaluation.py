@@ -38,7 +38,7 @@ from fisheye_svp_ros.diagnosis.problem import (
     unpair_cameras,
 )
 from fisheye_svp_ros.diagnosis.selection import Selection
-from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors, standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     cause_squares,
@@ -160,6 +160,16 @@ class Evaluation:
     def names(self) -> list[str]:
         """The names of the causes that move predictions."""
         return [effect.name for effect, _, _ in self.selection.causes]
+
+    @cached_property
+    def model_errors(self) -> ModelErrors:
+        """What is known of the errors of the extended model."""
+        return ModelErrors.of(self.null, self.fitted)
+
+    @cached_property
+    def uncertainty(self) -> dict[str, dict[str, float]]:
+        """How far off poses and image points are by the extended model: a summary."""
+        return self.model_errors.summary(self.null.linear)
 
     @cached_property
     def errors(self) -> Array:

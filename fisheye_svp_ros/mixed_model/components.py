@@ -157,13 +157,13 @@ def _step_without(eq: Equations, now: Variances, whole: _Whole, kind: int) -> Va
 
 
 def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Array:
-    """Return p-values (K,) of variances at zero, 1 for those not asked and those not testable.
+    """Return p-values (K,) of variances at zero, NaN for those not asked or not testable.
 
     The sum of squares of the columns' products with the residual (Rao's score, 1948) against a
     gamma distribution of the same mean and variance.  Source: Lin, Variance component testing in
     generalised linear models with random effects, Biometrika 84 (1997).
     """
-    p_values, kinds = np.ones(eq.components.count), list(kinds)
+    p_values, kinds = np.full(eq.components.count, np.nan), list(kinds)
     if not kinds:
         return p_values
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)

@@ -27,7 +27,7 @@ from fisheye_svp_ros.study.settings import LocalizerSettings
 from fisheye_svp_ros.study.solutions import Solved, localized, residual_points
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+    from fisheye_svp_ros.diagnosis import LensErrors
 
 _AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
 _NEAR = 0.1  # rad, and of the distance of the nearest landmark
@@ -123,7 +123,7 @@ class Localizer(SolverNode):
 
 def _errors_of(lens: Lens) -> LensErrors:
     # Nothing else here needs what that imports, and a node is to start at once.
-    from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+    from fisheye_svp_ros.diagnosis import LensErrors
 
     return LensErrors.of(lens)
 

@@ -16,8 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose
-from fisheye_svp_ros.diagnosis.inputs import posable
+from fisheye_svp_ros.diagnosis import Diagnosis, diagnose, posable_observations
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -209,7 +208,7 @@ class ModelCritic(SolverNode):
 
 def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
     """Diagnose the frames that can be posed; raise FisheyeSvpError where none can."""
-    usable, _ = posable(table, lens)
+    usable, _ = posable_observations(table, lens)
     return diagnose(usable, lens, free_intrinsics=free_intrinsics)
 
 

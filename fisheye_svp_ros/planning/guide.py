@@ -16,11 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, posable_observations
 from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.inputs import posable
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -111,7 +109,7 @@ def _evaluate(session: Session) -> SessionState:
     session = replace(session, latest=(lens, float(shift[0])))
     if len(session.taken) >= _MIN_DIAGNOSED:
         with suppress(FisheyeSvpError):  # the next photograph may mend it
-            return _diagnose_session(session, posable(table, lens)[0], lens)
+            return _diagnose_session(session, posable_observations(table, lens)[0], lens)
     wanted = next_photographs(linear, (), _noise(linear), _VIEWS_AHEAD, number, room)
     return _session_state(
         session, _model(linear), wanted, _value(linear, number), wanted.answers[0])
@@ -135,7 +133,8 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
                           alike=names[1:])
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
-        found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(left_out=alike))
+        found = diagnose(
+            table, lens, free_intrinsics=True, options=DiagnosisOptions(left_out=alike))
         break
     wanted = next_photographs(
         found.after, found.causes, found.noise_px, _VIEWS_AHEAD, number, room)

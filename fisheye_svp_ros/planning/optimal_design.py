@@ -19,13 +19,13 @@ from scipy import special
 from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.choice import CLASS_SIGNIFICANCE
-from fisheye_svp_ros.diagnosis.evidence import block_basis
+from fisheye_svp_ros.diagnosis import CONFOUNDED_P
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.mixed_model import group_basis
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.boards import spacing
@@ -168,7 +168,7 @@ class Criterion:
         if self.value is None:
             return float(np.exp(-merit / 2))
         rank = len(self.interest)
-        return float(1 - special.chndtr(special.chdtri(rank, CLASS_SIGNIFICANCE), rank, merit))
+        return float(1 - special.chndtr(special.chdtri(rank, CONFOUNDED_P), rank, merit))
 
 
 class Design:
@@ -369,7 +369,7 @@ def information(linear: Linearised, effects: Sequence[Effect]) -> Array:
     """Return what each frame tells of all that is shared (F, K, K), its pose taken out."""
     columns = np.concatenate(
         [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1)
-    basis = block_basis(linear.frame_columns)
+    basis = group_basis(linear.frame_columns)
     clean = columns - basis @ (np.swapaxes(basis, -1, -2) @ columns)
     return np.asarray(np.swapaxes(clean, -1, -2) @ clean)
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis import Cause
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE

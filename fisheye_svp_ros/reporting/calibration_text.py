@@ -14,7 +14,7 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import list_frames
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis.calibration import Trust
+    from fisheye_svp_ros.diagnosis import LensTrust
     from fisheye_svp_ros.solve.lens_calibration import Calibration
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
@@ -29,7 +29,7 @@ class CalibratedCamera:
 
     lens: Lens
     result: Calibration
-    trust: Trust
+    trust: LensTrust
     table: Observations
     model: str
 

@@ -8,14 +8,17 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fisheye_svp_ros.diagnosis.budget import stage_shares
-from fisheye_svp_ros.diagnosis.choice import NAMED, TraceStep
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-from fisheye_svp_ros.diagnosis.known_truth import Compared
-from fisheye_svp_ros.diagnosis.points import PointResiduals
-from fisheye_svp_ros.diagnosis.target_map import BoardMap, board_maps
+from fisheye_svp_ros.diagnosis import (
+    NAMED_P,
+    Comparison,
+    Diagnosis,
+    PointResiduals,
+    TraceStep,
+    stage_shares,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting import diagnosis_text as text
@@ -67,7 +70,7 @@ class Inputs(NamedTuple):
 
 
 def write_report(
-    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Compared], inputs: Inputs,
+    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Comparison], inputs: Inputs,
     wanted: NextViews | None = None,
 ) -> list[Path]:
     """Write report.html and its pictures into a folder; return the files.
@@ -84,7 +87,7 @@ def write_report(
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
     write_text(report, page(
-        'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED,
+        'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED_P,
         headline=headline(diagnosis),
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
@@ -141,7 +144,7 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
         shown += [(f'{name} alone', (name,)) for name in mapped
                   if CATALOGUE[name].target_map == 'smooth']
     for title, names in shown:
-        yield from ((title, m) for m in board_maps(diagnosis.after, names) if m.spread_out)
+        yield from ((title, m) for m in diagnosis.board_maps(names) if m.spread_out)
 
 
 def _free(inputs: Inputs) -> str:

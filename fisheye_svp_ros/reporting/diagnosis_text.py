@@ -8,11 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, Advice
-from fisheye_svp_ros.diagnosis.causes import Cause
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-from fisheye_svp_ros.diagnosis.known_truth import Compared
-from fisheye_svp_ros.diagnosis.target_map import board_maps
+from fisheye_svp_ros.diagnosis import DIAGNOSE_AIR, Advice, Cause, Comparison, Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.headline import only_gross
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
@@ -94,7 +90,7 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     """Return how large a cause is: its parameters, or what many of them amount to."""
     shown = CATALOGUE[cause.effect].target_map
     if shown == 'smooth':
-        maps = board_maps(diagnosis.after, (cause.effect,))
+        maps = diagnosis.board_maps((cause.effect,))
         return '; '.join(
             (f'board {m.board}: ' if len(maps) > 1 else '')
             + f'{1e3 * m.peak_to_valley:.2f} mm from the lowest to the highest place'
@@ -118,7 +114,7 @@ def _landmarks(diagnosis: Diagnosis, cause: Cause) -> str:
         values = np.array([entry['value'] for entry in cause.parameters.values()]).reshape(-1, 3)
         far = 1e3 * np.linalg.norm(values, axis=1)
         return ', '.join(f'landmark {n} by {d:.2f} mm' for n, d in zip(names, far, strict=True))
-    maps = board_maps(diagnosis.after, (cause.effect,))
+    maps = diagnosis.board_maps((cause.effect,))
     squares = np.concatenate([m.height**2 + (m.slide**2).sum(axis=1) for m in maps])
     return f'{len(names)} landmarks by {1e3 * np.sqrt(squares.mean()):.2f} mm rms'
 
@@ -164,11 +160,11 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
 
 
 def verdict_sentences(
-    diagnosis: Diagnosis, known: Mapping[str, Compared] | None = None
+    diagnosis: Diagnosis, known: Mapping[str, Comparison] | None = None
 ) -> tuple[str, str, str]:
     """Return what is wrong, what correcting it gains, and what to do next.
 
-    known: errors where the truth is known, of `diagnosis.known_truth`.
+    known: errors where the truth is known, of `diagnosis.known_errors`.
     """
     return _wrong(diagnosis), _gained(diagnosis, known or {}), _next(diagnosis)
 
@@ -208,7 +204,7 @@ def _name(cause: Cause) -> str:
     return f'{cause.effect}, or as well {others}' if others else cause.effect
 
 
-def _gained(d: Diagnosis, known: Mapping[str, Compared]) -> str:
+def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     before, named, best = (f.heldout_rms_px for f in (d.base, d.named, d.extended))
     moving = [c for c in d.causes if CATALOGUE[c.effect].stage != 'noise']
     local = ''
@@ -357,17 +353,17 @@ def _remedy(cause: Cause) -> str:
     return cause.to_separate.replace(';', ',')
 
 
-def known_rows(known: Mapping[str, Compared]) -> Iterable[tuple[str, str, str, str]]:
+def known_rows(known: Mapping[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
     """Return name, mean error before and after, and by how much it is less."""
     return (compared_row(name, compared) for name, compared in known.items())
 
 
-def compared_row(name: str, compared: Compared) -> tuple[str, str, str, str]:
+def compared_row(name: str, compared: Comparison) -> tuple[str, str, str, str]:
     """Return a mean error's name, its value before and after, and by how much it is less."""
     label, factor, unit = _MEASURES[name]
-    return (label, f'{factor * compared.base:.3g} {unit}',
-            f'{factor * compared.extended:.3g} {unit}',
-            f'{percent(compared.gain)} ({percent(compared.low)} to {percent(compared.high)})')
+    return (label, f'{factor * compared.before:.3g} {unit}',
+            f'{factor * compared.after:.3g} {unit}',
+            f'{percent(compared.value)} ({percent(compared.low)} to {percent(compared.high)})')
 
 
 def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:

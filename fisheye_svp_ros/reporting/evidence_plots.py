@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-from fisheye_svp_ros.diagnosis.target_map import BoardMap
+from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK
 from fisheye_svp_ros.reporting.plots import picture, round_number
 

@@ -6,11 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fisheye_svp_ros.diagnosis.carried import Carried
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
-from fisheye_svp_ros.diagnosis.known_truth import Compared
-from fisheye_svp_ros.diagnosis.two_cameras import TwoCameras
-from fisheye_svp_ros.diagnosis.two_sets import TwoSets
+from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
 from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quantity
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
@@ -38,7 +34,7 @@ def sections(diagnosis: Diagnosis) -> list[Section]:
     return found if diagnosis.against is None else [*found, _of_sets(diagnosis.against)]
 
 
-def carried_row(one: Carried, what: str) -> tuple[str, ...]:
+def carried_row(one: Transfer, what: str) -> tuple[str, ...]:
     """Return where something was found, tried, what it was, rms without and with it, and less."""
     less = one.less_px
     return (one.source, one.to, what, f'{one.without_px:.4f}', f'{one.with_px:.4f}',
@@ -93,11 +89,11 @@ def _rig(pair: TwoCameras) -> str:
     return '; found view by view, the rig scatters: ' + listed(said)
 
 
-def _rig_rows(rig: dict[str, Compared]) -> Iterable[tuple[str, str, str, str]]:
+def _rig_rows(rig: dict[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
     return (compared_row(f'rig_{name}', value) for name, value in rig.items())
 
 
-def _of_sets(against: TwoSets) -> Section:
+def _of_sets(against: TwoDatasets) -> Section:
     carried = []
     for tried in filter(None, against.tried):
         carried.append(carried_row(tried.lens, 'causes of the lens'))
@@ -116,7 +112,7 @@ def _of_sets(against: TwoSets) -> Section:
                    carried, ('of the lens', 'here', Path(against.source).name, ''), rows)
 
 
-def _lens_holds(against: TwoSets) -> str:
+def _lens_holds(against: TwoDatasets) -> str:
     if against.verdict == 'nothing':
         return f'Neither these data nor {against.source} call for a cause that moves with the lens'
     tried = listed([
@@ -132,7 +128,7 @@ def _lens_holds(against: TwoSets) -> str:
     return f'{said}: found in one, it takes held-out frames of {tried}{gone}'
 
 
-def _apart(against: TwoSets) -> str:
+def _apart(against: TwoDatasets) -> str:
     if not against.parameters:
         return ''
     said = ''
@@ -149,7 +145,7 @@ def _apart(against: TwoSets) -> str:
     return said or '; its parameters agree within their errors'
 
 
-def _follows(against: TwoSets) -> str:
+def _follows(against: TwoDatasets) -> str:
     there = [one.target for one in against.tried if one is not None and one.target is not None]
     if not there:
         return ''

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis import Diagnosis
 
 VERDICTS = {
     'adequate': 'Adequate: the simulation describes these data',

@@ -18,7 +18,7 @@ from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
 from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors
-from fisheye_svp_ros.diagnosis.noise import Gross
+from fisheye_svp_ros.diagnosis import Outliers
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -204,10 +204,10 @@ def test_frames_that_are_doubtful_alike_are_one_line(scene, capsys):
 def test_views_that_are_set_aside_as_a_whole_are_named(scene, capsys):
     _, _, table = scene
     rows = np.flatnonzero((table.frame == 2) | (np.arange(len(table)) == 0))
-    note_gross_errors(table, Gross(rows, np.full(len(rows), 99.0), ('far',) * len(rows)))
+    note_gross_errors(table, Outliers(rows, np.full(len(rows), 99.0), ('far',) * len(rows)))
     said = capsys.readouterr().err
     assert said.count('\n') == 1 and said.endswith('; all points of frame 2: in another order?\n')
-    note_gross_errors(table, Gross(rows[:1], np.full(1, 99.0), ('far',)))
+    note_gross_errors(table, Outliers(rows[:1], np.full(1, 99.0), ('far',)))
     assert 'another order' not in capsys.readouterr().err
 
 

@@ -9,23 +9,27 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.diagnoses import with_changes
 from helpers.targets import plane, poses_around
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.diagnosis.advice import Advice
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.known_truth import Compared, known_errors
+from fisheye_svp_ros.diagnosis import (
+    Advice,
+    Comparison,
+    DiagnosisOptions,
+    Structure,
+    diagnose,
+    known_errors,
+    point_residuals,
+    with_effect,
+)
 from fisheye_svp_ros.diagnosis.model import Linearised
-from fisheye_svp_ros.diagnosis.points import point_residuals
-from fisheye_svp_ros.diagnosis.search import with_effect
-from fisheye_svp_ros.diagnosis.structure import Structure
-from fisheye_svp_ros.diagnosis.target_map import board_maps
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
+from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.effects.target_shape import TargetShapeEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.csv_table import CsvTable
@@ -312,7 +316,8 @@ class TestWords:
 
     def test_local_offsets_that_held_out_data_refute_gain_nothing(self, found):
         worse = replace(found.extended, heldout_rms_px=2 * found.base.heldout_rms_px)
-        refuted = replace(found, extended=worse, gain=found.gain._replace(value=-1.0, low=-1.0))
+        gain = found.gain._replace(value=-1.0, low=-1.0)
+        refuted = with_changes(found, extended=worse, gain=gain)
         _, gained, _ = verdict_sentences(refuted)
         assert 'takes away' not in gained and '-100 %' not in gained
         assert f'do not hold there: with them {worse.heldout_rms_px:.3g} px' in gained
@@ -320,7 +325,7 @@ class TestWords:
     def test_a_class_is_named_with_what_would_separate_it(self, found):
         cause = replace(found.causes[0], indistinguishable_from=['flat_port', 'radial_profile'],
                         to_separate='go nearer; or farther')
-        wrong, _, following = verdict_sentences(replace(found, causes=[cause]))
+        wrong, _, following = verdict_sentences(with_changes(found, causes=[cause]))
         assert 'viewpoint_shift, or as well flat_port or radial_profile' in wrong
         assert 'to tell viewpoint_shift from flat_port and radial_profile: go nearer, or' in (
             following)
@@ -329,36 +334,36 @@ class TestWords:
         left = [Structure('outliers', 0.0, 0.5), Structure('theta', 1e-9, 0.1),
                 Structure('range', 1e-9, 0.3)]
         wrong, gained, following = verdict_sentences(
-            replace(found, verdict='unexplained', causes=[], advice=[], remaining=left))
+            with_changes(found, causes=[], advice=[], remaining=left))
         assert 'depend on the distance of the landmark and the incidence angle' in wrong
         assert 'a few points lie far off' in wrong
         assert 'no extension improved on it' in gained
         assert following.startswith('Look for the reason')
-        *_, following = verdict_sentences(replace(
+        *_, following = verdict_sentences(with_changes(
             found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}))
         assert 'give the time of each frame (a column t, s)' in following
 
     def test_frames_that_do_not_predict_each_other_leave_more_than_noise(self, found):
         for times, said in ((1.1, 'that is the noise'), (3.0, 'that is 3.0 times the noise')):
             error = replace(found.base, heldout_rms_px=times * 2**0.5 * found.noise_px)
-            _, gained, _ = verdict_sentences(replace(
-                found, verdict='adequate', causes=[], base=error, named=error, extended=error))
+            _, gained, _ = verdict_sentences(with_changes(
+                found, causes=[], base=error, named=error, extended=error))
             assert said in gained
 
     def test_what_was_almost_named_is_told(self, found):
         step = replace(found.trace[0], accepted=False, corrected=3e-6,
                        why='does not predict better')
         left = [Structure('range', 1e-9, 0.3)]
-        wrong, _, _ = verdict_sentences(replace(
-            found, verdict='unexplained', causes=[], advice=[], remaining=left, trace=[step]))
+        wrong, _, _ = verdict_sentences(with_changes(
+            found, causes=[], advice=[], remaining=left, trace=[step]))
         assert '; viewpoint_shift would (p = 3e-06), but with it frames left out' in wrong
 
     def test_what_remains_is_told_in_numbers(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5), Structure('size', 0.0, 0.0)]
         extended = replace(found.extended, chi2_per_dof=9.0)
-        wrong, _, _ = verdict_sentences(replace(
-            found, verdict='unexplained', causes=[], advice=[], remaining=left, gross=gross,
+        wrong, _, _ = verdict_sentences(with_changes(
+            found, causes=[], advice=[], remaining=left, gross=gross,
             extended=extended))
         assert '2 points lie far off, furthest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma says' in wrong
@@ -366,32 +371,33 @@ class TestWords:
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5)]
-        clean = replace(found, verdict='unexplained', causes=[], advice=[], remaining=left,
+        clean = with_changes(found, causes=[], advice=[], remaining=left,
                         gross=gross)
         assert headline(clean) == ('Unexplained: 2 points lie far off, and these data show '
                                    'nothing else wrong')
         *_, following = verdict_sentences(clean)
         assert following.startswith('Keep the lens as it is; look for the reason of what remains')
-        partly = replace(found, verdict='partly_explained', remaining=left, gross=gross)
+        partly = with_changes(found, remaining=left, gross=gross)
         assert headline(partly) == (
             'Partly explained: 2 points lie far off, all else that is wrong has a name')
         more = [*left, Structure('range', 1e-9, 0.3)]
-        assert headline(replace(clean, remaining=more)) == VERDICTS['unexplained']
-        *_, following = verdict_sentences(replace(clean, remaining=more))
+        assert headline(with_changes(clean, remaining=more)) == VERDICTS['unexplained']
+        *_, following = verdict_sentences(with_changes(clean, remaining=more))
         assert following.startswith('Look for the reason')
 
     def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
         cause = replace(found.causes[0], effect='rolling_shutter', to_separate='use a tripod')
         shutter = replace(found.lens, corrections={'rolling_shutter': {}})
-        told = [verdict_sentences(replace(found, causes=[cause], advice=[], lenses={'': lens}))[2]
-                for lens in (found.lens, shutter)]
+        told = [verdict_sentences(with_changes(
+            found, causes=[cause], advice=[], lenses={'': lens}))[2]
+            for lens in (found.lens, shutter)]
         assert told[0] == 'To confirm rolling_shutter: use a tripod.'
         assert told[1].startswith('Solve with extended_lens.yaml, which holds rolling_shutter; to')
-        following = verdict_sentences(replace(
+        following = verdict_sentences(with_changes(
             found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
         assert following.count('olve with extended_lens.yaml') == 1
         worse = replace(found.named, heldout_rms_px=2 * found.base.heldout_rms_px)
-        refuted = verdict_sentences(replace(
+        refuted = verdict_sentences(with_changes(
             found, causes=[cause], advice=[], lenses={'': shutter}, named=worse))
         assert 'no correction' in refuted[1] and 'olve with' not in refuted[2]
 
@@ -400,14 +406,14 @@ class TestWords:
 
     def test_errors_against_the_truth_go_or_stay(self, found):
         _, gained, _ = verdict_sentences(found, {
-            'position_error_m': Compared(0.002, 0.001, 0.5, 0.3, 0.6),
-            'depth_error_m': Compared(0.0021, 0.002, 0.05, -0.1, 0.2),
+            'position_error_m': Comparison(0.002, 0.001, 0.5, 0.3, 0.6),
+            'depth_error_m': Comparison(0.0021, 0.002, 0.05, -0.1, 0.2),
         })
         assert 'the position error goes from 2 mm to 1 mm' in gained
         assert 'the stereo error stays at 2 mm' in gained
 
     def test_many_causes_are_counted(self, found):
-        wrong, *_ = verdict_sentences(replace(found, causes=5 * found.causes))
+        wrong, *_ = verdict_sentences(with_changes(found, causes=5 * found.causes))
         assert wrong.count('viewpoint_shift') == 3
         assert 'and for 2 more reasons in the table' in wrong
 
@@ -416,7 +422,7 @@ class TestWords:
         cause = replace(found.causes[0], parameters={
             **found.causes[0].parameters, 'open': entry,
             'nothing': {'value': 0.0, 'stderr': float('nan'), 'unit': '1'}})
-        row, = cause_rows(replace(found, causes=[cause]))
+        row, = cause_rows(with_changes(found, causes=[cause]))
         assert row[1].startswith('e0 = ') and 'open' not in row[1] and 'nothing' not in row[1]
 
 
@@ -427,7 +433,7 @@ def without_solution(monkeypatch, request):
     def singular(*_, **__):
         raise request.param
 
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnosis.diagnose', singular)
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnose', singular)
 
 
 def test_views_that_cannot_be_fitted_are_one_line(scene, without_solution, capsys):
@@ -478,7 +484,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
             for name in ('frame', 'landmark', 'board', 'camera', 'uv', 'xyz', 't', 'sigma')}
     larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
     found = diagnose(replace(table, cameras=('left', 'right'), **both),
-                     {'left': LENS, 'right': larger}, wanted=Wanted(quick=True))
+                     {'left': LENS, 'right': larger}, options=DiagnosisOptions(quick=True))
     shown = Shown.of(found, point_residuals(found.before, found.after))
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
@@ -508,7 +514,7 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     effect = TargetShapeEffect.candidates(found.after.scene)[0]
     bow = np.array([0.002, 0.0, 0.0])
     state = replace(found.after.state, terms=((effect, bow),))
-    one, = board_maps(Linearised(found.after.data, state, ()), ('target_shape',))
+    one, = board_maps(found.after.data.views, state.terms, state.lens)
     assert len(one.height) == len(board.ids)
     x = one.place[:, 0] / np.abs(one.place[:, 0]).max()
     expected = 0.002 * x**2

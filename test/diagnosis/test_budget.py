@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis import NullModel, with_effect
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.budget import cause_squares
-from fisheye_svp_ros.diagnosis.evidence import bare_evidence
 from fisheye_svp_ros.diagnosis.model import prepare
-from fisheye_svp_ros.diagnosis.search import with_effect
+from fisheye_svp_ros.diagnosis.variance_budget import cause_squares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 
@@ -26,12 +25,12 @@ def state():
     return data, fit(data, found, ('cx', 'cy'))
 
 
-def displacement(evidence, names):
+def displacement(null, names):
     """Return the mean squared displacement by some causes, px^2, beside poses and intrinsics."""
-    linear = evidence.linear
+    linear = null.linear
     shared = linear.shared_columns
     signal = np.zeros(linear.residual.shape)
-    for effect, columns, values in evidence.terms:
+    for effect, columns, values in null.terms:
         if effect.name in names:
             signal += shared[..., columns] @ values
     frames, rows, _ = linear.frame_columns.shape
@@ -46,8 +45,8 @@ def displacement(evidence, names):
 
 def test_shares_add_up_to_what_all_causes_do_together(state):
     """Two that undo each other are worth little, not one a lot and the other nothing."""
-    evidence = bare_evidence(*state, ('cx', 'cy'))
-    squares = cause_squares(evidence, evidence.terms)
+    null = NullModel.with_variances(*state, ('cx', 'cy'))
+    squares = cause_squares(null, null.terms)
     assert list(squares) == ['decentering', 'sensor_tilt', 'skew']
     assert min(squares.values()) > 0
-    assert sum(squares.values()) == pytest.approx(displacement(evidence, squares), rel=1e-6)
+    assert sum(squares.values()) == pytest.approx(displacement(null, squares), rel=1e-6)

@@ -7,20 +7,19 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.inputs import thinned
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.noise import (
+from fisheye_svp_ros.diagnosis import (
     FRAME,
-    VIEW,
-    Gross,
-    find_gross_errors,
-    quantisation_step,
+    DiagnosisOptions,
+    Problem,
+    diagnose,
+    find_outliers,
+    standard_errors,
 )
-from fisheye_svp_ros.diagnosis.search import search
-from fisheye_svp_ros.diagnosis.standard_errors import standard_errors
-from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
+from fisheye_svp_ros.diagnosis.outliers import VIEW, quantization_step
+from fisheye_svp_ros.diagnosis.problem import Inputs, thin_out
+from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -215,7 +214,7 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
     wrong = np.flatnonzero(table.frame == 11)[3]
     table.uv[wrong] += [9.0, -5.0]
     data = prepare(table)
-    near = find_gross_errors(data, start(data, lens()))[1]
+    near = find_outliers(data, start(data, lens()))[1]
     assert {7, 11} == set(table.frame[near.rows].tolist())
     found = diagnose(table, lens())
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
@@ -236,9 +235,9 @@ def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
     uv[40] = clean.uv[40] + 10 * SIGMA
     table = replace(clean, uv=uv, sigma=sigma)
     data = prepare(table)
-    assert not len(find_gross_errors(data, start(data, lens()))[1].rows)
+    assert not len(find_outliers(data, start(data, lens()))[1].rows)
     data = prepare(replace(table, sigma=np.full(len(clean), SIGMA)))
-    gross = find_gross_errors(data, start(data, lens()))[1]
+    gross = find_outliers(data, start(data, lens()))[1]
     assert 40 in gross.rows.tolist()
     assert gross.px[gross.rows == 40] == pytest.approx(10 * SIGMA * np.sqrt(2), rel=0.3)
 
@@ -250,7 +249,7 @@ def test_a_view_is_off_as_a_whole_where_most_are_not(bad, named):
     clean = observe(lens(), (), pose, views, SIGMA, rng)
     off = 30 * rng.normal(size=clean.uv.shape) * np.isin(clean.frame, bad)[:, None]
     data = prepare(replace(clean, uv=clean.uv + off))
-    gross = find_gross_errors(data, start(data, lens()))[1]
+    gross = find_outliers(data, start(data, lens()))[1]
     assert (VIEW in gross.why) == named
     frames = {int(clean.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
               if why == VIEW}
@@ -264,16 +263,16 @@ def test_one_camera_of_three_that_the_others_contradict_is_to_blame():
     bad = np.flatnonzero((table.frame == 5) & (table.camera == 2))
     table.uv[bad] = table.uv[bad[::-1]]
     data = prepare(table)
-    gross = find_gross_errors(data, start(data, lens()))[1]
+    gross = find_outliers(data, start(data, lens()))[1]
     assert set(gross.why) == {FRAME} and sorted(gross.rows.tolist()) == bad.tolist()
 
 
 def test_quantisation_is_read_off_the_numbers():
     rng = np.random.default_rng(15)
     uv = rng.uniform(0, 1000, (500, 2))
-    assert quantisation_step(np.round(uv)) == 1.0
-    assert quantisation_step(np.round(uv * 4) / 4) == 0.25
-    assert quantisation_step(uv) == 0.0
+    assert quantization_step(np.round(uv)) == 1.0
+    assert quantization_step(np.round(uv * 4) / 4) == 0.25
+    assert quantization_step(uv) == 0.0
     pose, views = scene(rng)
     table = observe(lens(), (), pose, views, SIGMA, rng)
     rough = observe(lens(), (), pose, views, 0.1, rng)
@@ -322,15 +321,15 @@ def test_what_the_user_knows_is_taken_in_or_left_out():
     rng = np.random.default_rng(19)
     pose, views = scene(rng)
     table = observe(lens(), [(CATALOGUE['skew'](), np.array([0.002]))], pose, views, SIGMA, rng)
-    known = diagnose(table, lens(), wanted=Wanted(included=('aspect',), quick=True))
+    known = diagnose(table, lens(), options=DiagnosisOptions(included=('aspect',), quick=True))
     assert {cause.effect for cause in known.causes} == {'aspect', 'skew'}
-    without = diagnose(table, lens(), wanted=Wanted(left_out=('skew',), quick=True))
+    without = diagnose(table, lens(), options=DiagnosisOptions(left_out=('skew',), quick=True))
     assert 'skew' not in {cause.effect for cause in without.causes}
     assert without.verdict != 'adequate'
     with pytest.raises(ParameterError, match='known are'):
-        Wanted(left_out=('skwe',))
+        DiagnosisOptions(left_out=('skwe',))
     with pytest.raises(ParameterError, match='without a test'):
-        Wanted(included=('wrong_ids',))
+        DiagnosisOptions(included=('wrong_ids',))
 
 
 def table_of(seed, frames=12, cameras=1, terms=()):
@@ -343,7 +342,7 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
     terms = [(CATALOGUE['skew'](), np.array([0.002]))]
     table, held_out = table_of(27, terms=terms), table_of(28, terms=terms)
     found, known = (
-        diagnose(table, lens(), held_out=held_out, wanted=Wanted(names, quick=True))
+        diagnose(table, lens(), held_out=held_out, options=DiagnosisOptions(names, quick=True))
         for names in ((), ('skew',)))
     assert [cause.effect for cause in (*found.causes, *known.causes)] == ['skew', 'skew']
     assert known.base.rms_px == pytest.approx(found.base.rms_px)
@@ -360,8 +359,8 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
                     for seed in (1, 2))
     bare = replace(other, board=np.zeros_like(other.board))
     extended = extend_lens(lens(), [(shape, values)], table)
-    assert diagnose(bare, extended, wanted=Wanted(quick=True)).verdict == 'adequate'
-    found = diagnose(table, lens(), held_out=bare, wanted=Wanted(quick=True))
+    assert diagnose(bare, extended, options=DiagnosisOptions(quick=True)).verdict == 'adequate'
+    found = diagnose(table, lens(), held_out=bare, options=DiagnosisOptions(quick=True))
     assert [cause.effect for cause in found.causes] == ['target_shape']
     assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
@@ -373,7 +372,7 @@ def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
     table = replace(observe(lens(), (), pose, views, SIGMA, rng), cameras=cameras)
     right = np.flatnonzero(views.camera == cameras.index('right'))
     poses = {int(views.frame[i]): pose.take(i) for i in right}
-    found = diagnose(table, lens(), poses=poses, wanted=Wanted(quick=True))
+    found = diagnose(table, lens(), poses=poses, options=DiagnosisOptions(quick=True))
     assert found.verdict == 'adequate'
     assert found.base.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
@@ -384,11 +383,11 @@ def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
 ])
 def test_a_rig_is_the_first_camera_in_the_second(cameras, names, x):
     table = replace(table_of(29, cameras=2), cameras=cameras)
-    found = diagnose(table, lens(), wanted=Wanted(quick=True))
+    found = diagnose(table, lens(), options=DiagnosisOptions(quick=True))
     assert found.rig is not None and found.rig[0] == names
     np.testing.assert_allclose(found.rig[1].position, [x, 0, 0], atol=2e-3)
     alone = replace(table, frame=2 * table.frame + table.camera)
-    assert diagnose(alone, lens(), wanted=Wanted(quick=True)).rig is None
+    assert diagnose(alone, lens(), options=DiagnosisOptions(quick=True)).rig is None
 
 
 def test_what_the_lens_already_holds_is_no_cause_again():
@@ -445,13 +444,11 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     terms = [(CATALOGUE['viewpoint_shift'].candidates(fitted(25)[2].scene)[0], np.array([0.02]))]
     table = observe(lens(), terms, pose, views._replace(points=views.points + moves), SIGMA, rng)
     table = replace(table, xyz=views.points[0][table.landmark])
-    data = prepare(table)
-    gross = Gross(np.zeros(0, dtype=np.int64), np.zeros(0), ())
-    found = search(data, fit(data, start(data, lens()), ()), (), Wanted(), gross, lambda *_: None)
-    own = np.arange(found.evidence.own)
-    information = found.evidence.information
+    inputs = Inputs.check(table, lens(), DiagnosisOptions())
+    found = select_causes(Problem.of(inputs), lambda *_: None)
+    own, information = found.null.included, found.null.information
     step = np.linalg.solve(information[np.ix_(own, own)], information[own, -1])
-    errors = standard_errors(found.evidence) * found.evidence.scale[own]
+    errors = standard_errors(found.null) * found.null.scale[own]
     assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
     assert np.abs(step / errors).max() < 0.1
 
@@ -463,13 +460,14 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
         return np.array([[len(values), values.sum()], [values.sum(), (values**2).sum()]])
 
     values = spread * np.random.default_rng(27).normal(size=40)
-    evidence = SimpleNamespace(
-        own=1, terms=[], scale=np.array([2.0]), information=information(values),
-        in_turn=lambda at: [information(np.delete(values, i)) for i in range(40)],
+    null = SimpleNamespace(
+        own=1, included=np.arange(1), terms=[], scale=np.array([2.0]),
+        information=information(values), information_without_frames=lambda at: [
+            information(np.delete(values, i)) for i in range(40)],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     expected = 1 if spread == 1 else values.std(ddof=1)
-    assert standard_errors(evidence) == pytest.approx(expected / np.sqrt(40) / 2)
-    assert standard_errors(evidence, jackknife=False) == pytest.approx(1 / np.sqrt(40) / 2)
+    assert standard_errors(null) == pytest.approx(expected / np.sqrt(40) / 2)
+    assert standard_errors(null, jackknife=False) == pytest.approx(1 / np.sqrt(40) / 2)
 
 
 def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
@@ -477,11 +475,11 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     rows = np.column_stack([np.ones(40), np.arange(40) == 39, np.zeros(40)])
     rows[:, 2] = np.random.default_rng(28).normal(size=40) + 100 * rows[:, 1]
     without = [np.delete(rows, i, axis=0) for i in range(40)]
-    evidence = SimpleNamespace(
-        own=2, terms=[], scale=np.ones(2), information=rows.T @ rows,
-        in_turn=lambda at: [w.T @ w for w in without],
+    null = SimpleNamespace(
+        own=2, included=np.arange(2), terms=[], scale=np.ones(2), information=rows.T @ rows,
+        information_without_frames=lambda at: [w.T @ w for w in without],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
-    assert standard_errors(evidence) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
+    assert standard_errors(null) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
 
 
 def rig_table(seed, right_terms=(), frames=16):
@@ -547,7 +545,7 @@ def test_a_quick_diagnosis_takes_a_part_of_many_points() -> None:
     none = np.full(len(frame), np.nan)
     table = Observations(frame, landmark, np.zeros((len(frame), 2)), np.zeros((len(frame), 3)),
                          np.zeros_like(frame), np.zeros_like(frame), none, none)
-    kept = thinned(table)
+    kept = thin_out(table)
     assert np.bincount(kept.frame).tolist() == [800, 700, 30]
     assert set(kept.landmark[kept.frame == 1]) == set(range(0, 2100, 3))
-    assert len(thinned(kept)) == len(kept)
+    assert len(thin_out(kept)) == len(kept)

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.calibration import calibrated_without_gross_errors, trust
-from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.model import prepare
-from fisheye_svp_ros.diagnosis.refit import refit
-from fisheye_svp_ros.diagnosis.standard_errors import (
-    honest_errors,
-    model_uncertainty,
+from fisheye_svp_ros.diagnosis import (
+    NullModel,
+    assess_lens,
+    calibrate_without_outliers,
+    refit,
     standard_errors,
 )
+from fisheye_svp_ros.diagnosis.adjustment import fit, start
+from fisheye_svp_ros.diagnosis.model import prepare
+from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.solve.lens_adjustment import parameter_values
@@ -39,9 +39,9 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         data = prepare(replace(table, xyz=views.points[0][table.landmark]))
         begin = start(data, lens())
         state = fit(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
-        evidence = gather_evidence(data, state, ())
-        fitted = refit(data, state, (), evidence.variances)
-        error, = standard_errors(evidence)
+        null = NullModel.fit(data, state, ())
+        fitted = refit(data, state, (), null.variances)
+        error, = standard_errors(null)
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
     # Of a t distribution with a dozen draws: wide of this less than once in a thousand runs.
     assert 0.45 < np.sqrt(np.mean(np.square(off))) < 1.75, off
@@ -60,10 +60,10 @@ def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resem
         bumps = np.exp(-(apart**2).sum(axis=-1) / 2 / (0.25 * size.max()) ** 2)
         table = replace(table, uv=table.uv + bumps @ rng.normal(size=(6, 2)) * 3 * SIGMA)
         data = prepare(table)
-        evidence = gather_evidence(data, fit(data, start(data, lens()), free), free)
-        fitted = refit(data, evidence.linear.state, free, evidence.variances)
+        null = NullModel.fit(data, fit(data, start(data, lens()), free), free)
+        fitted = refit(data, null.linear.state, free, null.variances)
         found = np.array([getattr(fitted.lens, name) for name in free])
-        off.append((found - true) / honest_errors(evidence))
+        off.append((found - true) / total_errors(null))
     spread = np.sqrt(np.mean(np.square(off), axis=0))
     assert (spread > 0.45).all() and (spread < 1.75).all(), spread
 
@@ -76,8 +76,8 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
     terms = [(CATALOGUE['decentering'](), np.array([size, 0.0]))]
     data = prepare(observe(lens(), terms, pose, views, SIGMA, rng))
     state = fit(data, start(data, lens()), ('cx', 'cy'))
-    evidence = gather_evidence(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(evidence), model_uncertainty(evidence)
+    null = NullModel.fit(data, state, ('cx', 'cy'))
+    errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     if size:
         assert off > 5 * errors[1]
@@ -94,11 +94,11 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     data = prepare(observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views,
                            12 * SIGMA, rng))
     state, others = fit(data, start(data, lens()), ('cx', 'cy')), {*CATALOGUE} - {tilt.name}
-    evidence = gather_evidence(data, state, ('cx', 'cy'), left_out=[*others])
-    more = model_uncertainty(evidence)[1]
+    null = NullModel.fit(data, state, ('cx', 'cy'), left_out=[*others])
+    more = model_uncertainty(null)[1]
     small = tuple(p._replace(large=p.large / 10) for p in tilt.parameters)
     monkeypatch.setattr(tilt, 'parameters', small)
-    assert 0 < model_uncertainty(evidence)[1] < 0.7 * more
+    assert 0 < model_uncertainty(null)[1] < 0.7 * more
 
 
 def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
@@ -111,8 +111,8 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
     data = prepare(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
     begin = replace(start(data, near), terms=((shift, np.zeros(1)),))
     others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
-    evidence = gather_evidence(data, fit(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
-    more = model_uncertainty(evidence)
+    null = NullModel.fit(data, fit(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
+    more = model_uncertainty(null)
     assert more[1] > 0 and more[2] == 0.0
 
 
@@ -125,8 +125,8 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
         lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng))
     begin = replace(start(data, lens()), terms=((tilt, np.zeros(2)),))
     state = fit(data, begin, ('cx', 'cy'))
-    evidence = gather_evidence(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(evidence), model_uncertainty(evidence)
+    null = NullModel.fit(data, state, ('cx', 'cy'))
+    errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     assert off > 4 * errors[1]
     assert off < 2 * np.hypot(errors, more)[1]
@@ -135,11 +135,11 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
 @pytest.mark.filterwarnings('error')
 def test_what_no_frame_tells_of_has_no_error():
     information = np.diag([0.0, 4.0, 1.0])
-    evidence = SimpleNamespace(
-        own=2, terms=[], scale=np.ones(2), information=information,
-        in_turn=lambda at: np.stack([0.9 * information] * 3), linear=SimpleNamespace(
-            data=SimpleNamespace(frames=3)))
-    np.testing.assert_allclose(standard_errors(evidence), [np.nan, 0.5])
+    null = SimpleNamespace(
+        own=2, included=np.arange(2), terms=[], scale=np.ones(2), information=information,
+        information_without_frames=lambda at: np.stack([0.9 * information] * 3),
+        linear=SimpleNamespace(data=SimpleNamespace(frames=3)))
+    np.testing.assert_allclose(standard_errors(null), [np.nan, 0.5])
 
 
 def test_two_effects_that_hide_each_other_widen_the_errors():
@@ -150,8 +150,8 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
              (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
     data = prepare(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
     state = fit(data, start(data, lens()), ('cx', 'cy'))
-    evidence = gather_evidence(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(evidence), model_uncertainty(evidence)
+    null = NullModel.fit(data, state, ('cx', 'cy'))
+    errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     assert off > 20 * errors[1]
     assert off < 2 * np.hypot(errors, more)[1]
@@ -161,12 +161,12 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     rng = np.random.default_rng(5)
     pose, views = scene(rng, frames=16)
     data = prepare(observe(lens(), (), pose, views, SIGMA, rng))
-    model_scene = gather_evidence(data, start(data, lens()), ()).linear.scene
+    model_scene = NullModel.fit(data, start(data, lens()), ()).linear.scene
     shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
     bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
     table = observe(lens(), bent, pose, views, SIGMA, rng)
     shifted = ViewpointShiftEffect(1).curved(lens(), np.array([1e-6]))
-    found = trust(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
+    found = assess_lens(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
     assert set(found.stderr) == {'fx', 'fy', 'cx', 'cy', 'e0'}
     assert not found.admissible['e0'].settled
     assert found.admissible['e0'].low < 0 < found.admissible['e0'].high
@@ -181,15 +181,15 @@ def test_a_calibration_says_how_far_off_an_effect_that_it_leaves_out_may_bring_i
     data, names = prepare(table), ('fx', 'fy')
     state = fit(data, start(data, lens()), names)
     off = abs(state.lens.fx - lens().fx)
-    assert off > 5 * standard_errors(gather_evidence(data, state, names))[0]
-    assert off < 2 * trust(table, state.lens, names).stderr['fx'] < 4 * off
+    assert off > 5 * standard_errors(NullModel.fit(data, state, names))[0]
+    assert off < 2 * assess_lens(table, state.lens, names).stderr['fx'] < 4 * off
 
 
 def test_ranges_over_targets_hold_the_one_that_was_believed():
     rng = np.random.default_rng(6)
     pose, views = scene(rng, frames=16)
     table = observe(lens(), (), pose, views, SIGMA, rng)
-    found = trust(table, lens(), ('fx', 'fy', 'cx', 'cy'))
+    found = assess_lens(table, lens(), ('fx', 'fy', 'cx', 'cy'))
     for name, value in zip(('fx', 'fy', 'cx', 'cy'), parameter_values(
             lens(), ('fx', 'fy', 'cx', 'cy')), strict=True):
         range_ = found.admissible[name]
@@ -210,7 +210,7 @@ def test_a_calibration_does_without_gross_errors():
         return calibrate(rows, 'kannala_brandt', (1536, 1536))
 
     clean = fitted(table.take(~np.isin(np.arange(len(table)), far)))
-    found, kept, gross = calibrated_without_gross_errors(replace(table, uv=uv), fitted)
+    found, kept, gross = calibrate_without_outliers(replace(table, uv=uv), fitted)
     assert sorted(gross.rows.tolist()) == far.tolist()
     assert len(kept) == len(table) - len(far)
     assert found.adjusted.lens.parameters == clean.adjusted.lens.parameters

@@ -7,16 +7,11 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy import stats
 
-from fisheye_svp_ros.diagnosis import search
+from fisheye_svp_ros.diagnosis import NullModel, diagnose, known_errors, refit, search, with_effect
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.choice import HeldOutGain, counted
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.evidence import gather_evidence
-from fisheye_svp_ros.diagnosis.known_truth import known_errors
+from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
-from fisheye_svp_ros.diagnosis.refit import refit
-from fisheye_svp_ros.diagnosis.search import with_effect
-from fisheye_svp_ros.diagnosis.single_landmarks import beside_bulk
+from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
@@ -142,10 +137,10 @@ def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves(alone):
 
 def test_one_frame_that_gains_most_is_no_reason_for_doubt_nor_for_trust():
     near = np.array([-0.4, -0.1, 11.4, 0.4, 2.2, 13.9, 0.6, 2.5, 330.4, 79.8, -0.6, 18.1])
-    assert counted(near).convincing
+    assert sum_gains(near).convincing
     alone = np.array([330.4, -0.4, 0.1, 0.4, -1.2, 0.9, -0.6, 0.5])
-    assert not counted(alone).convincing
-    assert counted(alone).value == pytest.approx(0.6)
+    assert not sum_gains(alone).convincing
+    assert sum_gains(alone).value == pytest.approx(0.6)
 
 
 def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
@@ -154,7 +149,7 @@ def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
     true = lens().with_parameters(('fx', 'fy'), [1.33 * lens().fx, 1.33 * lens().fy])
     data = prepare(observe(true, (), pose, views, SIGMA, rng))
     state = fit(data, start(data, lens()), ())
-    variances = gather_evidence(data, state, ()).variances
+    variances = NullModel.fit(data, state, ()).variances
     shifted = with_effect(state, CATALOGUE['viewpoint_shift'](), np.array([0.03]))
 
     def misfit(state):
@@ -180,18 +175,18 @@ def test_the_largest_of_landmarks_with_long_tails_is_no_single_one():
     rank, spots = np.full(60, 3), (np.arange(60) + 0.5) / 60
     normal, long = stats.f.ppf(spots, 3, 1e6) * 3, stats.f.ppf(spots, 3, 5) * 3
     assert normal.max() < long.max()
-    far = beside_bulk(np.append(normal[:-1], long.max()), rank, np.array([59]))[59]
+    far = bulk_p_values(np.append(normal[:-1], long.max()), rank, np.array([59]))[59]
     assert far < 1e-4
-    assert beside_bulk(long, rank, np.array([59]))[59] > 1e-3
+    assert bulk_p_values(long, rank, np.array([59]))[59] > 1e-3
     # One that is far beyond any tail is a single one beside either.
-    assert beside_bulk(np.append(long[:-1], 2000.0), rank, np.array([59]))[59] < 1e-5
+    assert bulk_p_values(np.append(long[:-1], 2000.0), rank, np.array([59]))[59] < 1e-5
 
 
 @pytest.mark.parametrize('size', [0.7, 1.0, 30.0])
 def test_no_tails_are_read_into_landmarks_that_are_off_by_noise_or_alike(size):
     rank, far = np.full(60, 3), 45.0 * max(size, 1.0)
     ordinary = size * stats.chi2.ppf((np.arange(60) + 0.5) / 60, 3)
-    p = beside_bulk(np.append(ordinary[:-1], far), rank, np.array([59]))
+    p = bulk_p_values(np.append(ordinary[:-1], far), rank, np.array([59]))
     assert p[59] == pytest.approx(stats.chi2.sf(45.0, 3), rel=1.0)
 
 
@@ -200,7 +195,7 @@ def test_landmarks_far_beyond_all_others_belong_to_no_tail():
     rank = np.full(60, 3)
     long = stats.f.ppf((np.arange(60) + 0.5) / 60, 3, 5) * 3
     both = np.append(long[:-2], [20.0 * long.max(), 2.0 * long.max()])
-    p = beside_bulk(both, rank, np.array([58, 59]))
+    p = bulk_p_values(both, rank, np.array([58, 59]))
     assert p[58] < 1e-100 < 1e-6 < p[59]
-    everything = beside_bulk(np.full(60, 30.0), rank, np.arange(60))
+    everything = bulk_p_values(np.full(60, 30.0), rank, np.arange(60))
     assert everything == pytest.approx(stats.chi2.sf(30.0, 3))

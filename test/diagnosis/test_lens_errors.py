@@ -18,13 +18,13 @@ from helpers.uncertain import (
 )
 
 import fisheye_svp_ros as fsvp
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.lens_errors import (
+from fisheye_svp_ros.diagnosis import (
+    DiagnosisOptions,
     LensErrors,
     depth_errors,
+    diagnose,
     localize_with_errors,
 )
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -114,7 +114,7 @@ def test_stereo_points_scatter_as_the_lens_files_say():
 def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     lens = replace(uncertain(), uncertainty=None, viewpoint_shift=None)
     table = board_table(lens, np.random.default_rng(3), 8)
-    found = diagnose(table, lens, free_intrinsics=True, wanted=Wanted(quick=True))
+    found = diagnose(table, lens, free_intrinsics=True, options=DiagnosisOptions(quick=True))
     save_lens(found.lens, tmp_path / 'lens.yaml')
     errors = LensErrors.of(load_lens(tmp_path / 'lens.yaml'))
     views, pose = found.after.data.views, found.after.state.pose
@@ -122,7 +122,7 @@ def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)
     np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-4, atol=1e-12)
     assert errors.noise == pytest.approx(found.noise_px) and said.misfit.any()
-    assert {'fx', 'k4', 'target_shape.board0.z20'} < set(errors.names)
+    assert {'fx', 'k4', 'target_shape.board0.z20'} < set(errors.model.names)
 
 
 def board_table(lens, rng, frames):

@@ -7,14 +7,17 @@ import pytest
 from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
+from fisheye_svp_ros.diagnosis import (
+    DiagnosisOptions,
+    InAir,
+    assess_lens,
+    diagnose,
+    find_outliers,
+    with_covariance,
+)
 from fisheye_svp_ros.diagnosis.adjustment import start
-from fisheye_svp_ros.diagnosis.calibration import trust, with_stderr
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.in_air import InAir
-from fisheye_svp_ros.diagnosis.medium import INDEX, PLACE
+from fisheye_svp_ros.diagnosis.checks.medium import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.diagnosis.model import prepare
-from fisheye_svp_ros.diagnosis.noise import find_gross_errors
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -35,7 +38,7 @@ def medium_of(found):
 def test_water_is_named_and_measured(lens, others):
     seen = photographs(AIR, PORT, 12)
     other = photographs(AIR, PORT, others, seed=1) if others else None
-    found = diagnose(seen, lens, held_out=other, wanted=Wanted(quick=True))
+    found = diagnose(seen, lens, held_out=other, options=DiagnosisOptions(quick=True))
     cause = medium_of(found)
     assert [c.effect for c in found.causes] == ['flat_port'] and found.verdict == 'explained'
     for name in ('medium_index', 'distance', 'tilt_x', 'tilt_y'):
@@ -55,7 +58,7 @@ def test_glass_that_stood_in_for_a_cause_is_gone_with_it():
     rng = np.random.default_rng(0)
     true = replace(AIR, cx=AIR.cx + rng.normal(0, 6), cy=AIR.cy + rng.normal(0, 6),
                    fy=AIR.fy * (1 + rng.normal(0, 0.003)))
-    found = diagnose(photographs(true, PORT, 12, 0.05), AIR, wanted=Wanted(quick=True))
+    found = diagnose(photographs(true, PORT, 12, 0.05), AIR, options=DiagnosisOptions(quick=True))
     assert {c.effect for c in found.causes} >= {'flat_port', 'principal_point', 'aspect'}
     assert 'thickness' not in medium_of(found).parameters
     assert found.lens.port.thickness == 0.0
@@ -66,10 +69,10 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     """The curve turns back at 62 degrees where no point in air was."""
     table = photographs(AIR, None, 6, noise=0.3, seed=2, reach=0.15)
     result = calibrate(table, 'kannala_brandt', (AIR.width, AIR.height)).adjusted
-    given = with_stderr(result.lens, trust(table, result.lens, result.names))
+    given = with_covariance(result.lens, assess_lens(table, result.lens, result.names))
     assert given.max_incidence < 1.1
     found = diagnose(photographs(AIR, PORT, 4, seed=12, reach=0.9), given,
-                     wanted=Wanted(quick=True))
+                     options=DiagnosisOptions(quick=True))
     assert [c.form for c in found.causes] == ['flat_port(medium)']
     index = medium_of(found).parameters['medium_index']
     assert abs(index['value'] - 1.34) < 3 * index['stderr'] < 0.03
@@ -95,7 +98,7 @@ def test_what_a_lens_file_tells_of_its_focal_length():
     known = InAir.of(replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]}))
     assert known.focal == pytest.approx(0.005) and known.reach == np.inf
     off = replace(AIR, fx=AIR.fx + 4.2, fy=AIR.fx + 4.2)
-    assert known.unlikely(off) == pytest.approx(4.0)
+    assert known.squared_distance(off) == pytest.approx(4.0)
 
 
 def test_what_a_diagnosis_in_air_found_takes_the_place_of_the_calibration():
@@ -110,7 +113,7 @@ def test_an_index_is_no_surer_than_the_focal_length_in_air():
     index = {}
     for percent in (0.0, 1.0):
         lens = replace(AIR, calibration={'stderr': {'fx': percent / 100 * AIR.fx}})
-        found = diagnose(seen, lens, wanted=Wanted(quick=True))
+        found = diagnose(seen, lens, options=DiagnosisOptions(quick=True))
         index[percent] = medium_of(found).parameters['medium_index']
     assert index[0.0]['stderr'] < 0.005 and index[0.0]['value'] == index[1.0]['value']
     assert index[1.0]['stderr'] == pytest.approx(0.0134, rel=0.1)
@@ -121,7 +124,7 @@ def test_an_index_is_no_surer_than_the_focal_length_in_air():
     replace(AIR, port=FlatGlass(0.03, 1.0, 0.02, 0.0, 0.01)),
 ], ids=['focal length', 'window in air'])
 def test_what_is_no_medium_is_not_called_one(true):
-    found = diagnose(photographs(true, true.port, 10), AIR, wanted=Wanted(quick=True))
+    found = diagnose(photographs(true, true.port, 10), AIR, options=DiagnosisOptions(quick=True))
     assert found.causes and medium_of(found) is None
 
 
@@ -133,13 +136,13 @@ def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
     covariance = np.diag(np.square([*stderr.values()])).tolist()
     known = InAir.of(replace(AIR, calibration={'stderr': stderr, 'covariance': covariance}))
     data = prepare(photographs(true, true.port, seed=20))
-    wet = known.behind(data, replace(known.lens, port=PORT), PLACE, INDEX)
+    wet = known.fit_behind_port(data, replace(known.lens, port=PORT), PORT_PLACE, MEDIUM_INDEX)
     assert (wet is not None) == near
 
 
 def test_a_medium_can_be_ruled_out():
     found = diagnose(photographs(AIR, PORT, 8), AIR,
-                     wanted=Wanted(left_out=('flat_port',), quick=True))
+                     options=DiagnosisOptions(left_out=('flat_port',), quick=True))
     assert found.causes and all(c.effect != 'flat_port' for c in found.causes)
 
 
@@ -152,7 +155,7 @@ def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alon
         *(np.concatenate([getattr(first, name), getattr(second, name)])
           for name in ('landmark', 'uv', 'xyz')))
     for known in ((), ('session_step',)):
-        found = diagnose(seen, AIR, wanted=Wanted(included=known, quick=True))
+        found = diagnose(seen, AIR, options=DiagnosisOptions(included=known, quick=True))
         assert medium_of(found) is not None
         assert known == tuple(c.effect for c in found.causes if c.effect == 'session_step')
 
@@ -166,6 +169,6 @@ def test_a_view_of_which_half_is_out_of_sight_is_posed_by_the_other_half():
     away = replace(state, pose=state.pose.compose(Pose(turn, np.zeros((data.frames, 3)))))
     offset = away.cameras.offsets(away.pose, data.views)
     assert 0.5 < np.isinf(offset[0]).mean() < 0.9
-    kept, _ = find_gross_errors(data, away)
-    again, _ = find_gross_errors(data, state)
+    kept, _ = find_outliers(data, away)
+    again, _ = find_outliers(data, state)
     np.testing.assert_array_equal(kept.views.used, again.views.used)

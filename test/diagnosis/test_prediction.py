@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis import NullModel, rms_px, with_effect
 from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start
-from fisheye_svp_ros.diagnosis.evidence import bare_evidence
+from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
-from fisheye_svp_ros.diagnosis.prediction import without_causes
-from fisheye_svp_ros.diagnosis.residuals import rms_px
-from fisheye_svp_ros.diagnosis.search import with_effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 
 FREE = ('fx', 'fy', 'cx', 'cy')
@@ -23,7 +21,8 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     cause = CATALOGUE['decentering'](), np.array([size, size / 2])
     data = prepare(observe(lens(), (cause,), pose, views, 0.1, rng))
     state = fit(data, with_effect(start(data, lens()), *cause), FREE)
-    without = without_causes(bare_evidence(data, state, FREE), ['decentering'], FREE)
+    null = NullModel.with_variances(data, state, FREE)
+    without = fit_without_causes(null, ['decentering'], FREE)
     assert not without.terms
     best = fit(data, start(data, lens()), FREE)
     rms = [rms_px(Linearised(data, one, ())) for one in (fit_poses(data, without), best)]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
+from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.budget import REPEATED
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
+from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
-from fisheye_svp_ros.diagnosis.similar_views import similar_views
+from fisheye_svp_ros.diagnosis.variance_budget import REPEATED
 from fisheye_svp_ros.scene.observations import Observations
 
 NOISE = 0.05

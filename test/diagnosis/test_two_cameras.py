@@ -8,16 +8,19 @@ import pytest
 
 from benchmark.two_cameras import Hidden, pair
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.diagnosis import (
+    FRAME,
+    DiagnosisOptions,
+    diagnose,
+    diagnose_against,
+    find_outliers,
+    known_errors,
+    posable_observations,
+    simplest_form,
+)
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.candidates import simplest_form
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.inputs import posable
-from fisheye_svp_ros.diagnosis.known_truth import known_errors
 from fisheye_svp_ros.diagnosis.model import Linearised, prepare
-from fisheye_svp_ros.diagnosis.moments import loose
-from fisheye_svp_ros.diagnosis.noise import FRAME, find_gross_errors
-from fisheye_svp_ros.diagnosis.two_sets import diagnose_against
-from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.diagnosis.problem import rig_is_inconsistent
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -31,14 +34,14 @@ SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
 
 def test_cameras_bear_each_other_out():
     seen = pair(SMALL, 1)
-    found = diagnose(seen.table, seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.verdict == 'agree' and said.withdrawn == ()
     assert 'target_shape' in [cause.effect for cause in found.causes]
     assert said.maps.correlation > 0.95
     assert all(one.with_px < 0.8 * one.without_px for one in said.target)
     assert {one.source for one in said.target} == {'left', 'right'}
-    assert all(rig.low > 0 and rig.gain > 0.3 for rig in said.rig.values())
+    assert all(rig.low > 0 and rig.value > 0.3 for rig in said.rig.values())
     document = found.to_dict()['external']['cameras'][0]
     assert set(document['rig']) == {'translation_m', 'rotation_rad'}
     assert 'bear each other out' in sections(found)[0].sentence
@@ -46,7 +49,7 @@ def test_cameras_bear_each_other_out():
 
 def test_cameras_that_see_different_boards_contradict_each_other():
     seen = pair(replace(SMALL, apart=True, bend=2e-3, reversed_frames=0), 1)
-    found = diagnose(seen.table, seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.verdict == 'contradict' and said.withdrawn == ('target_shape',)
     assert 'target_shape' not in [cause.effect for cause in found.causes]
@@ -66,7 +69,7 @@ def test_reversed_frames_are_found_among_cameras_that_fit_badly():
     seen = pair(rough, 1)
     data = prepare(seen.table)
     first, *others = seen.lenses.values()
-    _, gross = find_gross_errors(data, start(data, first, others))
+    _, gross = find_outliers(data, start(data, first, others))
     torn = {int(data.observations.frame[row]) for row, why in
             zip(gross.rows, gross.why, strict=True) if why == FRAME}
     assert torn == set(seen.reversed_frames) and len(torn) == 2
@@ -78,7 +81,7 @@ def test_a_view_of_few_points_does_not_contradict_the_other_camera():
     few = (table.camera == 0) & (table.frame == 3) & (table.landmark >= 8)
     data = prepare(table.take(~few))
     first, *others = seen.lenses.values()
-    _, gross = find_gross_errors(data, start(data, first, others))
+    _, gross = find_outliers(data, start(data, first, others))
     assert FRAME not in gross.why
 
 
@@ -160,7 +163,7 @@ def test_cameras_that_were_not_photographed_together(late):
     # Of another moment altogether: with the next frame's number.
     table = seen.table if late else replace(
         seen.table, frame=seen.table.frame + seen.table.camera)
-    found = diagnose(table, seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(table, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
     assert 'each view was posed by itself' in sections(found)[0].sentence
@@ -171,7 +174,7 @@ def test_cameras_that_were_not_photographed_together(late):
 def test_cameras_without_a_common_frame():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     apart = replace(seen.table, frame=seen.table.frame + 100 * seen.table.camera)
-    found = diagnose(apart, seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(apart, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.verdict == 'agree' and said.maps.correlation > 0.95 and not said.rig
     assert not said.posed_alone
@@ -187,7 +190,7 @@ def test_a_wrong_lens_is_no_rig_that_moves():
     right = replace(right, fx=1.03 * right.fx, fy=1.03 * right.fy)
     data = prepare(seen.table)
     base = fit(data, start(data, left, [right]), ())
-    assert not loose(data, (left, right), base, ())
+    assert not rig_is_inconsistent(data, (left, right), base, ())
 
 
 def torn_frames(found, where=''):
@@ -199,7 +202,8 @@ def test_one_of_three_shared_frames_is_reversed(seed, which):
     # In seed 2 the pose of one view is far less certain than the others'.
     seen = pair(replace(SMALL, bend=1e-3, columns=9, rows=6, frames=24, reversed_frames=0), seed)
     table, shared = few_shared(seen, 3)
-    found = diagnose(reversed_in(table, shared[which]), seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(reversed_in(table, shared[which]), seen.lenses,
+                     options=DiagnosisOptions(quick=True))
     assert torn_frames(found) == [shared[which]]
     # Two frames say too little of the rig for one to predict the other.
     assert found.named.heldout_rms_px < 0.13 < found.base.heldout_rms_px < 0.21
@@ -223,7 +227,7 @@ def test_reversed_frames_among_those_held_out_are_named(longer):
     train, test = halves(longer)
     shared = np.intersect1d(*(test.frame[test.camera == i] for i in (0, 1)))[:2].tolist()
     found = diagnose(train, longer.lenses, held_out=reversed_in(test, shared),
-                     wanted=Wanted(quick=True))
+                     options=DiagnosisOptions(quick=True))
     assert torn_frames(found, 'held out: ') == shared
     assert found.named.heldout_rms_px < 0.16
     assert f'(frames {shared[0]} and {shared[1]})' in verdict_sentences(found)[2]
@@ -232,7 +236,7 @@ def test_reversed_frames_among_those_held_out_are_named(longer):
 def test_held_out_frames_in_which_the_rig_stands_elsewhere_are_posed_view_by_view(longer):
     train, test = halves(longer)
     late = replace(test, frame=test.frame + test.camera)
-    found = diagnose(train, longer.lenses, held_out=late, wanted=Wanted(quick=True))
+    found = diagnose(train, longer.lenses, held_out=late, options=DiagnosisOptions(quick=True))
     assert found.named.heldout_rms_px < 0.16
     assert 'do not stand as in the others' in verdict_sentences(found)[2]
 
@@ -243,7 +247,7 @@ def test_a_rig_that_was_not_seen_predicts_nothing_in_held_out_frames(longer):
     # The right camera's rows come first.
     test = test.take(np.argsort(-test.camera, kind='stable'))
     test = replace(test, cameras=('right', 'left'), camera=1 - test.camera)
-    found = diagnose(apart, longer.lenses, held_out=test, wanted=Wanted(quick=True))
+    found = diagnose(apart, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
     assert found.named.heldout_rms_px < 0.16
     assert not any('held-out' in advice.what for advice in found.advice)
     with pytest.raises(ObservationError, match='cam0, right'):
@@ -253,7 +257,7 @@ def test_a_rig_that_was_not_seen_predicts_nothing_in_held_out_frames(longer):
 def test_a_frame_that_alone_shows_a_part_of_the_image_spoils_no_figure():
     seen = pair(replace(SMALL, columns=9, rows=6, frames=24, reversed_frames=0), 3)
     gone = (seen.table.camera == 1) & (seen.table.frame % 3 == 0)
-    found = diagnose(seen.table.take(~gone), seen.lenses, wanted=Wanted(quick=True))
+    found = diagnose(seen.table.take(~gone), seen.lenses, options=DiagnosisOptions(quick=True))
     # Frame 19 is at the edge of the right camera's image; without it 2.8 px remain there.
     alone = [one for one in found.advice if 'the others do not predict them' in one.what]
     assert [one.frames for one in alone] == [[19]]
@@ -288,5 +292,5 @@ def test_the_same_photographs_twice_are_no_witness(longer):
 def test_lenses_of_another_image_size_are_refused(longer):
     left, right = longer.lenses.values()
     with pytest.raises(ObservationError, match='outside the 1024x768 px of lens'):
-        posable(longer.table, {'left': right, 'right': left})
-    assert len(posable(longer.table, longer.lenses)[0]) == len(longer.table)
+        posable_observations(longer.table, {'left': right, 'right': left})
+    assert len(posable_observations(longer.table, longer.lenses)[0]) == len(longer.table)

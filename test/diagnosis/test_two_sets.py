@@ -7,11 +7,17 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.diagnosis.carried import Carried
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.prediction import HeldOut, Less, gain_between, less_between
-from fisheye_svp_ros.diagnosis.two_sets import Shared, TwoSets, diagnose_against
-from fisheye_svp_ros.diagnosis.wanted import Wanted
+from fisheye_svp_ros.diagnosis import (
+    Comparison,
+    DiagnosisOptions,
+    HeldOut,
+    SharedParameter,
+    Transfer,
+    TwoDatasets,
+    diagnose,
+    diagnose_against,
+)
+from fisheye_svp_ros.diagnosis.cross_validation import held_out_gain, rms_reduction
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -19,7 +25,7 @@ from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.reporting.external_text import sections
 
 SHIFT, SKEW = CATALOGUE['viewpoint_shift'](), CATALOGUE['skew']()
-QUICK = Wanted(quick=True)
+QUICK = DiagnosisOptions(quick=True)
 
 
 def table(seed, *terms, bend=0.0, frames=8):
@@ -39,7 +45,7 @@ def table(seed, *terms, bend=0.0, frames=8):
 def test_what_moves_with_the_lens_holds_in_the_other_set():
     one, other = (table(seed, (SHIFT, np.array([0.02])), bend=0.002 * k, frames=14)
                   for k, seed in enumerate((31, 32)))
-    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK)
+    found = diagnose_against(one, other, lens(), free_intrinsics=True, options=QUICK)
     said = found.against
     assert said.verdict == 'agree' and not said.withdrawn
     assert set(said.tried[0].causes) == {'viewpoint_shift'}
@@ -64,7 +70,7 @@ def test_nothing_of_the_target_is_predicted_of_another_one():
 def test_what_the_other_set_refutes_is_withdrawn():
     one, other = table(33, (SKEW, np.array([0.003]))), table(34)
     shares = []
-    found = diagnose_against(one, other, lens(), free_intrinsics=True, wanted=QUICK,
+    found = diagnose_against(one, other, lens(), free_intrinsics=True, options=QUICK,
                              progress=lambda _, share: shares.append(share))
     assert shares == sorted(shares) and shares[-1] < 0.88
     assert found.against.withdrawn == ('skew',) and found.against.verdict == 'contradict'
@@ -76,7 +82,8 @@ def test_what_the_other_set_refutes_is_withdrawn():
 
 
 def test_parameters_that_do_not_agree_are_named():
-    said = TwoSets('b.csv', (None, None), {'e0': Shared(2.8e-3, 8e-5, 3.5e-3, 9e-5, 'm')})
+    shift = SharedParameter(2.8e-3, 8e-5, 3.5e-3, 9e-5, 'm')
+    said = TwoDatasets('b.csv', (None, None), {'e0': shift})
     assert said.verdict == 'nothing'
     assert said.parameters['e0'].apart == pytest.approx(-5.8, abs=0.1)
 
@@ -85,7 +92,7 @@ def test_parameters_that_do_not_agree_are_named():
     (0.01, 0.05, True, False), (-0.01, 0.05, False, False), (-0.05, -0.01, False, True),
 ])
 def test_better_and_worse_are_beyond_chance(low, high, better, worse):
-    tried = Carried('a', 'b', 0.2, 0.18, Less((low + high) / 2, low, high))
+    tried = Transfer('a', 'b', 0.2, 0.18, Comparison(0.2, 0.18, (low + high) / 2, low, high))
     assert (tried.better, tried.worse) == (better, worse)
 
 
@@ -94,9 +101,9 @@ def test_the_intervals_of_predictions_hold_95_percent():
     rng, count = np.random.default_rng(5), np.full(400, 20)
     before, after = rng.gamma(8.0, 5.0, 400), rng.gamma(8.0, 2.5, 400)
     spread = [np.std(squares) / np.mean(squares) / 20 for squares in (before, after)]
-    less = less_between(HeldOut(before, count), HeldOut(before / 4, count))
+    less = rms_reduction(HeldOut(before, count), HeldOut(before / 4, count))
     assert (less.high - less.low) / 2 == pytest.approx(1.96 * less.value * spread[0] / 2, rel=0.15)
-    found = gain_between(HeldOut(before, count), HeldOut(after, count), 0.0)
+    found = held_out_gain(HeldOut(before, count), HeldOut(after, count), 0.0)
     ratio = after.mean() / before.mean()
     assert (found.high - found.low) / 2 == pytest.approx(
         1.96 * ratio * np.hypot(*spread), rel=0.15)

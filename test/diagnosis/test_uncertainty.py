@@ -7,21 +7,23 @@ import pytest
 from helpers.water import AIR, photographs
 from scipy import linalg
 
+from fisheye_svp_ros.diagnosis import (
+    DiagnosisOptions,
+    FittedModel,
+    ModelErrors,
+    NullModel,
+    diagnose,
+)
 from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.evidence import gather_evidence
 from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
-from fisheye_svp_ros.diagnosis.refit import fit_of, local_offsets, target_modes
-from fisheye_svp_ros.diagnosis.uncertainty import ModelError
-from fisheye_svp_ros.diagnosis.wanted import Wanted
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.solve.localization import localize
 
 
 def errors_of(observations, free):
     data = prepare(observations)
-    evidence = gather_evidence(data, fit(data, start(data, AIR), free), free)
-    return ModelError.of(evidence, fit_of(evidence)), evidence.linear
+    null = NullModel.fit(data, fit(data, start(data, AIR), free), free)
+    return ModelErrors.of(null, FittedModel.of(null)), null.linear
 
 
 def displaced(frames, seed, size=5e-4):
@@ -67,7 +69,8 @@ def test_poses_scatter_as_the_remaining_misfit_says():
 
 
 def test_a_diagnosis_tells_how_far_off_poses_may_be():
-    found = diagnose(displaced(6, 0), AIR, wanted=Wanted(quick=True)).to_dict()['uncertainty']
+    options = DiagnosisOptions(quick=True)
+    found = diagnose(displaced(6, 0), AIR, options=options).to_dict()['uncertainty']
     assert found['position_m']['misfit'] > found['position_m']['noise'] > 0
     assert found['image_px']['noise'] == pytest.approx(0.02, rel=0.5)
 
@@ -75,45 +78,46 @@ def test_a_diagnosis_tells_how_far_off_poses_may_be():
 def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
     """Its landmarks are off by what was predicted, not by as much as any target's might be."""
     data = prepare(displaced(8, 3))
-    evidence = gather_evidence(data, fit(data, start(data, AIR), ()), ())
-    fitted, sigma = fit_of(evidence), evidence.variances.sigma
-    modes, alone = target_modes(fitted, sigma)
+    null = NullModel.fit(data, fit(data, start(data, AIR), ()), ())
+    fitted, sigma = FittedModel.of(null), null.variances.sigma
+    modes, alone = fitted.target_modes(sigma)
     square = (modes**2).sum(axis=-1) + alone**2
-    off = np.einsum('lab,lb->la', fitted.design.axes, local_offsets(fitted).offset)
+    off = np.einsum('lab,lb->la', fitted.random.axes, fitted.predicted_offsets().offset)
     assert (square >= (1 - 1e-6) * off**2).all()
     assert square.sum() == pytest.approx((off**2).sum(), rel=0.2)
     # One and the same target moves all poses alike: a mode, not a doubt of each landmark's own.
     assert (alone**2).sum() < 0.1 * square.sum()
-    dense = dense_square(evidence, sigma)
+    dense = dense_square(null, sigma)
     whole = modes.reshape(len(dense), -1)
     whole = whole @ whole.T + np.diag(alone.ravel()**2)
     np.testing.assert_allclose(np.diag(whole), np.diag(dense), rtol=1e-5, atol=1e-15)
     assert np.linalg.norm(whole - dense) < 0.05 * np.linalg.norm(dense)
 
 
-def dense_square(evidence, sigma):
+def dense_square(null, sigma):
     """Return the mean square (3 L, 3 L), m^2, of landmarks' offsets given the data, densely."""
-    linear, variances = evidence.linear, evidence.variances
-    random = evidence.design.kept(variances.alive)
+    linear, variances = null.linear, null.variances
+    effects = null.random.select(variances.alive)
+    random = effects.columns
     frames = linear.frame_columns
     fixed = np.concatenate([linalg.block_diag(*frames),
                             linear.shared_columns.reshape(frames.shape[0] * frames.shape[1], -1)],
                            axis=1)
-    blocks = [linalg.block_diag(*random.frame), random.offsets.toarray(),
+    blocks = [linalg.block_diag(*random.group), random.unit_columns.toarray(),
               random.shared.toarray()]
     lam = np.append(variances.lam, 1e12)
-    prior = [np.tile(lam[random.frame_label], len(frames)),
-             (lam[random.landmark_label] * variances.weight[:, None]).ravel(),
+    prior = [np.tile(lam[random.group_label], len(frames)),
+             (lam[random.unit_label] * variances.weight[:, None]).ravel(),
              lam[random.shared_label]]
     columns = np.concatenate([fixed, *blocks], axis=1)
     ridge = np.concatenate([np.zeros(fixed.shape[1]), *prior])
     inverse = np.linalg.inv(columns.T @ columns + np.diag(ridge))
     mean = inverse @ (columns.T @ linear.residual.ravel())
-    way = np.zeros((random.offsets.shape[1], len(inverse)))
+    way = np.zeros((random.unit_columns.shape[1], len(inverse)))
     start_of = fixed.shape[1] + blocks[0].shape[1]
     way[:, start_of:start_of + len(way)] = np.eye(len(way))
     place = start_of + len(way)
-    for field in random.fields:
+    for field in effects.fields:
         for axis in field.axes:
             way.reshape(-1, 3, len(inverse))[
                 :, axis, place:place + field.values.shape[1]] += field.values

@@ -7,8 +7,8 @@ import pytest
 from helpers.guide import LENS, POINTS, SHEET, present, seen_from, session
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
-from fisheye_svp_ros.diagnosis.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError

@@ -9,8 +9,8 @@ from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.diagnosis import Cause
 from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect

@@ -13,7 +13,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from fisheye_svp_ros.diagnosis.target_map import BoardMap
+from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting import evidence_plots
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers.water import AIR, photographs
 
-from fisheye_svp_ros.diagnosis.calibration import trust
+from fisheye_svp_ros.diagnosis import assess_lens
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_port
@@ -44,7 +44,7 @@ def test_a_port_is_found_in_front_of_a_lens_with_corrections():
     result = calibrate_port(seen, air, FlatGlass(0.0, 1.333))
     assert result.adjusted.converged
     assert np.abs(pulls(result, FLAT)).max() < 4
-    found = trust(seen, result.adjusted.lens, result.adjusted.names)
+    found = assess_lens(seen, result.adjusted.lens, result.adjusted.names)
     assert list(found.stderr) == list(result.adjusted.names)
     assert found.covariance.shape == (3, 3)
     assert min(found.stderr.values()) > 0

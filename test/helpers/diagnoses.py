@@ -1,0 +1,13 @@
+"""Diagnoses with other figures than those that were found."""
+
+from dataclasses import replace
+
+from fisheye_svp_ros.diagnosis import Figures, Record
+
+
+def with_changes(found, **changes):
+    """Return a diagnosis with other fields, those of its figures and its record among them."""
+    figures = {name: changes.pop(name) for name in Figures._fields if name in changes}
+    record = {name: changes.pop(name) for name in Record._fields if name in changes}
+    return replace(found, figures=found.figures._replace(**figures),
+                   record=found.record._replace(**record), **changes)
