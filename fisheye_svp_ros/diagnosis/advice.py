@@ -10,8 +10,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
-from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
 from fisheye_svp_ros.diagnosis.outliers import FRAME, VIEW, Outliers
 from fisheye_svp_ros.diagnosis.variance_budget import Component, stage_of
 from fisheye_svp_ros.scene.observations import Observations
@@ -142,7 +142,7 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
 
-def _vary_views(views: SimilarViews) -> Advice:
+def _vary_views(views: RepeatedErrors) -> Advice:
     """Return what to do where landmarks err alike in similar views."""
     soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
     return Advice(

@@ -109,7 +109,7 @@ class Cameras:
             _gathered((rows, ray.valid.astype(float)) for rows, ray in rays) > 0,
         )
         uv = _gathered((rows, scene.uv) for rows, _, scene in parts)
-        return RigScene(views, self.models[0].lens, pose, uv, incidence, parts)
+        return RigScene(views, self.models[0].lens, pose, uv, incidence, parts=parts)
 
     def effect_columns(self, effect: Effect, scene: Scene, seen: Seen) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""

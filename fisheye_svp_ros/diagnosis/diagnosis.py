@@ -15,7 +15,11 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
-from fisheye_svp_ros.diagnosis.checks.two_datasets import TwoDatasets, compare_datasets
+from fisheye_svp_ros.diagnosis.checks.two_datasets import (
+    DatasetModel,
+    TwoDatasets,
+    compare_datasets,
+)
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
@@ -318,8 +322,8 @@ def diagnose_against(
     found = diagnose_one(observations, options, 0.0, 0.35, **settings)
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
     progress('asking each set what it says of the other', 0.7)
-    datasets = compare_datasets(
-        found.evaluation, second.evaluation, observations.source, other.source)
+    models = [DatasetModel(one.before, one.evaluation.null) for one in (found, second)]
+    datasets = compare_datasets(models[0], models[1], observations.source, other.source)
     gone = tuple(name for name in datasets.refuted if name not in options.included)
     if gone:
         found = diagnose_one(observations, options.without(*gone), 0.7, 0.85,

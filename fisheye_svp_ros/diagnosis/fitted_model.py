@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.sparse.linalg import eigsh
@@ -16,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.adjustment import moved
-from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column_norms
 from fisheye_svp_ros.diagnosis.random_effects import (
@@ -51,6 +50,27 @@ _PAIR_REACH = 80  # of the image: how near to each other points have the same pl
 _MIN_PAIRS = 100
 
 
+class RepeatedErrors(Protocol):
+    """What landmarks err by alike in similar views, see `checks.similar_views`.
+
+    own (S, N, 2): in each view, predicted from the others, px; share: of what noise seemed to be.
+    """
+
+    @property
+    def own(self) -> Array: ...
+
+    @property
+    def share(self) -> float: ...
+
+    @property
+    def p_value(self) -> float: ...
+
+    @property
+    def lasting(self) -> float: ...
+
+    def at(self, linear: Linearised) -> Array: ...
+
+
 class PredictedOffsets(NamedTuple):
     """Predicted random effects of landmarks (L, 3), m, of the image (grids, (K, 2) px), of views.
 
@@ -60,7 +80,7 @@ class PredictedOffsets(NamedTuple):
     landmark: Index
     offset: Array
     grids: tuple[tuple[Grid, Array], ...]
-    views: SimilarViews | None = None
+    views: RepeatedErrors | None = None
 
     @property
     def of_image(self) -> PredictedOffsets:

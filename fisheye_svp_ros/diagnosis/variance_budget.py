@@ -15,9 +15,8 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.checks.similar_views import SimilarViews
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, RepeatedErrors
 from fisheye_svp_ros.diagnosis.null_model import NullModel, PlacedEffect
 from fisheye_svp_ros.diagnosis.outliers import Outliers
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
@@ -112,7 +111,7 @@ def _px2(null: NullModel) -> float:
 
 def variance_budget(
     null: NullModel, squares: Mapping[str, float], p_values: Mapping[str, float],
-    repeated: SimilarViews | None = None,
+    repeated: RepeatedErrors | None = None,
 ) -> list[Component]:
     """Return all parts: what is named, random components, noise.
 

@@ -22,9 +22,8 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import (
     moves_with_lens,
 )
 from fisheye_svp_ros.diagnosis.effect_forms import with_effect
-from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
-from fisheye_svp_ros.diagnosis.model import State
+from fisheye_svp_ros.diagnosis.model import Linearised, State
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.forward import Term
@@ -47,6 +46,13 @@ class SharedParameter(NamedTuple):
     def apart(self) -> float:
         """The difference over its standard error."""
         return (self.value - self.other_value) / float(np.hypot(self.stderr, self.other_stderr))
+
+
+class DatasetModel(NamedTuple):
+    """What was found of one data set: the simulation as it was fitted, and the extended model."""
+
+    before: Linearised
+    null: NullModel
 
 
 @dataclass(frozen=True)
@@ -109,8 +115,8 @@ class TwoDatasets:
         }
 
 
-def compare_datasets(one: Evaluation, other: Evaluation, source: str, to: str) -> TwoDatasets:
-    """Return what two evaluations of one camera say of each other."""
+def compare_datasets(one: DatasetModel, other: DatasetModel, source: str, to: str) -> TwoDatasets:
+    """Return what two data sets of one camera say of each other."""
     return TwoDatasets(
         to, (_transfer_causes(one, other, source, to), _transfer_causes(other, one, to, source)),
         _parameters(one, other),
@@ -118,7 +124,7 @@ def compare_datasets(one: Evaluation, other: Evaluation, source: str, to: str) -
 
 
 def _transfer_causes(
-    one: Evaluation, other: Evaluation, source: str, to: str
+    one: DatasetModel, other: DatasetModel, source: str, to: str
 ) -> TransferredCauses | None:
     """Try on another set what one found; None where it found nothing that moves with the lens."""
     carried = [term for term in one.null.linear.state.terms if moves_with_lens(term)]
@@ -145,7 +151,9 @@ def _transfer_causes(
         _transfer_target(one, other, source, to))
 
 
-def _transfer_target(one: Evaluation, other: Evaluation, source: str, to: str) -> Transfer | None:
+def _transfer_target(
+    one: DatasetModel, other: DatasetModel, source: str, to: str
+) -> Transfer | None:
     """Try the target's corrections on the other set, if it shows landmarks of the same places."""
     known, there = (KnownTarget.of(d.null.linear.data.views) for d in (one, other))
     if not any(map(displaces_landmarks, one.null.linear.state.terms)) or not (
@@ -162,7 +170,7 @@ def _transfer_target(one: Evaluation, other: Evaluation, source: str, to: str) -
     return Transfer.of(source, to, without, carried)
 
 
-def _parameters(one: Evaluation, other: Evaluation) -> dict[str, SharedParameter]:
+def _parameters(one: DatasetModel, other: DatasetModel) -> dict[str, SharedParameter]:
     """Fit both sets with the causes of both and compare what is the lens's."""
     both = [_with_lens_effects(a, b) for a, b in ((one, other), (other, one))]
     found: dict[str, SharedParameter] = {}
@@ -173,7 +181,7 @@ def _parameters(one: Evaluation, other: Evaluation) -> dict[str, SharedParameter
     return found
 
 
-def _with_lens_effects(one: Evaluation, other: Evaluation) -> State:
+def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> State:
     """Return the state with the other's causes of the lens as well, starting from nothing."""
     state = one.null.linear.state
     known = {effect.name: len(values) for effect, values in state.terms}
@@ -184,7 +192,7 @@ def _with_lens_effects(one: Evaluation, other: Evaluation) -> State:
     return state
 
 
-def _estimates(one: Evaluation, state: State) -> dict[str, tuple[float, float, str]]:
+def _estimates(one: DatasetModel, state: State) -> dict[str, tuple[float, float, str]]:
     """Return value, standard error and unit of the intrinsics and the lens's causes."""
     data, free, variances = one.null.linear.data, one.null.linear.free, one.null.variances
     state = refit(data, state, free, variances)
