@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.ray_errors import RANGES, RayModel, ray_model, typical_points
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
 from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
 from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
 
 _WIDTH = 9.2  # in
 _ARROWS, _TICKS = 2500, 60
