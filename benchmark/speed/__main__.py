@@ -14,6 +14,7 @@ from benchmark.speed import (  # noqa: E402
     commands,
     growth,
     localization,
+    maps,
     nodes,
     projection,
     stereo,
@@ -27,6 +28,7 @@ from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 
 _PARTS = {
     'projection': projection.rows,
+    'maps': maps.rows,
     'localization': localization.rows,
     'stereo': stereo.rows,
     'variants': variants.rows,

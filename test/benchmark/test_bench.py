@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from benchmark.speed import growth, localization, projection, report, stereo, variants
+from benchmark.speed import growth, localization, maps, projection, report, stereo, variants
 from benchmark.speed.adjustment import exact_view, moved, scipy_pose
 from benchmark.speed.compiled import Kernel
 from benchmark.speed.harness import (
@@ -117,6 +117,13 @@ def test_projections_agree():
         assert any(timing.name.startswith('fisheye-svp') for timing in row.timings)
         for timing in row.timings:
             assert timing.error < 1e-6, (row.title, timing.name)
+
+
+def test_maps_agree():
+    for row in maps.rows(repeats=1):
+        assert any(timing.name.startswith('fisheye-svp') for timing in row.timings)
+        for timing in row.timings:
+            assert timing.error < 1e-3, (row.title, timing.name)
 
 
 def test_localizations_agree():
