@@ -18,7 +18,7 @@ QUICK := $(patsubst %,test/%,optics scene effects io simulate solve rectify dete
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare rectification kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -95,6 +95,11 @@ COMPARE_PYTHON ?= python3.12
 COMPARE_DATA ?= data
 compare: .venv-compare/ready
 	.venv-compare/bin/python -m benchmark.compare $(COMPARE_DATA)
+
+# Rectified pairs of a lens whose viewpoint moves beside mrcal's and OpenCV's, into
+# docs/results/rectification.md; a minute.
+rectification: .venv-compare/ready
+	.venv-compare/bin/python -m benchmark.rectification
 
 # mrcal without what only its windows need, which wants to be compiled.
 .venv-compare/ready: setup.py
