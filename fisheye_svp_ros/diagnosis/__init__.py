@@ -30,7 +30,13 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     point_residuals,
     predict_other_data,
 )
-from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, diagnose, diagnose_against
+from fisheye_svp_ros.diagnosis.diagnosis import (
+    Diagnosis,
+    Figures,
+    Record,
+    diagnose,
+    diagnose_against,
+)
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form, with_effect
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
@@ -87,6 +93,7 @@ __all__ = [
     'EffectTests',
     'ErrorParts',
     'Evaluation',
+    'Figures',
     'FitQuality',
     'FittedModel',
     'HeldOut',
@@ -100,6 +107,7 @@ __all__ = [
     'PointResiduals',
     'PredictedOffsets',
     'Problem',
+    'Record',
     'Selection',
     'SharedParameter',
     'Structure',

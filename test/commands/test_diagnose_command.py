@@ -537,8 +537,8 @@ def test_the_depth_of_a_rig_gains_too():
     known = known_errors(found.before, found.after, ())
     assert set(known) == {'depth_error_m'}
     depth = known['depth_error_m']
-    assert 0 < depth.extended < depth.base
-    assert depth.low <= depth.gain <= depth.high
+    assert 0 < depth.after < depth.before
+    assert depth.low <= depth.value <= depth.high
     # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
     late = with_effect(found.after.state, StereoTimeOffsetEffect(), np.array([0.01]))
     assert known_errors(found.before, Linearised(found.after.data, late, ()), ()) == {}
