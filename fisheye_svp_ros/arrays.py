@@ -11,7 +11,7 @@ Index = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-def placed(where: Mask, values: Array) -> Array:
+def scatter(where: Mask, values: Array) -> Array:
     """Return values (M, ...) at the M true places of a mask (...), NaN at the others."""
     whole = np.full((*where.shape, *values.shape[1:]), np.nan)
     whole[where] = values
@@ -41,12 +41,12 @@ class Batch:
 
     def take(self, index: Any) -> Self:
         """Return what stands at `index` of the leading axes."""
-        return self._made(part.take(index) if isinstance(part, Batch) else part[index]
-                          for part in self._parts())
+        return self._from_fields(part.take(index) if isinstance(part, Batch) else part[index]
+                          for part in self._fields_tuple())
 
     def put(self, index: Any, other: Self) -> None:
         """Write `other` to the places `index` of the leading axes."""
-        for mine, new in zip(self._parts(), other._parts(), strict=True):
+        for mine, new in zip(self._fields_tuple(), other._fields_tuple(), strict=True):
             if isinstance(mine, Batch):
                 mine.put(index, new)
             else:
@@ -55,26 +55,26 @@ class Batch:
     @classmethod
     def stack(cls, parts: Sequence[Self]) -> Self:
         """Join batches of one shape along a new first axis."""
-        return cls._joined(np.stack, parts)
+        return cls._join_fields(np.stack, parts)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Self]) -> Self:
         """Join batches along their first axis."""
-        return cls._joined(np.concatenate, parts)
+        return cls._join_fields(np.concatenate, parts)
 
     @classmethod
-    def _joined(cls, join: Any, parts: Sequence[Self]) -> Self:
-        return cls._made(
-            fields[0]._joined(join, fields) if isinstance(fields[0], Batch) else join(fields)
-            for fields in zip(*(part._parts() for part in parts), strict=True)
+    def _join_fields(cls, join: Any, parts: Sequence[Self]) -> Self:
+        return cls._from_fields(
+            fields[0]._join_fields(join, fields) if isinstance(fields[0], Batch) else join(fields)
+            for fields in zip(*(part._fields_tuple() for part in parts), strict=True)
         )
 
     @classmethod
-    def _made(cls, parts: Any) -> Self:
+    def _from_fields(cls, parts: Any) -> Self:
         make: Any = cls
         made: Self = make(*parts)
         return made
 
-    def _parts(self) -> tuple[Any, ...]:
+    def _fields_tuple(self) -> tuple[Any, ...]:
         assert isinstance(self, tuple)
         return self

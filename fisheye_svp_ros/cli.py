@@ -42,11 +42,11 @@ COMMANDS = {
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
 # Others project many points at once, for which the compiled engine takes every core.
 _ON_ONE_THREAD = ('calibrate', 'diagnose', 'sweep')
-_SIGNALLED = ('record', 'run', 'watch')  # these end themselves on SIGTERM
+_SIGNAL_HANDLERS = ('record', 'run', 'watch')  # these end themselves on SIGTERM
 _BAD_INPUT = 2
-_INTERRUPTED = 130  # 128 + SIGINT, as a shell reports it
+_EXIT_SIGINT = 130  # 128 + SIGINT, as a shell reports it
 _BROKEN_PIPE = 141  # 128 + SIGPIPE
-_TERMINATED = 143  # 128 + SIGTERM
+_EXIT_SIGTERM = 143  # 128 + SIGTERM
 
 
 class _Parser(argparse.ArgumentParser):
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
               file=sys.stderr)
         return _BAD_INPUT
     except KeyboardInterrupt:
-        return _INTERRUPTED
+        return _EXIT_SIGINT
     return 0
 
 
@@ -117,12 +117,12 @@ def _run(arguments: Sequence[str]) -> None:
 @contextmanager
 def _tidy(command: str) -> Iterator[None]:
     """Have SIGTERM end a command as an exception does: temporary files go, children end."""
-    if command in _SIGNALLED or threading.current_thread() is not threading.main_thread():
+    if command in _SIGNAL_HANDLERS or threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def end(*_: object) -> NoReturn:
-        sys.exit(_TERMINATED)
+        sys.exit(_EXIT_SIGTERM)
 
     before = signal.signal(signal.SIGTERM, end)
     try:

@@ -127,14 +127,14 @@ def quaternion_from_rotation(rotation: Array) -> Array:
     """Matrices (..., 3, 3) to unit quaternions (..., 4), x, y, z, w with w >= 0."""
     # 4 q qT, which is linear in the rotation; its row of the largest diagonal term, one of the
     # four candidates of Shepperd (1978), is the best conditioned multiple of q.
-    outer = rotation.reshape(-1, 9) @ _OUTER + _UNIT
+    outer = rotation.reshape(-1, 9) @ _QUATERNION_PRODUCT + _UNIT
     best = outer[:, ::5].argmax(axis=1)
     chosen: Array = outer.reshape(-1, 4, 4)[np.arange(len(outer)), best]
     chosen /= np.copysign(np.sqrt((chosen * chosen).sum(axis=1)), chosen[:, 3])[:, None]
     return chosen.reshape(*rotation.shape[:-2], 4)
 
 
-def _outer() -> Array:
+def _quaternion_product_matrix() -> Array:
     """Return the matrix (9, 16) that makes 4 q qT, but for the identity, of a rotation matrix."""
     outer = np.zeros((3, 3, 4, 4))
     for i in range(3):
@@ -147,7 +147,7 @@ def _outer() -> Array:
     return outer.reshape(9, 16)
 
 
-_OUTER = _outer()
+_QUATERNION_PRODUCT = _quaternion_product_matrix()
 _UNIT = np.eye(4).ravel()
 
 

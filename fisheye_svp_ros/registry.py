@@ -24,13 +24,13 @@ class Registry(Mapping[str, T]):
         self._what, self._own, self._base = what, own, base
 
     def __getitem__(self, name: str) -> T:
-        return self._own[name] if name in self._own else self._added[name]
+        return self._own[name] if name in self._own else self._entry_points[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter((*self._own, *self._added))
+        return iter((*self._own, *self._entry_points))
 
     def __len__(self) -> int:
-        return len(self._own) + len(self._added)
+        return len(self._own) + len(self._entry_points)
 
     def name_of(self, kind: object) -> str | None:
         """Return the name of a kind; None where it is not registered."""
@@ -41,7 +41,7 @@ class Registry(Mapping[str, T]):
         return None
 
     @cached_property
-    def _added(self) -> dict[str, T]:
+    def _entry_points(self) -> dict[str, T]:
         group = f'fisheye_svp_ros.{self._what}'
         return {entry.name: self._load(entry) for entry in entry_points(group=group)}
 

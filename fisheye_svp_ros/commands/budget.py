@@ -53,10 +53,10 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.scene.rigs import rig
-    from fisheye_svp_ros.study.budget import Setup, at_point, make_budget, usual_spread
+    from fisheye_svp_ros.study.budget import Setup, at_point, default_spread, make_budget
 
     lens = load_with_notes(lens_path(args.lens))
-    spread = usual_spread(lens) if args.spread is None else np.radians(args.spread).item()
+    spread = default_spread(lens) if args.spread is None else np.radians(args.spread).item()
     limits = _limits(args)
     with progress('solving'):
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))

@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> None:
         table = observations.take(observations.camera == number)
         name = camera or (args.output.stem if args.output else args.model)
         size = sizes.get(camera) or sizes['']
-        found[camera] = _calibrated(table, args, size, name)
+        found[camera] = _calibrate_camera(table, args, size, name)
     # Written before a word is printed: nobody may be reading.
     if args.output:
         from fisheye_svp_ros.reporting.calibration_report import write_calibration_report
@@ -116,7 +116,7 @@ def _next_command(args: argparse.Namespace, paths: Mapping[str, Path]) -> str:
                        '-o', 'diagnosis'])
 
 
-def _calibrated(
+def _calibrate_camera(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
@@ -158,7 +158,7 @@ def _rig(
 
     left, right = (ForwardModel(lenses[name]) for name in names)
     try:
-        both = _of_both(observations, {name: lenses[name] for name in names})
+        both = _common_frames(observations, {name: lenses[name] for name in names})
     except ObservationError as cause:
         say(f'rig: {cause}')
         return
@@ -182,7 +182,7 @@ def _rig(
         save_rig(fitted.rig.take(0), folder / 'rig.yaml', names)
 
 
-def _of_both(observations: Observations, lenses: dict[str, Lens]) -> Observations:
+def _common_frames(observations: Observations, lenses: dict[str, Lens]) -> Observations:
     """Return the rows of the frames that both cameras of a rig have, without gross errors.
 
     Raises ObservationError where there is no such frame, or no rig explains most of them.

@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
                 'that of another camera, or of another image size? `localize` says how far each '
                 f'is off.{poses_too}'
             ) from cause
-        wanted, impossible = _wanted(args, diagnosis) if args.count else (None, None)
+        wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
             with together():
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> None:
         raise impossible
 
 
-def _wanted(
+def _plan_next_views(
     args: argparse.Namespace, diagnosis: Diagnosis
 ) -> tuple[NextViews | None, FisheyeSvpError | None]:
     """Return the photographs to take next, or why there are none: what was found comes first."""

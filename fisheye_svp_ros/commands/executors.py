@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from fisheye_svp_ros.errors import SweepError
 from fisheye_svp_ros.study.sweep import InProcess
 
-_AHEAD = 3  # tasks under way for each worker: none waits for the next
+_TASKS_PER_WORKER = 3  # tasks under way for each worker: none waits for the next
 _PATIENCE = 10  # s for a scheduler to answer, and for its first worker
 
 
@@ -40,7 +40,7 @@ def local(count: int) -> Iterator[Workers]:
     with tempfile.TemporaryDirectory(prefix='fisheye_svp_') as folder:
         executor = _Processes(count, folder)
         try:
-            yield Workers(executor, _AHEAD * count)
+            yield Workers(executor, _TASKS_PER_WORKER * count)
         except BrokenExecutor as cause:
             raise SweepError('a worker process died (out of memory?); what is done is kept, '
                              '--resume goes on with fewer --workers') from cause
@@ -71,7 +71,7 @@ class _Processes(ProcessPoolExecutor):
 
         def done(written: Future[Path]) -> None:
             try:
-                result.set_result(_taken(written.result()))
+                result.set_result(_load_and_delete(written.result()))
             except Exception as error:
                 result.set_exception(error)
 
@@ -85,7 +85,7 @@ def _written(folder: str, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> 
     return Path(file.name)
 
 
-def _taken(path: Path) -> Any:
+def _load_and_delete(path: Path) -> Any:
     value = pickle.loads(path.read_bytes())
     path.unlink()
     return value
@@ -112,7 +112,7 @@ def dask(address: str) -> Iterator[Workers]:
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as cause:
             raise SweepError(f'{address}: the Dask cluster has no worker; start one') from cause
-        ahead = _AHEAD * sum(client.nthreads().values())
+        ahead = _TASKS_PER_WORKER * sum(client.nthreads().values())
         try:
             yield Workers(client.get_executor(pure=False), ahead)
         except (distributed.KilledWorker, CommClosedError) as cause:

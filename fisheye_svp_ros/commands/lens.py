@@ -24,8 +24,8 @@ from fisheye_svp_ros.rectify.svp import nearest_svp_lens
 from fisheye_svp_ros.reporting.tables import print_table, range_text
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
-_AROUND = np.radians(np.arange(0, 360, 15))  # the axis
-_SEEN = 5e-4  # px
+_AZIMUTHS = np.radians(np.arange(0, 360, 15))  # the axis
+_VISIBLE_PX = 5e-4  # px
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -89,7 +89,7 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
     write_text(args.output, text)
     written = read_foreign(args.output, text)
     if written is not None:
-        _lost(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
+        _print_loss(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
 
 
 def _rigs(foreign: Foreign) -> None:
@@ -98,7 +98,7 @@ def _rigs(foreign: Foreign) -> None:
               + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
 
 
-def _lost(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool) -> None:
+def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool) -> None:
     """Say what the form does not hold, px, by angle and range; or how that could be less."""
     port = () if lens.port is None else (PORT,)
     own = [name for name in lens.corrections if name not in written.corrections]
@@ -109,13 +109,14 @@ def _lost(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool
         print(f'left out: {", ".join(named)}')
     angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]
     theta = np.radians(angles)[:, None]
+    sin = np.sin(theta)
     around = np.stack(np.broadcast_arrays(
-        np.sin(theta) * np.cos(_AROUND), np.sin(theta) * np.sin(_AROUND), np.cos(theta)), axis=-1)
+        sin * np.cos(_AZIMUTHS), sin * np.sin(_AZIMUTHS), np.cos(theta)), axis=-1)
     distance = np.minimum(ranges, MAX_RANGE)
     points = distance[:, None, None] * around[:, None]
     off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
     worst = np.fmax.reduce(off, axis=-1)
-    if np.fmax.reduce(worst, axis=None) > _SEEN:
+    if np.fmax.reduce(worst, axis=None) > _VISIBLE_PX:
         print_table('without it image points are off by up to, px',
                     ('deg', *map(range_text, ranges)),
                     [(str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))

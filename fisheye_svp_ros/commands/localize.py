@@ -22,7 +22,7 @@ from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured, rms_px
 
-_SHOWN = 40  # frames in the table for people
+_MAX_TABLE_ROWS = 40  # frames in the table for people
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
 _AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
@@ -78,10 +78,10 @@ def _print(
         for part in (slice(0, 3), slice(3, 6))
     ]
     rows = []
-    for i, frame in enumerate(views.frame[:_SHOWN]):
+    for i, frame in enumerate(views.frame[:_MAX_TABLE_ROWS]):
         place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
         rows.append((
-            _called(table, int(frame)), str(int(views.used[i].sum())),
+            _frame_label(table, int(frame)), str(int(views.used[i].sum())),
             f'{rms_px(measured.fitted[i]):.4f}', *place,
             f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
         ))
@@ -91,13 +91,13 @@ def _print(
         f'rms {rms_px(measured.fitted):.4f} px',
         header, rows,
     )
-    if len(views.frame) > _SHOWN:
-        print(f'  and {len(views.frame) - _SHOWN} more frames')
+    if len(views.frame) > _MAX_TABLE_ROWS:
+        print(f'  and {len(views.frame) - _MAX_TABLE_ROWS} more frames')
     said = noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty)
     print(f'  {said}, in the worst direction')
 
 
-def _called(table: Observations, frame: int) -> str:
+def _frame_label(table: Observations, frame: int) -> str:
     """Return the photograph's name, or the number of a frame without one."""
     return frame_name(table, frame).removeprefix('frame ')
 

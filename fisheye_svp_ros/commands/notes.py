@@ -13,9 +13,9 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Outliers
     from fisheye_svp_ros.scene.observations import Observations
 
-_ALIKE = 3  # frames whose reasons differ by numbers alone; of more the first speaks for all
+_MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
 _DIGITS = re.compile(r'\d')
-_HUGE = 20.0  # m; a target larger than this was measured in other units
+_MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
 
 
 def say(note: str) -> None:
@@ -49,7 +49,7 @@ def note_copies(table: Observations, frames: Sequence[int]) -> None:
 def note_huge(table: Observations) -> None:
     """Ask for the unit of a target that is larger than targets are."""
     across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
-    if across > _HUGE:
+    if across > _MAX_TARGET_SIZE:
         say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
 
 
@@ -77,7 +77,7 @@ def note_doubtful(
         if reason:
             alike.setdefault(_DIGITS.sub('', reason), []).append((frame, reason))
     for doubtful in alike.values():
-        shown = len(doubtful) if len(doubtful) <= _ALIKE else 1
+        shown = len(doubtful) if len(doubtful) <= _MAX_SIMILAR_NOTES else 1
         for frame, reason in doubtful[:shown]:
             say(f'{frame_name(table, frame)}: {reason}')
         if rest := [frame for frame, _ in doubtful[shown:]]:

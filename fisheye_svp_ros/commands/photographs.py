@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
 
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
-_SHOWN = 12
+_MAX_LISTED = 12
 _UNCERTAIN = 0.9
 
 
@@ -158,10 +158,10 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
            for one in sorted(detection.searched, key=lambda one: not one.reason)
            if one.reason or one.notes]
-    for line in odd[:_SHOWN]:
+    for line in odd[:_MAX_LISTED]:
         say(line)
-    if len(odd) > _SHOWN:
-        say(f'and {len(odd) - _SHOWN} more such photographs')
+    if len(odd) > _MAX_LISTED:
+        say(f'and {len(odd) - _MAX_LISTED} more such photographs')
     unsure = int((detection.certainty < _UNCERTAIN).sum())
     if unsure:
         say(f'{unsure} photographs: which corner is the first is less than '

@@ -74,12 +74,12 @@ class Processes:
                 if status is None:
                     continue
                 if status or name not in waiting:
-                    raise GraphError(f'{name} ended with status {status}: {self._last(name)}')
+                    raise GraphError(f'{name} ended with status {status}: {self._last_line(name)}')
                 waiting.discard(name)
                 del self._running[name]
             if time.monotonic() > end:
                 raise GraphError(f'{", ".join(sorted(waiting))} took more than '
-                                      f'{patience:g} s: {self._last(min(waiting))}')
+                                      f'{patience:g} s: {self._last_line(min(waiting))}')
             look()
             time.sleep(_POLL)
 
@@ -97,7 +97,7 @@ class Processes:
     def _log(self, name: str) -> Path:
         return self._logs / f'{name}.log'
 
-    def _last(self, name: str) -> str:
+    def _last_line(self, name: str) -> str:
         lines = self.latest(name).splitlines()
         return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
 

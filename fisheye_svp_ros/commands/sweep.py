@@ -20,7 +20,7 @@ from fisheye_svp_ros.reporting.tables import print_table
 from fisheye_svp_ros.study.metrics import summarise
 from fisheye_svp_ros.study.sweep import Plan, column_types, fingerprint, solve_sweep, tasks, work
 
-_LARGE = 1_000_000  # scenarios; more are rather a slip in the file than meant
+_MAX_SCENARIOS = 1_000_000  # scenarios; more are rather a slip in the file than meant
 _PARTS, _SUMMARY = 'parts', 'sweep.json'
 _MARK = 'sweep.txt'
 
@@ -40,20 +40,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--resume', action='store_true',
                         help='go on with what an interrupted run has left in DIR, if anything')
     parser.add_argument('--large', action='store_true',
-                        help=f'allow more than {_LARGE} scenarios')
+                        help=f'allow more than {_MAX_SCENARIOS} scenarios')
 
 
 def run(args: argparse.Namespace) -> None:
     """Solve what is not solved yet; join the parts."""
     path = sweep_path(str(args.file))
     plan = read_sweep(path)
-    if len(plan.sweep) > _LARGE and not args.large:
+    if len(plan.sweep) > _MAX_SCENARIOS and not args.large:
         lengths = ' x '.join(f'{len(v)} {name}' for name, v in plan.sweep.lists.items())
         raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); --large if that '
                              'is meant')
     parts = Parts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
-    if args.resume and _finished(args.output, mine):
+    if args.resume and _is_complete(args.output, mine):
         say(f'{args.output} holds this sweep already')
     else:
         engine = _claim(parts, mine, args.resume, work(plan))
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
     shutil.rmtree(parts.folder, ignore_errors=True)
 
 
-def _finished(folder: Path, mine: str) -> bool:
+def _is_complete(folder: Path, mine: str) -> bool:
     """Say whether a folder holds the whole table of a sweep."""
     summary = folder / _SUMMARY
     return summary.exists() and read_json(summary, OutputError).get('fingerprint') == mine

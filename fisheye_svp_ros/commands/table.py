@@ -17,7 +17,7 @@ from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import console, print_table
 
 Cells = dict[str, list[str]]  # by column
-_SHOWN = 40  # rows for people
+_MAX_ROWS = 40  # rows for people
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,11 +57,11 @@ def _print(bag: str, columns: Columns) -> None:
         if name not in varying:
             print(f'  {name}: {_cell(columns[name][0])}')
     rows = len(columns[STAMP])
-    print(f'{bag}: {rows} rows' + (f', the first {_SHOWN}' if rows > _SHOWN else ''))
+    print(f'{bag}: {rows} rows' + (f', the first {_MAX_ROWS}' if rows > _MAX_ROWS else ''))
     tags, metrics = dict[str, list[str]](), dict[str, list[str]]()
     for name in varying:
         to = metrics if '.' in name else tags
-        to[name] = [_cell(value) for value in columns[name][:_SHOWN]]
+        to[name] = [_cell(value) for value in columns[name][:_MAX_ROWS]]
     if len(tags) > 1:
         tags.pop(STAMP, None)  # the scenario says it more readably
     for block in _blocks(tags, metrics):

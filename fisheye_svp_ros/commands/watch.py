@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
     from fisheye_svp_ros.nodes.watcher import Watcher
 
-_LEAST = 64  # columns: three numbers, and some of the names, which are broken into lines
+_MIN_COLUMNS = 64  # columns: three numbers, and some of the names, which are broken into lines
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,16 +33,16 @@ def run(args: argparse.Namespace) -> None:
     with ros_session(args.ros_args):
         watcher = Watcher()
         with Live(console=console(), refresh_per_second=4) as live:
-            watcher.spin(lambda: live.update(_shown(watcher, live.console.width)))
+            watcher.spin(lambda: live.update(_result_table(watcher, live.console.width)))
         watcher.destroy_node()
 
 
-def _shown(watcher: Watcher, width: int) -> RenderableType:
+def _result_table(watcher: Watcher, width: int) -> RenderableType:
     from rich import box
     from rich.table import Table
 
-    if width < _LEAST:
-        return f'a terminal {_LEAST} columns wide is needed; this one has {width}'
+    if width < _MIN_COLUMNS:
+        return f'a terminal {_MIN_COLUMNS} columns wide is needed; this one has {width}'
     table = Table(box=box.SIMPLE_HEAD)
     for name in ('node', 'metric'):
         table.add_column(name, overflow='fold')

@@ -21,7 +21,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, gather_rows, placed
+from fisheye_svp_ros.arrays import Array, Index, gather_rows, scatter
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.camera import Incidence
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
@@ -88,7 +88,7 @@ class Scene:
         """Time of each view (S,), s; NaN where unknown."""
         t = np.where(self.views.used, self.views.t, np.nan)
         known = np.asarray(np.isfinite(t).any(axis=1))
-        return placed(known, np.nanmean(t[known], axis=1))
+        return scatter(known, np.nanmean(t[known], axis=1))
 
     @cached_property
     def twist(self) -> Array:

@@ -24,7 +24,7 @@ from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import Solved, localized, residual_points
+from fisheye_svp_ros.study.solutions import SetSolutions, localized, residual_points
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import LensErrors
@@ -102,7 +102,7 @@ class Localizer(SolverNode):
 
     def _localized(
         self, model: ForwardModel, views: Views, true: Pose | None
-    ) -> Solved[Localization]:
+    ) -> SetSolutions[Localization]:
         """Solve from where the camera was, which is faster; from anywhere if that is not near.
 
         A wrong lens is wrong in every set; to search each for gross errors would take 20 ms more.
@@ -128,7 +128,7 @@ def _errors_of(lens: Lens) -> LensErrors:
     return LensErrors.of(lens)
 
 
-def _rms_px(found: Solved[Localization]) -> float:
+def _rms_px(found: SetSolutions[Localization]) -> float:
     """Return the residual of one view; infinite without a pose."""
     return float(found.metrics['rms_px'][0]) if found.solved[0] else np.inf
 

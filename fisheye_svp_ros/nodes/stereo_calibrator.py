@@ -16,7 +16,7 @@ from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.metrics import STEREO_CALIBRATION_METRICS
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
-from fisheye_svp_ros.study.solutions import Solved, calibrated
+from fisheye_svp_ros.study.solutions import SetSolutions, calibrated
 
 
 class StereoCalibrator(SolverNode):
@@ -53,7 +53,7 @@ class StereoCalibrator(SolverNode):
         self._window, self._scenario = window, scenario
         self._publish(stamp, items, found)
 
-    def _publish(self, stamp: int, items: Items, found: Solved[StereoCalibration]) -> None:
+    def _publish(self, stamp: int, items: Items, found: SetSolutions[StereoCalibration]) -> None:
         rig, true = found.solution.rig.take(0), true_rig(items)
         left, right = (items[f'{camera}image_points'].frame for camera in self.CAMERAS)
         self._rig.publish(messages.transform_message(rig, stamp, right, left))

@@ -54,7 +54,7 @@ class LinearImage:
     def incidence(self) -> Incidence:
         """Where the points have their ray through the lens."""
         if self.lens.port is not None:
-            return _shaped(ported.met(self.lens, self._sight, self.limited),
+            return _reshape(ported.met(self.lens, self._sight, self.limited),
                            self.points.shape[:-1])
         return incidence(self.lens, self.points, self.limited)
 
@@ -105,10 +105,10 @@ def incidence(lens: Lens, points: Array, limited: bool = True) -> Incidence:
     limited: also refuse angles past the lens's `max_incidence`; a solver on its way does not.
     Source: Kita, section 2 and figure 2.
     """
-    return _shaped(engines.incidence(lens, points.reshape(-1, 3), limited), points.shape[:-1])
+    return _reshape(engines.incidence(lens, points.reshape(-1, 3), limited), points.shape[:-1])
 
 
-def _shaped(fields: Incidence, shape: tuple[int, ...]) -> Incidence:
+def _reshape(fields: Incidence, shape: tuple[int, ...]) -> Incidence:
     return Incidence._make(field.reshape((*field.shape[:-1], *shape)) for field in fields)
 
 

@@ -161,7 +161,8 @@ class ViewpointShift(Curve):
     def value_and_slope(self, theta: Array, half_tan: Array) -> tuple[Array, Array]:
         """Return s and ds/dtheta; `half_tan` is tan(theta / 2), which the caller has at hand."""
         # The guards only matter on the axis, where the slope of every shift vanishes.
-        t, theta = np.maximum(half_tan, formulas.NOWHERE), np.maximum(theta, 2 * formulas.NOWHERE)
+        t = np.maximum(half_tan, formulas.AXIS_EPS)
+        theta = np.maximum(theta, 2 * formulas.AXIS_EPS)
         scale = 1 / (1 + t * t)
         sin, cos = 2 * t * scale, (1 - t * t) * scale
         value, rise = self.formula(theta, sin, cos, *self.coefficients)

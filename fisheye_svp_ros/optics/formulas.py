@@ -11,7 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 
-NOWHERE = 1e-30  # m; added to X, it gives points on the axis a direction and changes no other
+AXIS_EPS = 1e-30  # m; added to X, it gives points on the axis a direction and changes no other
 
 
 def orthographic(sin: Array, cos: Array) -> tuple[Array, Array]:
@@ -26,13 +26,13 @@ def equidistant(theta: Array) -> tuple[Array, Array]:
 
 def equisolid(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 sin(theta / 2) and its derivative."""
-    half_sin, half_cos = halved(sin, cos)
+    half_sin, half_cos = half_angle(sin, cos)
     return 2.0 * half_sin, half_cos
 
 
 def stereographic(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Return 2 tan(theta / 2) and its derivative."""
-    half_sin, half_cos = halved(sin, cos)
+    half_sin, half_cos = half_angle(sin, cos)
     half_tan = half_sin / half_cos
     return 2.0 * half_tan, 1.0 + half_tan * half_tan
 
@@ -91,7 +91,7 @@ def flat_port(
     return thickness * (1.0 - cos * inverse), rise
 
 
-def halved(sin: Array, cos: Array) -> tuple[Array, Array]:
+def half_angle(sin: Array, cos: Array) -> tuple[Array, Array]:
     """Sine and cosine of theta / 2; the larger comes first, as rounding wants it."""
     larger = np.sqrt(0.5 + 0.5 * np.abs(cos))
     smaller = 0.5 * sin / larger

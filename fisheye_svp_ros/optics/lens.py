@@ -14,7 +14,7 @@ from fisheye_svp_ros.optics.ports import Port
 
 INTRINSICS = ('fx', 'fy', 'cx', 'cy')
 PORT = 'port'  # before the names of a port's coefficients, among those of a lens
-_INSIDE = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
+_RANGE_MARGIN = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def curve_limit(lens: Lens) -> float:
 
 def monotone_limit(lens: Lens) -> float:
     """Return the angle, rad, just inside which both curves of the lens can be used."""
-    return curve_limit(lens) * _INSIDE
+    return curve_limit(lens) * _RANGE_MARGIN
 
 
 def field_of_view(lens: Lens) -> float:

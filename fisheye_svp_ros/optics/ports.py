@@ -120,9 +120,9 @@ class FlatGlass(Port):
         one = constant(1.0, len(medium.slope))
         normal = joined(tilt_y.tan(), 0.0 - tilt_x.tan(), one).unit()
         at = origin + direction * ((distance - normal.dot(origin)) / normal.dot(direction))
-        direction = refracted(direction, normal, one, glass)
+        direction = refract(direction, normal, one, glass)
         at = at + direction * (thickness / normal.dot(direction))
-        return at, refracted(direction, normal, glass, medium)
+        return at, refract(direction, normal, glass, medium)
 
     def start(self, points: Array) -> Array:
         """See `Port.start`; exact where the viewpoint is the origin, NaN where no ray leads.
@@ -187,7 +187,7 @@ class DomeGlass(Port):
             origin = origin + direction * (
                 (along * along - arm.dot(arm) + size * size).root() - along
             )
-            direction = refracted(direction, (origin - centre) / size, index, beyond)
+            direction = refract(direction, (origin - centre) / size, index, beyond)
             index = beyond
         return origin, direction
 
@@ -201,7 +201,7 @@ class DomeGlass(Port):
         return super().check()
 
 
-def refracted(direction: Varying, normal: Varying, before: Varying, after: Varying) -> Varying:
+def refract(direction: Varying, normal: Varying, before: Varying, after: Varying) -> Varying:
     """Return directions behind a face by Snell's law; normal: the way the light is followed.
 
     NaN where all of it is reflected, or where it does not come to this side of the face.

@@ -17,13 +17,13 @@ from fisheye_svp_ros.optics.formulas import newton_step
 from fisheye_svp_ros.optics.lens import Lens
 
 NEWTON_STEPS, MORE_STEPS = 3, 3  # for all points, and for those that need them
-SETTLED = 1e-7  # a last Newton step this small leaves an error of its square
-CLEAR = 1e-20  # m; a clearance of 0 but for rounding
+STEP_TOLERANCE = 1e-7  # a last Newton step this small leaves an error of its square
+ZERO_CLEARANCE = 1e-20  # m; a clearance of 0 but for rounding
 _HALVINGS = 48
-_EXACT = 1e-13  # rad
+_ANGLE_TOLERANCE = 1e-13  # rad
 _MARGIN = 0.1  # rad past `max_incidence` in which a solver on its way still gets an answer
 _ANGLE_SLACK = 1e-9  # rad; keeps points exactly at the edge of the field inside it
-BEHIND = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
+BACKWARD_ANGLE = float(np.nextafter(np.pi, 0.0))  # nothing that is seen lies on the axis behind
 
 ShiftedRays = tuple[Array, Array, Array]  # sine and cosine of theta, clearance (m)
 
@@ -81,18 +81,18 @@ def solve_incidence(lens: Lens, local: Array, limited: bool) -> RaySolution:
     theta = np.arctan2(r, z)
     shifted: ShiftedRays | None = None
     if lens.viewpoint_shift is None:
-        valid = d2 > CLEAR * CLEAR
+        valid = d2 > ZERO_CLEARANCE * ZERO_CLEARANCE
     else:
         distance = np.sqrt(d2)
         theta, shifted = _shifted_rays(lens, r, z, distance, (theta, r / distance, z / distance))
-        valid = shifted[2] > CLEAR
+        valid = shifted[2] > ZERO_CLEARANCE
     valid &= theta <= edge(lens, limited)
     return RaySolution(x, y, z, x2, r2, d2, r, theta, shifted, valid)
 
 
 def edge(lens: Lens, limited: bool) -> float:
     """Return the largest angle that counts, rad: the lens's own, if `limited` to it."""
-    return min(lens.max_incidence + _ANGLE_SLACK, BEHIND) if limited else BEHIND
+    return min(lens.max_incidence + _ANGLE_SLACK, BACKWARD_ANGLE) if limited else BACKWARD_ANGLE
 
 
 def search_limit(shift: ViewpointShift, max_incidence: float) -> float:
@@ -145,7 +145,7 @@ def _newton(
     turned = step * cos
     turned += sin
     cos -= step * sin
-    found = (theta, turned, cos, clearance, np.abs(step, out=step) < SETTLED)
+    found = (theta, turned, cos, clearance, np.abs(step, out=step) < STEP_TOLERANCE)
     late = ~found[-1]
     if more and late.any():
         start = theta[late], *_sine_and_cosine(theta[late])
@@ -185,11 +185,11 @@ def _scan(shift: ViewpointShift, limit: float, r: Array, z: Array) -> Array:
         high = np.take_along_axis(grid, right, axis=1)
     theta = np.full(len(r), np.nan)
     if found.any():
-        theta[found] = _bracketed(shift, r[found], z[found], low[found, 0], high[found, 0])
+        theta[found] = _bracketed_newton(shift, r[found], z[found], low[found, 0], high[found, 0])
     return theta
 
 
-def _bracketed(shift: ViewpointShift, r: Array, z: Array, low: Array, high: Array) -> Array:
+def _bracketed_newton(shift: ViewpointShift, r: Array, z: Array, low: Array, high: Array) -> Array:
     """Newton steps that fall back to halving the bracket; the equation falls through zero."""
     theta = (low + high) / 2
     for _ in range(_HALVINGS):
@@ -198,7 +198,7 @@ def _bracketed(shift: ViewpointShift, r: Array, z: Array, low: Array, high: Arra
         step = theta - value / slope
         inside = (step >= low) & (step <= high)
         before, theta = theta, np.where(inside, step, (low + high) / 2)
-        if np.all(np.abs(theta - before) < _EXACT):
+        if np.all(np.abs(theta - before) < _ANGLE_TOLERANCE):
             break
     return theta
 

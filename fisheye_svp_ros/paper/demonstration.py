@@ -160,14 +160,14 @@ def _row(task: Task, lens: str, radius: float, where: str, row: dict[str, Any]) 
         value = row.get(f'{task.node}.{name}')
         return np.nan if value is None else float(value)
 
-    error, axis, pixels = _published(task, lens, radius, where)
+    error, axis, pixels = _published_cells(task, lens, radius, where)
     return DemoRow(
         task.name, lens, radius, where, metric(task.error), metric('axis_error_rad'),
         metric(task.pixels), error, axis, pixels
     )
 
 
-def _published(
+def _published_cells(
     task: Task, lens: str, radius: float, where: str
 ) -> tuple[tuple[float, float], float, tuple[float, float]]:
     """Return error, m, axis error, rad, and px; for depth the paper gives ranges."""

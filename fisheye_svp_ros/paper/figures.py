@@ -30,7 +30,7 @@ from fisheye_svp_ros.scene.rigs import calibration_poses, rig
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 
 _COLOURS = {'fish180': OURS, 'fish214': PUBLISHED}
-_MAGNIFIED = 100  # residuals of figure 6
+_RESIDUAL_MAGNIFICATION = 100  # residuals of figure 6
 _VERTICAL_MAGNIFIED = {'fish180': 100, 'fish214': 10}
 _TRUE, _MEASURED = PUBLISHED, OURS
 _CURVE = 120  # points of an epipolar curve
@@ -245,7 +245,7 @@ def _draw_residuals(axis: Any, localized: LocalizedSpread, row: int, colour: str
     """Draw image points as circles, residuals (measured less predicted) as lines, magnified."""
     seen = localized.views.used[row]
     uv = localized.views.uv[row][seen]
-    ends = uv - _MAGNIFIED * localized.solved.residual[row][seen]
+    ends = uv - _RESIDUAL_MAGNIFICATION * localized.solved.residual[row][seen]
     axis.plot(uv[:, 0], uv[:, 1], 'o', fillstyle='none', color=_INK, markersize=3,
               markeredgewidth=0.6)
     axis.plot([uv[:, 0], ends[:, 0]], [uv[:, 1], ends[:, 1]], color=colour, linewidth=1.2)

@@ -23,7 +23,7 @@ from fisheye_svp_ros.paper.tables import (
     NAMES,
     OUT_OF_LINE,
     QUANTITIES,
-    REPEATED,
+    REPEATED_CELL,
     STYLE_NAMES,
     UNITS,
     Cell,
@@ -48,7 +48,7 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
 
     Raises OutputError where one cannot be written.
     """
-    parts = (_summary, _recovered, _localization, _stopping, _calibration, _stereo, _claims,
+    parts = (_summary, _recovery, _localization, _stopping, _calibration, _stereo, _claims,
              _solvers, _noise, _differences)
     blocks = [block for part in parts for block in part(results)]
     with together():
@@ -107,7 +107,7 @@ def _summary(results: Results) -> Iterator[Block]:
     )
 
 
-def _recovered(results: Results) -> Iterator[Block]:
+def _recovery(results: Results) -> Iterator[Block]:
     fits, count = results.family.fits, len(results.family.members)
     yield Heading('What the tables determine')
     yield Text(
@@ -126,9 +126,9 @@ def _recovered(results: Results) -> Iterator[Block]:
         curves = _MM * shift_curves(fits, name, theta)
         own = shift_at(results.lenses[name], theta)
         f = np.array([one.lens_numbers[k, 0] for one in fits])
-        rows.append([NAMES[name], 'f, px', f'{results.lenses[name].fx:.1f}', _spread(f, 1)])
+        rows.append([NAMES[name], 'f, px', f'{results.lenses[name].fx:.1f}', _span(f, 1)])
         rows += [
-            [NAMES[name], f'shift at {angle} degree, mm', f'{_MM * value:.2f}', _spread(fitted, 2)]
+            [NAMES[name], f'shift at {angle} degree, mm', f'{_MM * value:.2f}', _span(fitted, 2)]
             for angle, value, fitted in zip(_ANGLES, own, curves.T, strict=True)
         ]
     yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
@@ -145,7 +145,7 @@ def _localization(results: Results) -> Iterator[Block]:
     yield Heading('Self-localization: tables 1 and 2, figure 6')
     for table in (1, 2):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 1]]}', 3)
-        yield _beside(results, table, SPREADS)
+        yield _comparison_table(results, table, SPREADS)
         if table == 1:
             yield Text('*: the row that is out of line in the paper itself, see below.')
     yield Picture('figure6.png', 'Figure 6: two views of each environment, image points and '
@@ -192,7 +192,7 @@ def _calibration(results: Results) -> Iterator[Block]:
                   'landmarks at 0.5 m.')
     for table in (3, 4):
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 3]]}', 3)
-        yield _beside(results, table, STYLE_NAMES)
+        yield _comparison_table(results, table, STYLE_NAMES)
     yield Text(
         'new: cells that the paper leaves empty. The ten poses are not printed either. The '
         f'last columns of the list of differences below have what {POSE_SETS} random sets of ten '
@@ -291,7 +291,7 @@ def _differences(results: Results) -> Iterator[Block]:
             continue
         ends = ['', '']
         if cell.table > 2:
-            place = _place(cell, STYLE_NAMES)
+            place = _cell_index(cell, STYLE_NAMES)
             ends = [f'{low[place]:.4f}', f'{high[place]:.4f}']
         rows.append([
             str(cell.table), f'{NAMES[cell.lens]} {cell.radius} m {cell.row}', cell.quantity,
@@ -310,8 +310,8 @@ def _reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
         return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the layout found does '
                 'not follow')
-    place = _place(cell, STYLE_NAMES)
-    if place[:3] == REPEATED:
+    place = _cell_index(cell, STYLE_NAMES)
+    if place[:3] == REPEATED_CELL:
         return 'a row of the paper that repeats another one'
     if low[place] <= cell.published <= high[place]:
         return 'within what other sets of poses give'
@@ -321,7 +321,7 @@ def _reason(cell: Cell, low: Array, high: Array) -> str:
     return 'beyond what other sets of poses give'
 
 
-def _beside(results: Results, table: int, names: Sequence[str]) -> TableBlock:
+def _comparison_table(results: Results, table: int, names: Sequence[str]) -> TableBlock:
     header = ['radius', 'range' if table < 3 else 'style']
     for quantity, unit in zip(QUANTITIES, UNITS, strict=True):
         header += [f'{quantity} {unit} published', 'ours', '%']
@@ -338,15 +338,15 @@ def _percent(cell: Cell, names: Sequence[str]) -> str:
         return 'new'
     percent = 100 * cell.relative
     text = f'{percent:+.0f}' if abs(percent) < 1000 else '< -999' if percent < 0 else '> 999'
-    return text + '*' if cell.table == 1 and _place(cell, names)[:3] == OUT_OF_LINE else text
+    return text + '*' if cell.table == 1 and _cell_index(cell, names)[:3] == OUT_OF_LINE else text
 
 
-def _place(cell: Cell, names: Sequence[str]) -> tuple[int, int, int, int]:
+def _cell_index(cell: Cell, names: Sequence[str]) -> tuple[int, int, int, int]:
     return (LENSES.index(cell.lens), RADII.index(cell.radius), list(names).index(cell.row),
             QUANTITIES.index(cell.quantity))
 
 
-def _spread(values: Array, decimals: int) -> str:
+def _span(values: Array, decimals: int) -> str:
     return f'{values.min():.{decimals}f} to {values.max():.{decimals}f}'
 
 

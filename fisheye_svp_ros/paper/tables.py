@@ -68,13 +68,13 @@ nan nan nan nan nan
 """
 
 
-def _parsed(*tables: str) -> Array:
+def _parse_tables(*tables: str) -> Array:
     values = np.array([[float(word) for word in table.split()] for table in tables])
     return values.reshape(len(tables), len(RADII), 3, len(QUANTITIES))
 
 
-LOCALIZATION = _parsed(_TABLE_1, _TABLE_2)
-CALIBRATION = _parsed(_TABLE_3, _TABLE_4)
+LOCALIZATION = _parse_tables(_TABLE_1, _TABLE_2)
+CALIBRATION = _parse_tables(_TABLE_3, _TABLE_4)
 
 # (Error2 in px, Error3 in mm) in the order in which the captions of figures 9 and 10 are printed;
 # five of nine panels a lens have kept theirs.
@@ -91,7 +91,7 @@ RIGHT_CAMERA_Z = {'fish214': -0.1}
 # Fish180, Whole, 2.0 m: z is out of line with the rows below it in the paper itself.
 OUT_OF_LINE = (0, 0, 0)
 # Table 3, divergent at 0.2 m: y, z and residual repeat those at 2.0 m, digit by digit.
-REPEATED = (0, 2, 2)
+REPEATED_CELL = (0, 2, 2)
 
 
 class Cell(NamedTuple):

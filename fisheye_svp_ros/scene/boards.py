@@ -8,7 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 
-_MANY = 100  # landmarks: four for each coefficient from degree 2 to 6
+_MIN_LANDMARKS_DEGREE_6 = 100  # landmarks: four for each coefficient from degree 2 to 6
 
 
 class Board(NamedTuple):
@@ -28,7 +28,7 @@ class Board(NamedTuple):
     @property
     def highest_degree(self) -> int:
         """The highest degree of a polynomial over the board that its landmarks can tell."""
-        return 6 if self.landmarks >= _MANY else 4
+        return 6 if self.landmarks >= _MIN_LANDMARKS_DEGREE_6 else 4
 
     def local(self, points: Array) -> Array:
         """Return points (..., 3) in the board's axes, over its size."""

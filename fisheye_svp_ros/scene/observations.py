@@ -40,7 +40,7 @@ class Observations:
     def take(self, index: Index | Mask) -> Observations:
         """Return some of the rows."""
         rows = {
-            f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _SHARED
+            f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in _HEADER
         }
         return replace(self, **rows)
 
@@ -65,7 +65,7 @@ class Observations:
 
 
 STEREO = ('left', 'right')
-_SHARED = ('cameras', 'source', 'photographs')
+_HEADER = ('cameras', 'source', 'photographs')
 
 
 def make_observations(

@@ -20,11 +20,11 @@ from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
-_BETWEEN = 3  # samples along each side of a pixel
+_SAMPLES = 3  # samples along each side of a pixel
 _ROUNDS = 6  # to meet a bowed board
 _DARK, _BRIGHT, _ROOM = 0.08, 0.85, 0.30  # reflectance of ink, paper, what is behind
-_WIDE = 0.75  # pixels around an edge that may see it: a half, and what bends
-_AROUND = 12.0  # px around the sheet that may see it once it is moved
+_EDGE_WIDTH = 0.75  # pixels around an edge that may see it: a half, and what bends
+_SHEET_MARGIN = 12.0  # px around the sheet that may see it once it is moved
 _CHUNK = 200_000  # pixels whose rays are computed at once
 
 Field = Callable[[Array], Array]  # of places (..., 2), m, on a board
@@ -139,7 +139,7 @@ def render(
     part = uv[window]
     if part.size:
         seen = sum(_of_board(lens, board, camera, exposure, part, moved) for board in boards)
-        light[window] = _blurred(
+        light[window] = _lens_blur(
             np.asarray(_ROOM + seen, np.float32), theta[window], exposure, lens.max_incidence)
     outwards = np.nan_to_num(theta / lens.max_incidence)
     light *= exposure.gain * (1 - exposure.vignetting * outwards**2)
@@ -166,8 +166,8 @@ def _window(lens: Lens, boards: Sequence[Placed], camera: Pose) -> tuple[slice, 
         if not image.valid.all():
             return slice(None), slice(None)
         low, high = np.minimum(low, image.uv.min(axis=0)), np.maximum(high, image.uv.max(axis=0))
-    low = np.floor(low - _AROUND).astype(int).clip(0)
-    high = np.ceil(high + _AROUND).astype(int).clip(0)
+    low = np.floor(low - _SHEET_MARGIN).astype(int).clip(0)
+    high = np.ceil(high + _SHEET_MARGIN).astype(int).clip(0)
     return slice(low[1], high[1]), slice(low[0], high[0])
 
 
@@ -175,26 +175,26 @@ def _of_board(
     lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array, moved: Field | None
 ) -> NDArray[np.float32]:
     """Return what a board adds to the light of the parts of pixels uv (H, W, 2)."""
-    places = _seen_places(lens, board, camera, exposure, uv)
+    places = _board_xy(lens, board, camera, exposure, uv)
     if moved is not None:
         for _ in range(3):
             # The image of a place is moved: look where the unmoved image of what is seen lies.
-            off = moved(_near(places, board.printed))
-            places = _seen_places(lens, board, camera, exposure, uv - off)
+            off = moved(_is_near_sheet(places, board.printed))
+            places = _board_xy(lens, board, camera, exposure, uv - off)
     return _light(board.printed, places) - np.float32(_ROOM)
 
 
-def _seen_places(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
+def _board_xy(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
     """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
     flat = uv.reshape(-1, 2)
     parts = [
-        _seen_part(lens, board, camera, exposure, flat[i:i + _CHUNK])
+        _board_share(lens, board, camera, exposure, flat[i:i + _CHUNK])
         for i in range(0, len(flat), _CHUNK)
     ]
     return np.concatenate(parts).reshape(uv.shape)
 
 
-def _seen_part(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
+def _board_share(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
     printed = board.printed
     rays = back_project(lens, uv)
     origin, direction = rays.origin, rays.direction
@@ -215,18 +215,18 @@ def _seen_part(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: 
             reach = (height - origin[:, 2]) / direction[:, 2]
             places = origin[:, :2] + reach[:, None] * direction[:, :2]
             if printed.bow is not None:
-                height = printed.bow(_near(places, printed))
+                height = printed.bow(_is_near_sheet(places, printed))
     # Only the printed side is seen, and only ahead.
     places[~((reach > 0) & (direction[:, 2] > 0))] = np.nan
     if printed.shift is not None:
         nominal = places
         for _ in range(3):
-            nominal = places - printed.shift(_near(nominal, printed))
+            nominal = places - printed.shift(_is_near_sheet(nominal, printed))
         places = nominal
     return np.asarray(places)
 
 
-def _near(places: Array, printed: Print) -> Array:
+def _is_near_sheet(places: Array, printed: Print) -> Array:
     """Keep places (..., 2) where fields over the board are meant to be asked."""
     low, high = (np.array(end) * printed.size for end in printed.ends)
     low, high = low - printed.size, high + printed.size
@@ -234,28 +234,28 @@ def _near(places: Array, printed: Print) -> Array:
 
 
 def _light(printed: Print, places: Array) -> NDArray[np.float32]:
-    """Return the reflectance (H, W, each times _BETWEEN) that the parts of pixels see."""
+    """Return the reflectance (H, W, each times _SAMPLES) that the parts of pixels see."""
     part = places / printed.size
     by_v, by_u = np.gradient(part, axis=(0, 1))
     (vv, uv_), uu = np.gradient(by_v, axis=(0, 1)), np.gradient(by_u, axis=1)
-    wide = _WIDE * (np.abs(by_u) + np.abs(by_v))
+    wide = _EDGE_WIDTH * (np.abs(by_u) + np.abs(by_v))
     # Few pixels see an edge; the others see one brightness all over.
     edge = ~(_line_distance(printed, part) > wide).all(axis=-1)
-    light = np.empty((*edge.shape, _BETWEEN, _BETWEEN), np.float32)
+    light = np.empty((*edge.shape, _SAMPLES, _SAMPLES), np.float32)
     light[:] = np.expand_dims(_reflectance(printed, part, np.full(2, 1e-12)), (2, 3))
     part, by_u, by_v, uu, uv_, vv = (
         np.asarray(array)[edge] for array in (part, by_u, by_v, uu, uv_, vv))
-    steps = (np.arange(_BETWEEN) + 0.5) / _BETWEEN - 0.5
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     for row, b in enumerate(steps):
         for column, a in enumerate(steps):
             sample = (part + a * by_u + b * by_v
                       + 0.5 * a * a * uu + a * b * uv_ + 0.5 * b * b * vv)
             # How far, in squares, a sample reaches across lines of x and of y.
             reach = np.abs(by_u + a * uu + b * uv_) + np.abs(by_v + a * uv_ + b * vv)
-            light[edge, row, column] = _reflectance(printed, sample, reach / _BETWEEN + 1e-12)
+            light[edge, row, column] = _reflectance(printed, sample, reach / _SAMPLES + 1e-12)
     light[~np.isfinite(light)] = _ROOM
     height, width = edge.shape
-    return light.swapaxes(1, 2).reshape(_BETWEEN * height, _BETWEEN * width)
+    return light.swapaxes(1, 2).reshape(_SAMPLES * height, _SAMPLES * width)
 
 
 def _line_distance(printed: Print, places: Array) -> Array:
@@ -280,28 +280,28 @@ def _reflectance(printed: Print, places: Array, width: Array) -> Array:
         line = np.clip(np.round(places), 0, high - 1)
         face = np.where(line % 2 == 0, 1.0, -1.0) * np.clip(2 * (places - line) / width, -1, 1)
         ink = 0.5 + 0.5 * face[..., 0] * face[..., 1]
-    squares = _inside(places, low, high, width)
-    sheet = _inside(places, low - printed.margin, high + printed.margin, width)
+    squares = _coverage(places, low, high, width)
+    sheet = _coverage(places, low - printed.margin, high + printed.margin, width)
     board = _BRIGHT + (_DARK - _BRIGHT) * ink * squares
     return np.asarray(_ROOM + (board - _ROOM) * sheet)
 
 
-def _inside(places: Array, low: Any, high: Any, width: Array) -> Array:
+def _coverage(places: Array, low: Any, high: Any, width: Array) -> Array:
     depth = np.minimum(places - low, high - places) / width
     share = np.clip(depth + 0.5, 0.0, 1.0)
     return np.asarray(share[..., 0] * share[..., 1])
 
 
-def _blurred(light: NDArray[np.float32], theta: Array, exposure: Exposure, edge: float) -> Array:
+def _lens_blur(light: NDArray[np.float32], theta: Array, exposure: Exposure, edge: float) -> Array:
     """Return what pixels (H, W) see of light between them: the lens blurs before they sample."""
     if not exposure.blur_edge:
-        return _sampled(light, exposure.blur)
+        return _sample_pixels(light, exposure.blur)
     # Blur that grows outwards: between images of few blurs, by the square of the blur.
     part = np.nan_to_num(theta / edge, nan=1.0)
     square = exposure.blur**2 + (exposure.blur_edge * part) ** 2
     levels = np.linspace(exposure.blur**2, exposure.blur**2 + exposure.blur_edge**2, 6)
     place = np.clip((square - levels[0]) / (levels[1] - levels[0]), 0, len(levels) - 1 - 1e-9)
-    stack = np.stack([_sampled(light, float(np.sqrt(level))) for level in levels])
+    stack = np.stack([_sample_pixels(light, float(np.sqrt(level))) for level in levels])
     lower = np.floor(place).astype(int)
     row, column = np.indices(theta.shape)
     weight = place - lower
@@ -309,9 +309,9 @@ def _blurred(light: NDArray[np.float32], theta: Array, exposure: Exposure, edge:
                       + weight * stack[lower + 1, row, column])
 
 
-def _sampled(light: NDArray[np.float32], blur: float) -> Array:
+def _sample_pixels(light: NDArray[np.float32], blur: float) -> Array:
     if blur > 0.05:
-        light = np.asarray(cv2.GaussianBlur(light, (0, 0), _BETWEEN * blur))
-    height, width = (size // _BETWEEN for size in light.shape)
-    parts = light.reshape(height, _BETWEEN, width, _BETWEEN)
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), _SAMPLES * blur))
+    height, width = (size // _SAMPLES for size in light.shape)
+    parts = light.reshape(height, _SAMPLES, width, _SAMPLES)
     return np.asarray(parts.mean(axis=(1, 3), dtype=float))

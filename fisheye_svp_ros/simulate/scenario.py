@@ -81,7 +81,7 @@ class Scenario:
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
 
 
-_PIECE = 1000  # sets that are simulated at once
+_SETS_PER_BLOCK = 1000  # sets that are simulated at once
 
 SCALARS = tuple(row.name for row in rows(Scenario) if not isinstance(row.default, tuple))
 
@@ -107,7 +107,7 @@ def simulate_scenario(scenario: Scenario, number: int = 0, repetition: int = 0) 
     Raises FisheyeSvpError for a lens, landmarks or poses that
     cannot be used.
     """
-    return _simulated(scenario, scenario_poses(scenario),
+    return _simulate_poses(scenario, scenario_poses(scenario),
                       noise_generator(scenario.seed, number, repetition))
 
 
@@ -121,13 +121,13 @@ def simulate_in_pieces(
     rng = noise_generator(scenario.seed, number, repetition)
     poses, steps = _given_poses(scenario), scenario.trajectory_steps
     sets = (len(poses.position) - 1) * max(steps, 1) + 1
-    for first in range(0, sets, _PIECE):
-        numbers = np.arange(first, min(first + _PIECE, sets))
-        piece = _along(poses, steps, numbers) if steps else poses.take(numbers)
-        yield first, sets, _simulated(scenario, piece, rng)
+    for first in range(0, sets, _SETS_PER_BLOCK):
+        numbers = np.arange(first, min(first + _SETS_PER_BLOCK, sets))
+        piece = _interpolate_poses(poses, steps, numbers) if steps else poses.take(numbers)
+        yield first, sets, _simulate_poses(scenario, piece, rng)
 
 
-def _simulated(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
+def _simulate_poses(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
     lens = true_lens(scenario.lens, scenario.shift_scale)
     landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
     model, sigma = ForwardModel(lens), scenario.noise_px
@@ -213,7 +213,7 @@ def scenario_poses(scenario: Scenario) -> Pose:
     poses, steps = _given_poses(scenario), scenario.trajectory_steps
     if not steps:
         return poses
-    return _along(poses, steps, np.arange((len(poses.position) - 1) * steps + 1))
+    return _interpolate_poses(poses, steps, np.arange((len(poses.position) - 1) * steps + 1))
 
 
 def _given_poses(scenario: Scenario) -> Pose:
@@ -235,7 +235,7 @@ def _listed_poses(numbers: tuple[float, ...]) -> Pose:
     return Pose(rotation_from_quaternion(table[:, 3:]), table[:, :3])
 
 
-def _along(poses: Pose, steps: int, numbers: Index) -> Pose:
+def _interpolate_poses(poses: Pose, steps: int, numbers: Index) -> Pose:
     """Return some (N,) of the poses on the way: straight lines, turns about a fixed axis.
 
     numbers: of the poses, `steps` from each of the given ones to the next.

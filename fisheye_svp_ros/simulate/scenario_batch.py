@@ -20,7 +20,7 @@ from fisheye_svp_ros.simulate.scenario import (
     scenario_rig,
     true_lens,
 )
-from fisheye_svp_ros.simulate.simulation import Predicted, blank_views, predicted, recorded
+from fisheye_svp_ros.simulate.simulation import Prediction, blank_views, predicted, recorded
 
 
 class Batch(NamedTuple):
@@ -83,9 +83,9 @@ def _simulate(scenes: Sequence[_Scene], first: int) -> Batch:
     for number, camera in enumerate(cameras):
         views = blank_views(landmark[sets], points[sets], flat)
         seen = predicted(model, camera.reshape(flat), views._replace(camera=views.camera + number))
-        ideal = Predicted(seen.uv.reshape(*shape, 2), seen.scale.reshape(*shape, 1))
+        ideal = Prediction(seen.uv.reshape(*shape, 2), seen.scale.reshape(*shape, 1))
         uv.append(np.stack([
-            recorded(model, Predicted(*parts), scene.scenario.noise_px, rng)
+            recorded(model, Prediction(*parts), scene.scenario.noise_px, rng)
             for scene, rng, *parts in zip(scenes, noise, *ideal, strict=True)
         ]))
     row = np.array([scene.row for scene in scenes])

@@ -67,7 +67,7 @@ def simulate_stereo(
     return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, STEREO)
 
 
-class Predicted(NamedTuple):
+class Prediction(NamedTuple):
     """Image points (S, N, 2), px, without noise; scale: factor (S, N, 1) on the noise."""
 
     uv: Array
@@ -86,13 +86,13 @@ def blank_views(
     )
 
 
-def predicted(model: ForwardModel, poses: Pose, views: Views) -> Predicted:
+def predicted(model: ForwardModel, poses: Pose, views: Views) -> Prediction:
     """Return what a camera at poses (S,) sees of views (S, N) before the noise."""
-    return Predicted(model.predict(poses, views).uv, _noise_scale(model, poses, views))
+    return Prediction(model.predict(poses, views).uv, _noise_scale(model, poses, views))
 
 
 def recorded(
-    model: ForwardModel, seen: Predicted, sigma: float, rng: np.random.Generator
+    model: ForwardModel, seen: Prediction, sigma: float, rng: np.random.Generator
 ) -> Array:
     """Return image points (S, N, 2), px, with noise; NaN where there is none."""
     if not (np.isfinite(sigma) and sigma >= 0):

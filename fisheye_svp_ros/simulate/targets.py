@@ -18,8 +18,8 @@ from fisheye_svp_ros.simulate.render import Placed, Print
 _TRIES = 400  # a view
 _EDGE, _SPACING = 8.0, 9.0  # px, least distance from the image's edge and between corners
 _TILT = np.radians(50.0)
-_LEAST = 2  # boards of which something is seen
-_INSIDE = 0.3  # of half the room: how far from its middle the camera comes
+_MIN_BOARDS = 2  # boards of which something is seen
+_CAMERA_RANGE = 0.3  # of half the room: how far from its middle the camera comes
 
 
 def board(printed: Print) -> tuple[Placed, ...]:
@@ -75,7 +75,10 @@ def board_views(
         turn, place = _placed_in_sight(lens, ranges, rng)
         return Pose(turn, place - turn @ middle).inverse()
 
-    return _chosen(count, draw, lambda camera: _whole(lens, camera.into_body(corners), printed), (
+    def sees(camera: Pose) -> bool:
+        return _contains(lens, camera.into_body(corners), printed)
+
+    return _draw_poses(count, draw, sees, (
         f'lens {lens.name!r} does not see the whole board at {ranges[0]:g} to {ranges[1]:g} m; '
         'choose a smaller board or other ranges'))
 
@@ -94,19 +97,19 @@ def target_views(
     def draw() -> Pose:
         if kind == 'room':
             return Pose(rotation_from_vector(rng.normal(size=3)),
-                        _INSIDE * half * rng.uniform(-1, 1, 3))
+                        _CAMERA_RANGE * half * rng.uniform(-1, 1, 3))
         turn, place = _placed_in_sight(lens, ranges, rng)
         return Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
 
     def seen(camera: Pose) -> bool:
-        return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _LEAST)
+        return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _MIN_BOARDS)
 
-    return _chosen(count, draw, seen, (
+    return _draw_poses(count, draw, seen, (
         f'lens {lens.name!r} does not see two boards of the {kind} at '
         f'{ranges[0]:g} to {ranges[1]:g} m; choose other ranges'))
 
 
-def _chosen(
+def _draw_poses(
     count: int, draw: Callable[[], Pose], good: Callable[[Pose], bool], wrong: str
 ) -> Pose:
     """Return the first `count` poses drawn that are good; raise GeometryError for too few."""
@@ -140,7 +143,7 @@ def _facing(sight: Array, rng: np.random.Generator) -> Array:
                       @ rotation_from_vector(np.array([0.0, 0.0, roll])))
 
 
-def _whole(lens: Lens, points: Array, printed: Print) -> bool:
+def _contains(lens: Lens, points: Array, printed: Print) -> bool:
     image = project(lens, points)
     if not image.valid.all():
         return False

@@ -8,7 +8,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.optics.engines.results import FLAT
+from fisheye_svp_ros.optics.engines.results import PLANARITY
 from fisheye_svp_ros.optics.engines.results import Localization as Localization
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
@@ -148,7 +148,7 @@ def _flat_targets(views: Views) -> tuple[Index, Array, Array]:
     centre = weight @ views.points / weight.sum(axis=2, keepdims=True)
     centred = views.points - centre
     extent, axes = np.linalg.eigh((np.swapaxes(centred, -1, -2) * weight) @ centred)
-    flat = np.flatnonzero(extent[:, 0] < FLAT**2 * extent[:, 2])
+    flat = np.flatnonzero(extent[:, 0] < PLANARITY**2 * extent[:, 2])
     return flat, centre[flat, 0], axes[flat, :, 0]
 
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask, placed
+from fisheye_svp_ros.arrays import Array, Index, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Views, views_of
@@ -156,7 +156,7 @@ def triangulate_optimally(
     valid[valid] = fixed
 
     def place_valid(field: Array) -> Array:
-        return placed(valid.reshape(pairs.shape), field[fixed])
+        return scatter(valid.reshape(pairs.shape), field[fixed])
 
     return OptimalPoints(
         place_valid(solved.state[0]), place_valid(np.asarray(np.linalg.inv(hessian), dtype=float)),

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask, placed
+from fisheye_svp_ros.arrays import Array, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.optics.camera import back_project, unique_range
@@ -26,15 +26,15 @@ from fisheye_svp_ros.study.metrics import known_mean
 
 QUANTITIES = ('position', 'axis', 'residual', 'epipolar', 'depth')
 UNITS = {'position': 'm', 'axis': 'rad', 'residual': 'px', 'epipolar': 'px', 'depth': 'm'}
-_OWN = ('parameters', 'misfit')
+_LENS_PARTS = ('parameters', 'misfit')
 _LANDMARKS = 48
-_AT_ONCE = 24  # caps
-_FEWER = 4  # of them one for what the lens's own errors do to stereo points
-_SMALLEST_SPREAD = np.radians(15.0)
+_CAPS_PER_BLOCK = 24  # caps
+_STEREO_CAPS = 4  # of them one for what the lens's own errors do to stereo points
+_MIN_SPREAD = np.radians(15.0)
 _EDGE = np.radians(1.0)  # how far inside the field of view the widest spread ends
 _NEAREST, _FARTHEST = 0.05, 20.0  # m
 _BASELINES = (1e-3, _FARTHEST)  # m
-_CLEAR = 1.5  # unique ranges of the lens that the nearest range keeps
+_RANGE_FACTOR = 1.5  # unique ranges of the lens that the nearest range keeps
 
 
 class Setup(NamedTuple):
@@ -97,7 +97,7 @@ def widest_spread(lens: Lens) -> float:
     return float(np.nanmax(seen, axis=1).min() - _EDGE)
 
 
-def usual_spread(lens: Lens) -> float:
+def default_spread(lens: Lens) -> float:
     """Return the spread to be asked about where none is named, rad.
 
     It is the widest, but for a lens that was calibrated up to a smaller angle (`Lens.reached`).
@@ -105,12 +105,12 @@ def usual_spread(lens: Lens) -> float:
     widest = widest_spread(lens)
     if lens.reached is None:
         return widest
-    return float(np.clip(lens.reached, _SMALLEST_SPREAD, widest))
+    return float(np.clip(lens.reached, _MIN_SPREAD, widest))
 
 
 def nearest_range(lens: Lens) -> float:
     """Return the nearest range that a budget covers, m."""
-    return max(_NEAREST, _CLEAR * unique_range(lens))
+    return max(_NEAREST, _RANGE_FACTOR * unique_range(lens))
 
 
 def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
@@ -129,12 +129,12 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     if not _BASELINES[0] <= baseline <= _BASELINES[1]:
         raise ParameterError(f'baseline is {baseline:.4g} m; a budget covers {_BASELINES[0]:g} to '
                              f'{_BASELINES[1]:g} m')
-    angle = np.linspace(_SMALLEST_SPREAD, widest_spread(lens), spreads)
+    angle = np.linspace(_MIN_SPREAD, widest_spread(lens), spreads)
     distance = np.geomspace(nearest_range(lens), _FARTHEST, ranges)
     points = distance[:, None, None] * _caps(angle)[:, None]
     shape = (spreads, ranges)
     flat = points.reshape(-1, _LANDMARKS, 3)
-    rows = [*_localized(setup, flat), *_measured(setup, flat)]
+    rows = [*_localization_errors(setup, flat), *_stereo_errors(setup, flat)]
     error, noise = (
         {name: row[i].reshape(shape) for name, row in zip(QUANTITIES, rows, strict=True)}
         for i in range(2)
@@ -166,8 +166,8 @@ def at_point(
         # The excess in log is linear where both follow powers of the range.
         with np.errstate(divide='ignore'):
             excess = np.log(error / allowed)
-        by_range = _along(budget.spreads, excess, spread)
-        by_spread = _along(np.log(budget.ranges), excess.T, np.log(working_range))
+        by_range = _interpolate_rows(budget.spreads, excess, spread)
+        by_spread = _interpolate_rows(np.log(budget.ranges), excess.T, np.log(working_range))
         here = np.interp(np.log(working_range), np.log(budget.ranges), by_range)
         found.append(Point(
             quantity,
@@ -175,15 +175,15 @@ def at_point(
             _value(budget, noise, spread, working_range),
             _value(budget, allowed, spread, working_range),
             None if np.isnan(here) else bool(here <= 0),
-            float(np.exp(_kept_from(np.log(budget.ranges), by_range))),
-            _largest_kept(budget.spreads, by_spread),
+            float(np.exp(_range_from(np.log(budget.ranges), by_range))),
+            _max_range(budget.spreads, by_spread),
             *(_value(budget, budget.own.get(part, {}).get(quantity, np.full_like(noise, np.nan)),
-                     spread, working_range) for part in _OWN),
+                     spread, working_range) for part in _LENS_PARTS),
         ))
     return found
 
 
-def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
+def _localization_errors(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     """Return error and noise (S,) of position, axis and residual for caps (S, N, 3)."""
     true = identity(len(points))
     seen = ForwardModel(setup.lens).predict(true, views_of(points)).uv
@@ -198,7 +198,7 @@ def _localized(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     ]
 
 
-def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
+def _stereo_errors(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
     """Return error and noise (S,) of epipolar distance and depth for caps (S, N, 3)."""
     true, svp = ForwardModel(setup.lens), ForwardModel(setup.lens.svp())
     right = true.predict(identity(len(points)), views_of(points)).uv
@@ -214,7 +214,7 @@ def _measured(setup: Setup, points: Array) -> list[tuple[Array, Array]]:
         np.linalg.norm(solved - points[both], axis=-1),
         np.sqrt(np.trace(spread, axis1=-2, axis2=-1)),
     ]
-    epipolar, depth, depth_noise = (known_mean(placed(both, values)) for values in per_pair)
+    epipolar, depth, depth_noise = (known_mean(scatter(both, values)) for values in per_pair)
     # Noise of the left point across the curve and of the right point that moves the curve.
     epipolar_noise = np.full(len(points), 2 / np.sqrt(np.pi) * setup.noise)
     return [(epipolar, epipolar_noise), (depth, depth_noise)]
@@ -227,20 +227,21 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
 
     errors, lens = LensErrors.of(setup.lens), ForwardModel(setup.lens)
-    some = points[:, ::_FEWER]
+    some = points[:, ::_STEREO_CAPS]
     left = lens.predict(setup.rig.broadcast_to(len(some)), views_of(some)).uv
     both: Mask = np.asarray(np.isfinite(left).all(axis=-1))
     depth = depth_errors(errors, errors, setup.rig, some[both])
     poses = [errors.of_poses(views_of(caps), identity(len(caps)))
-             for caps in np.array_split(points, -(-len(points) // _AT_ONCE))]
+             for caps in np.array_split(points, -(-len(points) // _CAPS_PER_BLOCK))]
     found = {}
-    for part in _OWN:
+    for part in _LENS_PARTS:
         variance = np.concatenate([
             np.diagonal(getattr(one, part), axis1=-2, axis2=-1) for one in poses])
         far = np.sqrt(np.trace(getattr(depth, part), axis1=-2, axis2=-1))
         found[part] = {
             'position': np.sqrt(variance[:, :3].sum(axis=-1)),
-            'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)), 'depth': known_mean(placed(both, far)),
+            'axis': np.sqrt(variance[:, 3:5].sum(axis=-1)),
+            'depth': known_mean(scatter(both, far)),
         }
     return found
 
@@ -256,19 +257,19 @@ def _caps(angles: Array) -> Array:
     return np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine], axis=-1)
 
 
-def _along(places: Array, table: Array, place: float) -> Array:
+def _interpolate_rows(places: Array, table: Array, place: float) -> Array:
     """Interpolate the rows of a table (P, K) at a place among `places` (P,)."""
     return np.array([np.interp(place, places, column) for column in table.T])
 
 
 def _value(budget: Budget, table: Array, spread: float, working_range: float) -> float:
     with np.errstate(divide='ignore'):
-        by_range = _along(budget.spreads, np.log(table), spread)
+        by_range = _interpolate_rows(budget.spreads, np.log(table), spread)
     logs = np.log(budget.ranges)
     return float(np.exp(np.interp(np.log(working_range), logs, by_range)))
 
 
-def _kept_from(places: Array, excess: Array) -> float:
+def _range_from(places: Array, excess: Array) -> float:
     """Return the place from which on an excess stays at or below 0; NaN for nowhere."""
     above = np.flatnonzero(~(excess <= 0))
     if not above.size:
@@ -276,7 +277,7 @@ def _kept_from(places: Array, excess: Array) -> float:
     return _crossing(places, excess, above[-1]) if above[-1] < len(places) - 1 else float('nan')
 
 
-def _largest_kept(places: Array, excess: Array) -> float:
+def _max_range(places: Array, excess: Array) -> float:
     """Return the last place where an excess is at or below 0; NaN for nowhere."""
     kept = np.flatnonzero(excess <= 0)
     if not kept.size:

@@ -38,7 +38,7 @@ class Grid(NamedTuple):
     median: Array
 
 
-class Spread(NamedTuple):
+class ResidualRatio(NamedTuple):
     """Residuals beside their noise: ratio (K,) of rms to sigma, and the density noise predicts.
 
     at, density (M,): of that ratio where nothing but noise is in the image points.
@@ -93,7 +93,7 @@ def grid(table: SweptTable, metric: str, x: str, y: str) -> Grid:
     return Grid(list(columns), list(lines), median)
 
 
-def noise_spreads(table: SweptTable, by: str | None) -> list[Spread]:
+def noise_spreads(table: SweptTable, by: str | None) -> list[ResidualRatio]:
     """Return the residuals of localizations beside what their noise alone would leave.
 
     N image points of noise sigma in u and in v leave, after a pose is fitted to them, a sum of
@@ -115,7 +115,7 @@ def noise_spreads(table: SweptTable, by: str | None) -> list[Spread]:
                 for n, part in zip(counts, share, strict=True)
             )
             name = f'{by} {value_text(label)}' if by else ''
-            found.append(Spread(name, ratio, at, np.asarray(density)))
+            found.append(ResidualRatio(name, ratio, at, np.asarray(density)))
     return found
 
 

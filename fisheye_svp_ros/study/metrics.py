@@ -15,11 +15,11 @@ from fisheye_svp_ros.pose import Pose, axis_angle_between
 
 Metrics = dict[str, Array]
 
-_FIT = ('points', 'rms_px', 'mean_residual_px')
+_FIT_METRICS = ('points', 'rms_px', 'mean_residual_px')
 _POSE = ('position_error_m', 'position_error_x_m', 'position_error_y_m', 'position_error_z_m',
          'rotation_error_rad', 'axis_error_rad')
-LOCALIZATION_METRICS = (*_FIT, *_POSE)
-STEREO_CALIBRATION_METRICS = ('views', *_FIT, *_POSE)
+LOCALIZATION_METRICS = (*_FIT_METRICS, *_POSE)
+STEREO_CALIBRATION_METRICS = ('views', *_FIT_METRICS, *_POSE)
 STEREO_DEPTH_METRICS = ('points', 'error2_px', 'error2_vertical_px', 'error2_max_px', 'error3_m',
                         'error3_max_m')
 
@@ -40,7 +40,7 @@ def localization_metrics(pose: Pose, residual: Array, true: Pose | None = None) 
     rms_px: root mean square of the 2-D residual norm; mean_residual_px: mean norm, as Kita's
     tables have it; position errors in the frame of the poses; axis: the viewing axis.
     """
-    return {**_fit(residual), **_pose_errors(pose, true)}
+    return {**_fit_metrics(residual), **_pose_errors(pose, true)}
 
 
 def stereo_calibration_metrics(
@@ -54,7 +54,7 @@ def stereo_calibration_metrics(
     systems, views = residual.shape[:2]
     return {
         'views': np.full(systems, float(views)),
-        **_fit(residual.reshape(systems, -1, 2)),
+        **_fit_metrics(residual.reshape(systems, -1, 2)),
         **_pose_errors(rig, true),
     }
 
@@ -71,15 +71,15 @@ def stereo_depth_metrics(
         'points': np.isfinite(points[..., 0]).sum(axis=-1).astype(float),
         'error2_px': known_mean(distance),
         'error2_vertical_px': known_mean(np.abs(vertical)),
-        'error2_max_px': _largest(distance),
+        'error2_max_px': _nanmax(distance),
     }
     if true is not None:
         off = np.linalg.norm(points - true, axis=-1)
-        metrics |= {'error3_m': known_mean(off), 'error3_max_m': _largest(off)}
+        metrics |= {'error3_m': known_mean(off), 'error3_max_m': _nanmax(off)}
     return metrics
 
 
-def _fit(residual: Array) -> Metrics:
+def _fit_metrics(residual: Array) -> Metrics:
     norm = np.linalg.norm(residual, axis=-1)
     return {
         'points': np.isfinite(norm).sum(axis=-1).astype(float),
@@ -108,7 +108,7 @@ def known_mean(values: Array) -> Array:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def _largest(values: Array) -> Array:
+def _nanmax(values: Array) -> Array:
     known = np.isfinite(values)
     largest = np.where(known, values, -np.inf).max(axis=-1, initial=-np.inf)
     return np.asarray(np.where(known.any(axis=-1), largest, np.nan))

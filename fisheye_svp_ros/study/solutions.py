@@ -9,7 +9,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask, placed
+from fisheye_svp_ros.arrays import Array, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
@@ -47,7 +47,7 @@ class Measurement(NamedTuple):
     foot: Array
 
 
-class Solved(NamedTuple, Generic[T]):
+class SetSolutions(NamedTuple, Generic[T]):
     """The solution of S sets and its metrics, arrays (S,) by name.
 
     solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
@@ -60,7 +60,7 @@ class Solved(NamedTuple, Generic[T]):
     unsolved: str
     reasons: tuple[str, ...] = ('',)
 
-    def checked(self) -> Solved[T]:
+    def checked(self) -> SetSolutions[T]:
         """Return it as it is; raise GeometryError where a set has no solution."""
         if not self.solved.all():
             raise GeometryError(self.unsolved)
@@ -70,7 +70,7 @@ class Solved(NamedTuple, Generic[T]):
 def localized(
     model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None,
     examined: bool = False, searched: bool = True,
-) -> Solved[Localization]:
+) -> SetSolutions[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
     examined: test the misfit against sigma and leave gross errors out, which simulated sets do
@@ -84,7 +84,7 @@ def localized(
         found, reasons = checked.result, checked.reasons
         residual = np.where(checked.gross[..., None], np.nan, found.residual)
     metrics = localization_metrics(found.pose, residual, true)
-    return Solved(found, metrics, found.converged, _NO_POSE, reasons)
+    return SetSolutions(found, metrics, found.converged, _NO_POSE, reasons)
 
 
 def residual_points(model: ForwardModel, views: Views, solution: Localization) -> Points:
@@ -96,7 +96,7 @@ def residual_points(model: ForwardModel, views: Views, solution: Localization) -
 
 def calibrated(
     models: Pair, left: Views, right: Views, systems: int = 1, true: Pose | None = None
-) -> Solved[StereoCalibration]:
+) -> SetSolutions[StereoCalibration]:
     """Calibrate S rigs from S * V views; models: left, right; true: rigs (S,).
 
     Raises GeometryError as `calibrate_stereo` does.
@@ -112,13 +112,13 @@ def calibrated(
         for cost, free, fails in
         zip(found.cost, freedom, misfit_fails(found.cost, freedom), strict=True)
     )
-    return Solved(found, metrics, found.converged, _NO_RIG, reasons)
+    return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons)
 
 
 def measured(
     models: Pair, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
     optimal: bool = False,
-) -> Solved[Measurement]:
+) -> SetSolutions[Measurement]:
     """Measure landmarks with rigs (S,) that are known; models: left, right.
 
     uv_left, uv_right (S, N, 2), px, of the same landmarks, NaN = unseen; true (S, N, 3), m: where
@@ -129,6 +129,6 @@ def measured(
     offset = epipolar_offset(*pairs)
     points = (triangulate_optimally if optimal else triangulate)(*pairs).points
     found = Measurement(*(
-        placed(both, part) for part in (points, offset.distance, offset.vertical, offset.foot)))
+        scatter(both, part) for part in (points, offset.distance, offset.vertical, offset.foot)))
     metrics = stereo_depth_metrics(found.distance, found.vertical, found.points, true)
-    return Solved(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)
+    return SetSolutions(found, metrics, np.asarray(both.any(axis=1)), _NO_PAIR)

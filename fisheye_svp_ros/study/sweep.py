@@ -38,9 +38,9 @@ CAMERA = 'synthetic_camera'
 TABLES: Mapping[str, type[Any]] = {
     CAMERA: SyntheticCameraSettings, **{name: s.settings for name, s in SOLVERS.items()}
 }
-PLACE = ('scenario', 'scenarios', 'set', 'sets')
+SCENARIO_COLUMNS = ('scenario', 'scenarios', 'set', 'sets')
 _EVALUATIONS = 10  # of all points, to solve a set
-_TOGETHER = 512  # sets a task: enough to solve them fast together, few enough to lose
+_SETS_PER_TASK = 512  # sets a task: enough to solve them fast together, few enough to lose
 
 
 class Plan(NamedTuple):
@@ -85,7 +85,7 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
 def column_types(plan: Plan) -> dict[str, type]:
     """Return the columns of the rows of a sweep: names as in a table of a recording, and types."""
     kinds = {row.name: type(row.default) for row in rows(Scenario)}
-    columns: dict[str, type] = dict.fromkeys(PLACE, int)
+    columns: dict[str, type] = dict.fromkeys(SCENARIO_COLUMNS, int)
     columns |= {name: kinds[name] for name in SCALARS}
     for node in plan.solvers:
         columns |= {f'{node}.{name}': float for name in SOLVERS[node].metrics}
@@ -96,7 +96,7 @@ def column_types(plan: Plan) -> dict[str, type]:
 def tasks(plan: Plan) -> list[range]:
     """Return the numbers of the scenarios of each task: the same whoever works on them."""
     sets = len(scenario_poses(_scenario(plan, 0)).position)
-    count, step = len(plan.sweep), max(1, _TOGETHER // sets)
+    count, step = len(plan.sweep), max(1, _SETS_PER_TASK // sets)
     return [range(start, min(start + step, count)) for start in range(0, count, step)]
 
 
@@ -189,11 +189,11 @@ def _columns(plan: Plan, scenarios: list[Scenario], first: int, batch: Batch) ->
     tags = [scalars(scenarios[row]) for row in batch.row]
     columns |= {name: [tag[name] for tag in tags for _ in range(sets)] for name in SCALARS}
     for node, settings in plan.solvers.items():
-        columns |= _told(node, SOLVERS[node].solve(batch, settings))
+        columns |= _result_columns(node, SOLVERS[node].solve(batch, settings))
     return columns
 
 
-def _told(node: str, outcome: Outcome) -> Columns:
+def _result_columns(node: str, outcome: Outcome) -> Columns:
     notes = outcome.note.tolist()
     return {
         **{

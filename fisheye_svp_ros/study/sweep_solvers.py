@@ -25,11 +25,11 @@ from fisheye_svp_ros.study.settings import (
     StereoCalibratorSettings,
     StereoDepthSettings,
 )
-from fisheye_svp_ros.study.solutions import Solved, calibrated, localized, measured
+from fisheye_svp_ros.study.solutions import SetSolutions, calibrated, localized, measured
 
-_TOGETHER = 512  # sets solved at once: more take more memory and no less time
+_SETS_PER_SOLVE = 512  # sets solved at once: more take more memory and no less time
 
-_Solve = Callable[[Index], Solved[Any]]  # the sets of an index (A,)
+_Solve = Callable[[Index], SetSolutions[Any]]  # the sets of an index (A,)
 S = TypeVar('S', bound=SolverSettings)
 
 
@@ -85,7 +85,7 @@ def _model(batch: Batch, settings: SolverSettings) -> ForwardModel:
 
 
 def _chunks(index: Index) -> list[Index]:
-    return [index[i:i + _TOGETHER] for i in range(0, len(index), _TOGETHER)]
+    return [index[i:i + _SETS_PER_SOLVE] for i in range(0, len(index), _SETS_PER_SOLVE)]
 
 
 def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
@@ -93,7 +93,7 @@ def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
     sets, model = _sets(batch), _model(batch, settings)
     outcome = Outcome(len(sets.landmark), LOCALIZATION_METRICS)
 
-    def solve(index: Index) -> Solved[Any]:
+    def solve(index: Index) -> SetSolutions[Any]:
         return localized(model, sets.views(0, index, settings.sigma_px), sets.poses[0].take(index))
 
     for index in _chunks(np.arange(len(sets.landmark))):
@@ -112,7 +112,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
     outcome = Outcome(len(sets.landmark), STEREO_CALIBRATION_METRICS)
     windows: list[list[int]] = [[] for _ in range(scenarios)]
 
-    def solve(index: Index) -> Solved[Any]:
+    def solve(index: Index) -> SetSolutions[Any]:
         of = index // per_scenario
         rows = np.array([windows[scenario] for scenario in of])
         left, right = (sets.views(i, rows.ravel(), settings.sigma_px) for i in (0, 1))
@@ -139,7 +139,7 @@ def stereo_depth(batch: Batch, settings: StereoDepthSettings) -> Outcome:
     per_scenario = batch.uv[0].shape[1]
     outcome = Outcome(len(sets.landmark), STEREO_DEPTH_METRICS)
 
-    def solve(index: Index) -> Solved[Any]:
+    def solve(index: Index) -> SetSolutions[Any]:
         true = sets.poses[1].take(index).into_body(sets.points[index])
         left, right = (uv[index] for uv in sets.uv)
         rigs = rig.take(index // per_scenario)

@@ -30,7 +30,7 @@ def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> Non
     results.metrics['position_error_x_m'].add(-1.23456789e-5)
     watcher = SimpleNamespace(results={'/here/localizer': results})
     out = Console(width=width, file=io.StringIO(), record=True)
-    out.print(watch._shown(cast('Any', watcher), width))
+    out.print(watch._result_table(cast('Any', watcher), width))
     assert shown in ' '.join(out.export_text().split())
 
 

@@ -21,7 +21,7 @@ from fisheye_svp_ros.optics.camera import project, project_with_jacobian
 from fisheye_svp_ros.optics.curve_base import SumOfShifts
 from fisheye_svp_ros.optics.curves import Equidistant, Gennery
 from fisheye_svp_ros.optics.engines import marquardt, numpy_engine
-from fisheye_svp_ros.optics.engines.results import FLAT
+from fisheye_svp_ros.optics.engines.results import PLANARITY
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import views_of
@@ -162,17 +162,17 @@ def test_small_changes_of_poses_are_those_of_the_reference(compiled):
 
 
 def test_flat_targets_are_told_by_the_eigenvalues_of_their_spread(compiled):
-    from fisheye_svp_ros.optics.engines.entries import _flat
+    from fisheye_svp_ros.optics.engines.entries import _is_planar
 
     rng, said = np.random.default_rng(98), []
-    for thickness in FLAT * np.geomspace(0.05, 20.0, 60):
+    for thickness in PLANARITY * np.geomspace(0.05, 20.0, 60):
         points = rng.normal(size=(30, 3)) * [1.0, 0.6, thickness]
         points = identity(1).retract(rng.normal(size=(1, 6))).take(0).transform(points) + 40.0
         weight = rng.uniform(0.5, 2.0, 30)
         least, _, largest = np.linalg.eigvalsh(np.cov(points.T, aweights=weight, ddof=0))
-        if abs(np.log(least / largest / FLAT**2)) > 0.1:
-            said.append(_flat(points, weight))
-            assert said[-1] == (least < FLAT**2 * largest)
+        if abs(np.log(least / largest / PLANARITY**2)) > 0.1:
+            said.append(_is_planar(points, weight))
+            assert said[-1] == (least < PLANARITY**2 * largest)
     assert 20 < sum(said) < len(said) - 20
 
 

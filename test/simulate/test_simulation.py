@@ -169,7 +169,7 @@ def test_pieces_are_the_whole(monkeypatch: pytest.MonkeyPatch, steps: int) -> No
              0.1, 0.2, 0.0, 1.0, 0.0, 0.0, 0.0)
     one = Scenario(poses=poses, trajectory_steps=steps, noise_px=0.3)
     whole = simulate_scenario(one)
-    monkeypatch.setattr(scenario, '_PIECE', 4)
+    monkeypatch.setattr(scenario, '_SETS_PER_BLOCK', 4)
     pieces = list(simulate_in_pieces(one))
     sets = 2 * max(steps, 1) + 1
     assert [first for first, _, _ in pieces] == list(range(0, sets, 4))

@@ -31,7 +31,7 @@ def one_sided(monkeypatch):
     """Return a localization that tries one side alone."""
     def run(*arguments):
         with monkeypatch.context() as patch:
-            patch.setattr(localization, 'FLAT', 0.0)
+            patch.setattr(localization, 'PLANARITY', 0.0)
             return localize(*arguments)
 
     return run

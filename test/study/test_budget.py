@@ -21,8 +21,8 @@ from fisheye_svp_ros.study.budget import (
     QUANTITIES,
     Setup,
     at_point,
+    default_spread,
     make_budget,
-    usual_spread,
     widest_spread,
 )
 
@@ -39,7 +39,7 @@ def budget():
     (80.0, 80.0), (80, 80.0), (300.0, 106.0), ('far', 106.0), (None, 106.0)])
 def test_where_no_spread_is_named_a_calibration_says_how_far_it_reached(reached, spread):
     calibrated = replace(LENS, calibration={'reached_deg': reached} if reached else None)
-    assert np.degrees(usual_spread(calibrated)) == pytest.approx(spread, abs=0.1)
+    assert np.degrees(default_spread(calibrated)) == pytest.approx(spread, abs=0.1)
 
 
 def point(budget, quantity, spread=SPREAD, working_range=0.5, **limits):

@@ -35,7 +35,7 @@ def use(name: str) -> None:
     Raises ParameterError for another name, or for one that is not installed.
     """
     global _engine
-    _engine = _named(name)
+    _engine = _load_engine(name)
     os.environ[VARIABLE] = name
 
 
@@ -106,7 +106,7 @@ def adjust_rigs(
     return rigs
 
 
-def _named(name: str) -> ModuleType:
+def _load_engine(name: str) -> ModuleType:
     if name not in ENGINES:
         raise ParameterError(f'{VARIABLE} is {name!r}; known are {", ".join(ENGINES)}')
     if name != 'numba':
@@ -121,4 +121,4 @@ def _named(name: str) -> ModuleType:
     return numba_engine
 
 
-_engine = _named(os.environ.get(VARIABLE, 'auto'))
+_engine = _load_engine(os.environ.get(VARIABLE, 'auto'))

@@ -162,11 +162,11 @@ def _solve(normal, cameras, damping, step, eliminated, lower):
             step[v, i] = -eliminated[v, 0, i]
             for k in range(columns - 1):
                 step[v, i] -= eliminated[v, k + 1, i] * step[views, k]
-    return _moved(normal, cameras, step)
+    return _squared_image_step(normal, cameras, step)
 
 
 @njit(**BARE)
-def _moved(normal, cameras, step):
+def _squared_image_step(normal, cameras, step):
     """Return |J d|^2."""
     total, views = 0.0, len(step) - 1
     for v in range(views - 1 + cameras):

@@ -10,8 +10,8 @@ from numba import config, njit, types
 from fisheye_svp_ros.optics.engines import cache
 from fisheye_svp_ros.optics.engines.adjustment import copy, minimise, normal_of, pose_of, workspace
 from fisheye_svp_ros.optics.engines.kernels import (
+    BACKWARD_ANGLE,
     BARE,
-    BEHIND,
     INVALID,
     OPTIONS,
     ROW,
@@ -35,9 +35,9 @@ from fisheye_svp_ros.optics.engines.kernels import (
     substitute,
 )
 from fisheye_svp_ros.optics.engines.marquardt import MAX_ITERATIONS
-from fisheye_svp_ros.optics.engines.results import FLAT
+from fisheye_svp_ros.optics.engines.results import PLANARITY
 
-_DETERMINED = 1e12  # trace of a scaled inverse; what is worse goes to the reference
+_MAX_CONDITION = 1e12  # trace of a scaled inverse; what is worse goes to the reference
 
 
 @njit(**BARE)
@@ -66,7 +66,7 @@ def _inverse(hessian, lower, out):
         out[k, k] = 1.0
         substitute(lower, out[k])
         trace += out[k, k] * hessian[k, k]
-    return trace < _DETERMINED
+    return trace < _MAX_CONDITION
 
 
 @njit(**BARE)
@@ -75,7 +75,7 @@ def _residual(w, points, uv, row, lens, pose, out):
     for start in range(0, len(points), B):
         n, rows, measured = min(B, len(points) - start), row[start:], uv[start:]
         load(w, n, points[start:], *pose)
-        solve_incidence(w, n, lens, BEHIND)
+        solve_incidence(w, n, lens, BACKWARD_ANGLE)
         image(w, n, lens)
         remaining, off = 0, out[start:]
         for i in range(n):
@@ -89,7 +89,7 @@ def _residual(w, points, uv, row, lens, pose, out):
 
 
 @njit(**BARE)
-def _flat(points, weight):
+def _is_planar(points, weight):
     """Say whether the weighted points lie near a plane: eigenvalues after Smith (1961)."""
     total = x = y = z = xx = xy = xz = yy = yz = zz = 0.0
     for i in range(len(points)):
@@ -111,14 +111,14 @@ def _flat(points, weight):
     det = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
     turn = np.arccos(min(max(0.5 * det / (size * size * size), -1.0), 1.0)) / 3.0
     largest = mean + 2.0 * size * np.cos(turn)
-    return mean + 2.0 * size * np.cos(turn + 2.0943951023931953) < FLAT * FLAT * largest
+    return mean + 2.0 * size * np.cos(turn + 2.0943951023931953) < PLANARITY * PLANARITY * largest
 
 
-def _in(dimensions: int, kind: Any = types.float64) -> types.Array:
+def _arg(dimensions: int, kind: Any = types.float64) -> types.Array:
     return types.Array(kind, dimensions, 'C', readonly=True)
 
 
-def _out(dimensions: int, kind: Any = types.float64) -> types.Array:
+def _dest(dimensions: int, kind: Any = types.float64) -> types.Array:
     return types.Array(kind, dimensions, 'C')
 
 
@@ -135,10 +135,10 @@ def _entry(result: Any, *arguments: Any) -> Any:
     return compiled
 
 
-_LENS = (_in(1), types.float64)
+_LENS = (_arg(1), types.float64)
 
 
-@_entry(types.void, _in(2), *_LENS, _out(2), _out(1))
+@_entry(types.void, _arg(2), *_LENS, _dest(2), _dest(1))
 def project(points, lens, edge, uv, state):
     """Write image points (M, 2) and states (M)."""
     w = np.empty(SCRATCH)
@@ -150,7 +150,7 @@ def project(points, lens, edge, uv, state):
         _write(w, n, uv[start:], state[start:])
 
 
-@_entry(types.void, _in(3), _in(2), _in(3), *_LENS, _out(3), _out(2), _out(4))
+@_entry(types.void, _arg(3), _arg(2), _arg(3), *_LENS, _dest(3), _dest(2), _dest(4))
 def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
     """Write image points (S, N, 2), states (S, N) and derivatives (S, 2, 6, N)."""
     w = np.empty(SCRATCH)
@@ -175,12 +175,12 @@ def linearise_views(rotation, position, points, lens, edge, uv, state, d_pose):
                         out[i] = a * x[i] + b * y[i] + c * z[i]
 
 
-_SEEN = (_in(3), _in(3), _in(2))
+_VIEW_ARRAYS = (_arg(3), _arg(3), _arg(2))
 
 
-@_entry(types.UniTuple(types.int64, 2), _in(1), types.int64, types.int64, *_SEEN,
-        _in(2, types.int64), _out(3), _out(2), _out(3), _out(3), _out(1), _out(1, types.boolean),
-        _out(1, types.int64))
+@_entry(types.UniTuple(types.int64, 2), _arg(1), types.int64, types.int64, *_VIEW_ARRAYS,
+        _arg(2, types.int64), _dest(3), _dest(2), _dest(3), _dest(3), _dest(1),
+        _dest(1, types.boolean), _dest(1, types.int64))
 def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, covariance,
              residual, cost, solved, iterations):
     """Move S poses to their minima; return how many remain for the reference, and flat targets."""
@@ -205,12 +205,12 @@ def localize(lens, minimum, limit, points, uv, weight, row, rotation, position, 
                 and _residual(w, points[s], uv[s], row[s], lens, pose, residual[s])
             )
         remaining += not solved[s]
-        flat += _flat(points[s], weight[s])
+        flat += _is_planar(points[s], weight[s])
     return remaining, flat
 
 
-@_entry(types.int64, *_SEEN, _in(1), *_SEEN, _in(1), _out(4), _out(4), _out(1),
-        _out(1, types.int64))
+@_entry(types.int64, *_VIEW_ARRAYS, _arg(1), *_VIEW_ARRAYS, _arg(1), _dest(4), _dest(4), _dest(1),
+        _dest(1, types.int64))
 def adjust_rigs(left_points, left_uv, left_weight, left_lens, points, uv, weight, lens, state,
                 normal, cost, iterations):
     """Move S rigs of V views to their minima; return how many remain for the reference.

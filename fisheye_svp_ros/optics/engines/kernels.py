@@ -14,8 +14,14 @@ from numba.core.cpu import CPUTargetOptions
 from numba.extending import register_jitable
 
 from fisheye_svp_ros.optics import formulas
-from fisheye_svp_ros.optics.formulas import NOWHERE
-from fisheye_svp_ros.optics.rays import BEHIND, CLEAR, MORE_STEPS, NEWTON_STEPS, SETTLED
+from fisheye_svp_ros.optics.formulas import AXIS_EPS
+from fisheye_svp_ros.optics.rays import (
+    BACKWARD_ANGLE,
+    MORE_STEPS,
+    NEWTON_STEPS,
+    STEP_TOLERANCE,
+    ZERO_CLEARANCE,
+)
 
 # Division must not raise for a loop to vectorise; sums may be reordered, NaN keep their meaning.
 OPTIONS = {'error_model': 'numpy', 'fastmath': {'reassoc', 'contract', 'arcp'}}
@@ -25,7 +31,7 @@ BARE = OPTIONS | ({'_nrt': False} if hasattr(CPUTargetOptions, '_nrt') else {})
 HEIGHTS = (formulas.orthographic, formulas.equidistant, formulas.equisolid,
            formulas.stereographic, formulas.kannala_brandt)
 SHIFTS = (formulas.gennery, formulas.flat_port)
-for formula in (*HEIGHTS, *SHIFTS, formulas.halved, formulas.newton_step,
+for formula in (*HEIGHTS, *SHIFTS, formulas.half_angle, formulas.newton_step,
                 formulas.point_derivatives):
     register_jitable(**OPTIONS)(formula)
 
@@ -66,7 +72,7 @@ def _half_angle(r, m):
 
 
 @njit(inline='always', **BARE)
-def _turned(sin, cos, turn):
+def _rotate_sin_cos(sin, cos, turn):
     """Return sine and cosine of an angle turned on by up to 0.3 rad."""
     w = turn * turn
     s = turn * (1 + w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (
@@ -80,7 +86,7 @@ def _turned(sin, cos, turn):
 def solve_incidence(w, n, lens, edge):
     """Solve the ray equation of n points in the rows X, Y, Z; STATE says how it went."""
     for i in range(n):
-        x, y, z = w[X + i] + NOWHERE, w[Y + i], w[Z + i]
+        x, y, z = w[X + i] + AXIS_EPS, w[Y + i], w[Z + i]
         r2 = x * x + y * y
         r, d = np.sqrt(r2), np.sqrt(r2 + z * z)
         half = 2.0 * _half_angle(r, d + abs(z))
@@ -92,7 +98,7 @@ def solve_incidence(w, n, lens, edge):
     if lens[SHIFT_KIND] >= 0:
         _shifted_rays(w, n, lens)
     for i in range(n):
-        seen = (w[CLEARANCE + i] > CLEAR) & (w[THETA + i] <= edge)
+        seen = (w[CLEARANCE + i] > ZERO_CLEARANCE) & (w[THETA + i] <= edge)
         w[STATE + i] = VALID if seen else INVALID
     if lens[SHIFT_KIND] >= 0:
         for i in range(n):
@@ -111,9 +117,9 @@ def _shifted_rays(w, n, lens):
     if late:
         for i in range(n):
             for _ in range(MORE_STEPS):
-                if not w[STATE + i] < SETTLED:
+                if not w[STATE + i] < STEP_TOLERANCE:
                     _newton_steps(w, i, i + 1, lens)
-            if not w[STATE + i] < SETTLED:
+            if not w[STATE + i] < STEP_TOLERANCE:
                 w[TURN + i] = np.nan
 
 
@@ -136,9 +142,9 @@ def _newton_steps(w, first, last, lens):
         turn = w[TURN + i] + step
         w[TURN + i], w[CLEARANCE + i] = turn, clearance
         w[THETA + i] = w[THETA0 + i] + turn
-        w[SIN + i], w[COS + i] = _turned(w[SIN0 + i], w[COS0 + i], turn)
+        w[SIN + i], w[COS + i] = _rotate_sin_cos(w[SIN0 + i], w[COS0 + i], turn)
         w[STATE + i] = abs(step)
-        late += not w[STATE + i] < SETTLED
+        late += not w[STATE + i] < STEP_TOLERANCE
     return late
 
 
@@ -216,14 +222,14 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
             w[X + i] = 0.0 if unused else w[X + i]
             w[Y + i] = 0.0 if unused else w[Y + i]
             w[Z + i] = 1.0 if unused else w[Z + i]
-        solve_incidence(w, n, lens, BEHIND)
+        solve_incidence(w, n, lens, BACKWARD_ANGLE)
         image(w, n, lens)
         derivatives(w, n, lens)
         failed = 0
         for i in range(n):
             failed += (w[STATE + i] != VALID) & (weights[i] != 0.0)
         if failed:
-            return _worst(w, n, weights)
+            return _worst_state(w, n, weights)
         for i in range(n):
             w[ROW + 6 * B + i] = w[U + i] - measured[i, 0]
             w[ROW + 13 * B + i] = w[V + i] - measured[i, 1]
@@ -233,7 +239,7 @@ def add_view(w, points, uv, weight, lens, rotation, position, gram):
 
 
 @njit(**BARE)
-def _worst(w, n, weight):
+def _worst_state(w, n, weight):
     worst = VALID
     for i in range(n):
         if weight[i] != 0.0:
@@ -242,7 +248,7 @@ def _worst(w, n, weight):
 
 
 @njit(inline='always', **BARE)
-def _with(w, i, row, u, v):
+def _row_product(w, i, row, u, v):
     """Return the product of one row of a point with another."""
     at = ROW + row * B + i
     return u * w[at] + v * w[at + ROWS]
@@ -256,42 +262,42 @@ def _add_products(w, n, gram):
     for i in range(n):  # as many sums at once as there are registers for them
         s = w[STATE + i]
         u, v = s * w[ROW + i], s * w[ROW + ROWS + i]
-        a0 += _with(w, i, 0, u, v)
-        a1 += _with(w, i, 1, u, v)
-        a2 += _with(w, i, 2, u, v)
-        a3 += _with(w, i, 3, u, v)
-        a4 += _with(w, i, 4, u, v)
-        a5 += _with(w, i, 5, u, v)
-        a6 += _with(w, i, 6, u, v)
+        a0 += _row_product(w, i, 0, u, v)
+        a1 += _row_product(w, i, 1, u, v)
+        a2 += _row_product(w, i, 2, u, v)
+        a3 += _row_product(w, i, 3, u, v)
+        a4 += _row_product(w, i, 4, u, v)
+        a5 += _row_product(w, i, 5, u, v)
+        a6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + B + i], s * w[ROW + ROWS + B + i]
-        b1 += _with(w, i, 1, u, v)
-        b2 += _with(w, i, 2, u, v)
-        b3 += _with(w, i, 3, u, v)
-        b4 += _with(w, i, 4, u, v)
-        b5 += _with(w, i, 5, u, v)
-        b6 += _with(w, i, 6, u, v)
+        b1 += _row_product(w, i, 1, u, v)
+        b2 += _row_product(w, i, 2, u, v)
+        b3 += _row_product(w, i, 3, u, v)
+        b4 += _row_product(w, i, 4, u, v)
+        b5 += _row_product(w, i, 5, u, v)
+        b6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + 2 * B + i], s * w[ROW + ROWS + 2 * B + i]
-        c2 += _with(w, i, 2, u, v)
-        c3 += _with(w, i, 3, u, v)
-        c4 += _with(w, i, 4, u, v)
-        c5 += _with(w, i, 5, u, v)
-        c6 += _with(w, i, 6, u, v)
+        c2 += _row_product(w, i, 2, u, v)
+        c3 += _row_product(w, i, 3, u, v)
+        c4 += _row_product(w, i, 4, u, v)
+        c5 += _row_product(w, i, 5, u, v)
+        c6 += _row_product(w, i, 6, u, v)
     for i in range(n):
         s = w[STATE + i]
         u, v = s * w[ROW + 3 * B + i], s * w[ROW + ROWS + 3 * B + i]
-        d3 += _with(w, i, 3, u, v)
-        d4 += _with(w, i, 4, u, v)
-        d5 += _with(w, i, 5, u, v)
-        d6 += _with(w, i, 6, u, v)
+        d3 += _row_product(w, i, 3, u, v)
+        d4 += _row_product(w, i, 4, u, v)
+        d5 += _row_product(w, i, 5, u, v)
+        d6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + 4 * B + i], s * w[ROW + ROWS + 4 * B + i]
-        e4 += _with(w, i, 4, u, v)
-        e5 += _with(w, i, 5, u, v)
-        e6 += _with(w, i, 6, u, v)
+        e4 += _row_product(w, i, 4, u, v)
+        e5 += _row_product(w, i, 5, u, v)
+        e6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + 5 * B + i], s * w[ROW + ROWS + 5 * B + i]
-        f5 += _with(w, i, 5, u, v)
-        f6 += _with(w, i, 6, u, v)
+        f5 += _row_product(w, i, 5, u, v)
+        f6 += _row_product(w, i, 6, u, v)
         u, v = s * w[ROW + 6 * B + i], s * w[ROW + ROWS + 6 * B + i]
-        g6 += _with(w, i, 6, u, v)
+        g6 += _row_product(w, i, 6, u, v)
     sums = (a0, a1, a2, a3, a4, a5, a6, b1, b2, b3, b4, b5, b6, c2, c3, c4, c5, c6,
             d3, d4, d5, d6, e4, e5, e6, f5, f6, g6)
     for k in range(28):

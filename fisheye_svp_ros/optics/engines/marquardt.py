@@ -19,7 +19,7 @@ STEP_TOLERANCE = 2e-9
 _ROUNDING = 1e-13
 # Whitened residuals are known to no better than this: image points of 1000 px have 13 digits.
 _NOISE = 1e-11
-_LEAST = 1e-300  # what is divided by in place of 0
+_MIN_DIVISOR = 1e-300  # what is divided by in place of 0
 
 
 def is_last(moved: Array, moved_before: Array, cost: Array, damping: Array) -> Mask:
@@ -42,10 +42,10 @@ def adjusted(
 ) -> tuple[Array, Array]:
     """Return the next damping and its growth from what a step gained in cost, and |J d|^2."""
     # A step out of the domain gains minus infinity.
-    ratio = np.minimum(np.maximum(gained / np.maximum(moved, _LEAST), -1.0), 2.0)
+    ratio = np.minimum(np.maximum(gained / np.maximum(moved, _MIN_DIVISOR), -1.0), 2.0)
     shrunk = damping * np.minimum(np.maximum(1.0 - (2.0 * ratio - 1.0)**3, 0.1), 2.0)
     raised = np.maximum(damping, 1e-9) * growth
-    accepted, refused = 1.0 * better, 1.0 - better  # factors, see `optics.formulas.halved`
+    accepted, refused = 1.0 * better, 1.0 - better  # factors, see `optics.formulas.half_angle`
     return (
         accepted * np.maximum(shrunk, 1e-15) + refused * raised,
         accepted * FIRST_GROWTH + refused * 2.0 * growth,

@@ -27,8 +27,8 @@ from fisheye_svp_ros.pose import Pose
 T = TypeVar('T')
 
 _SHARE = 20_000  # points below which a thread of their own does not pay
-_PIECES = 4  # a thread: one that is held up leaves more of them to the others
-_KEPT = 64  # lenses
+_BLOCKS = 4  # a thread: one that is held up leaves more of them to the others
+_CACHE_SIZE = 64  # lenses
 
 _lenses: dict[int, tuple[Lens, Array | None]] = {}
 
@@ -44,8 +44,8 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     def run(part: slice) -> None:
         entries.project(points[part], numbers, limit, uv[part], state[part])
 
-    _spread(run, len(points), len(points))
-    unsettled = _unsettled(state, numbers)
+    _run_threaded(run, len(points), len(points))
+    unsettled = _rays_to_repeat(state, numbers)
     if unsettled is not None:
         uv[unsettled], state[unsettled] = numpy_engine.project(lens, points[unsettled], limited)
     return uv, state > 0
@@ -69,9 +69,9 @@ def linearise_views(
             d_pose[part],
         )
 
-    _spread(run, systems, systems * count)
+    _run_threaded(run, systems, systems * count)
     by_pose = np.moveaxis(d_pose, -1, 1)
-    unsettled = _unsettled(state, numbers)
+    unsettled = _rays_to_repeat(state, numbers)
     if unsettled is not None:
         rows, _ = unsettled
         again = numpy_engine.linearise_views(
@@ -103,7 +103,7 @@ def localize(
             numbers, minimum, limit, *(array[part] for array in arrays))
         return counts
 
-    remaining, flat = map(sum, zip(*_spread(run, systems, 4 * systems * count), strict=True))
+    remaining, flat = map(sum, zip(*_run_threaded(run, systems, 4 * systems * count), strict=True))
     return found, remaining, flat
 
 
@@ -137,7 +137,7 @@ def packed(lens: Lens) -> Array | None:
     """Return a lens as the kernels know it, None where it has a curve that they do not."""
     kept = _lenses.get(id(lens))
     if kept is None:
-        if len(_lenses) >= _KEPT:
+        if len(_lenses) >= _CACHE_SIZE:
             _lenses.clear()
         # A lens that is kept keeps its id to itself.
         kept = _lenses[id(lens)] = lens, _pack(lens)
@@ -168,19 +168,19 @@ def _contiguous(*arrays: Any) -> list[Any]:
     return [np.ascontiguousarray(array) for array in arrays]
 
 
-def _unsettled(state: Array, numbers: Array) -> tuple[Index, ...] | None:
+def _rays_to_repeat(state: Array, numbers: Array) -> tuple[Index, ...] | None:
     if numbers[kernels.SHIFT_KIND] < 0:
         return None
     places = np.nonzero(state == kernels.UNSETTLED)
     return places if places[0].size else None
 
 
-def _spread(run: Callable[[slice], T], count: int, points: int) -> list[T]:
+def _run_threaded(run: Callable[[slice], T], count: int, points: int) -> list[T]:
     """Run over `count` rows, on as many threads as there are and as `points` make worth while."""
     threads = min(_threads(), count, points // _SHARE)
     if threads < 2:
         return [run(slice(0, count))]
-    edges = np.linspace(0, count, min(_PIECES * threads, count) + 1).astype(int).tolist()
+    edges = np.linspace(0, count, min(_BLOCKS * threads, count) + 1).astype(int).tolist()
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(run, (slice(*pair) for pair in itertools.pairwise(edges))))
 

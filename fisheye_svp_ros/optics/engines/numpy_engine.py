@@ -8,7 +8,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.optics.engines.results import Incidence, Seen
-from fisheye_svp_ros.optics.formulas import NOWHERE, point_derivatives
+from fisheye_svp_ros.optics.formulas import AXIS_EPS, point_derivatives
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.rays import RaySolution, solve_incidence
 
@@ -16,7 +16,7 @@ _BLOCK = 16_700  # points; rows a power of two apart would share the same lines 
 
 # What the derivatives of a place in the image add up to, (3, 2, 6): by a point's x, y, z in the
 # camera frame, or by a turn of the point about these axes; of u, v; the terms of `_add_up`.
-_PLACE = np.array([
+_INTRINSICS_JACOBIAN = np.array([
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
     [[0, 0, 0, 1, 0, 0], [0, 1, -1, 0, 0, 0]],
     [[0, 0, 0, 0, -1, 0], [0, 0, 0, 0, 0, -1]],
@@ -26,7 +26,7 @@ _TURN = np.array([
     [[1, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0]],
     [[0, 0, 0, 0, 0, -1], [0, 0, 0, 0, 1, 0]],
 ], dtype=float)
-_BY_CAMERA = -np.array([_PLACE, _TURN])  # which moves the other way
+_BY_CAMERA = -np.array([_INTRINSICS_JACOBIAN, _TURN])  # which moves the other way
 _IMAGE = np.eye(2, 6, 4)  # the place itself: the last terms by turn
 
 # Where there is no image, there is something to divide by zero.
@@ -70,7 +70,7 @@ def linearise_views(
     uv, valid = np.empty((2, *shape)), np.empty(shape, dtype=bool)
     d_pose, sums = np.empty((12, *shape)), _sums(lens, rotation)
     for part in _tiles(*shape):
-        local = _seen(rotation, position, points, part)
+        local = _to_cameras(rotation, position, points, part)
         met = _solved_incidence(lens, local, limited)
         out = (rows[:, *part].swapaxes(0, 1) for rows in (d_pose, uv))
         _add_up(sums[part[0]], met, met.height(lens.image_height), *out)
@@ -95,7 +95,7 @@ def pose_equations(
     sums, centre = _sums(lens, rotation), _pair(lens.cx, lens.cy, 3)
     for part in _tiles(systems, count):
         own, weights = part[0], weight[part]
-        local = _seen(rotation, position, points, part)
+        local = _to_cameras(rotation, position, points, part)
         if not weights.all():
             local[:, weights == 0] = np.array([[0.0], [0.0], [1.0]])
         met = _solved_incidence(lens, local, False)
@@ -146,11 +146,13 @@ def _rows(points: Array) -> Array:
 
 def _solved_incidence(lens: Lens, local: Array, limited: bool) -> RaySolution:
     """See `rays.solve_incidence`; moves points off the axis."""
-    local[0] += NOWHERE
+    local[0] += AXIS_EPS
     return solve_incidence(lens, local, limited)
 
 
-def _seen(rotation: Array, position: Array, points: Array, part: tuple[slice, slice]) -> Array:
+def _to_cameras(
+    rotation: Array, position: Array, points: Array, part: tuple[slice, slice]
+) -> Array:
     """Return a tile's points (3, S, N) in the frames of their cameras."""
     own, seen = part[0], points[part].transpose(2, 0, 1)
     arm = np.array(seen, order='C')  # faster copied than subtracted

@@ -18,9 +18,9 @@ from fisheye_svp_ros.optics.varying import Varying
 from fisheye_svp_ros.pose import cross_matrix
 
 _STEPS = 20
-_SETTLED = 1e-8  # rad: a last Newton step this small leaves an error of its square
-_LONGEST = 0.2  # rad, a step
-_MISSED = 1e-9  # of the range, by which a ray may pass its point
+_STEP_TOLERANCE = 1e-8  # rad: a last Newton step this small leaves an error of its square
+_MAX_STEP = 0.2  # rad, a step
+_MAX_MISS = 1e-9  # of the range, by which a ray may pass its point
 
 _quiet = np.errstate(divide='ignore', invalid='ignore', over='ignore')
 
@@ -46,22 +46,22 @@ def sight(lens: Lens, points: Array) -> Sight:
     direction = lens.port.start(points)
     for _ in range(_STEPS):
         across = _across(direction)
-        _, off, by_turn = _missed(lens, points, direction, across)
-        step = -_solved(by_turn, off[..., None])[..., 0]
-        step *= _LONGEST / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), _LONGEST)
+        _, off, by_turn = _ray_miss(lens, points, direction, across)
+        step = -_solve_2x2(by_turn, off[..., None])[..., 0]
+        step *= _MAX_STEP / np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), _MAX_STEP)
         direction = direction + (step[..., None] * across).sum(axis=1)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        if np.all(np.abs(step) < _SETTLED, where=np.isfinite(step)):
+        if np.all(np.abs(step) < _STEP_TOLERANCE, where=np.isfinite(step)):
             break
     across = _across(direction)
     more = 1 + len(lens.port.coefficients)
-    side, off, slopes = _missed(lens, points, direction, across, more)
+    side, off, slopes = _ray_miss(lens, points, direction, across, more)
     by_turn, other = slopes[..., :2], slopes[..., 2:]
     # off = 0 stays so: what moves it otherwise is taken back by a turn of the ray.
-    turn = -_solved(by_turn, np.concatenate([side, other], axis=-1))
+    turn = -_solve_2x2(by_turn, np.concatenate([side, other], axis=-1))
     change = np.swapaxes(across, -1, -2) @ turn
     size = np.linalg.norm(points, axis=-1)
-    valid = np.asarray(np.linalg.norm(off, axis=-1) < _MISSED * size)
+    valid = np.asarray(np.linalg.norm(off, axis=-1) < _MAX_MISS * size)
     return Sight(direction, change[..., :3], change[..., 3], change[..., 4:], valid)
 
 
@@ -117,7 +117,7 @@ def _image(lens: Lens, seen: Sight, limited: bool) -> tuple[Array, Mask, Array]:
     return np.where(valid[:, None], uv[0], np.nan), valid, -d_pose[0, ..., :3]
 
 
-def _missed(
+def _ray_miss(
     lens: Lens, points: Array, direction: Array, across: Array, more: int = 0
 ) -> tuple[Array, Array, Array]:
     """Trace rays and say by what they miss their points: across (M, 2, 3), off (M, 2), slopes.
@@ -170,7 +170,7 @@ def _across(direction: Array) -> Array:
     return np.stack([one, np.cross(direction, one)], axis=1)
 
 
-def _solved(matrix: Array, right: Array) -> Array:
+def _solve_2x2(matrix: Array, right: Array) -> Array:
     """Return matrix^-1 right for matrices (M, 2, 2), right (M, 2, K); not finite if singular."""
     a, b, c, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 0], matrix[:, 1, 1]
     turned = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=1)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from fisheye_svp_ros.arrays import Array, Batch, Index, Mask
 from fisheye_svp_ros.pose import Pose
 
-FLAT = 0.1  # thickness of a target relative to its length, below which it counts as flat
+PLANARITY = 0.1  # thickness of a target relative to its length, below which it counts as flat
 
 # Points (S, N, 3), m; image points (S, N, 2), px; weights (S, N), 1/px
 Seen = tuple[Array, Array, Array]
