@@ -26,7 +26,7 @@ from benchmark.paper.writing import (
     lens_document,
     whole_directions,
 )
-from fisheye_svp_ros.commands.executors import local
+from fisheye_svp_ros.commands.executors import process_pool
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument('-o', '--output', type=Path, default=Path('config'), metavar='DIR',
                         help='default: config')
     args = parser.parse_args()
-    with local(os.cpu_count() or 1) as workers:
+    with process_pool(os.cpu_count() or 1) as workers:
         files = {'search': search, 'stopping': stopping}[args.study](workers.executor)
     for name, document in files.items():
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=95)

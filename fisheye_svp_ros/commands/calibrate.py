@@ -17,7 +17,7 @@ from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
     image_sizes,
-    measured,
+    read_input,
     search_options,
     sizes_beside,
 )
@@ -36,7 +36,7 @@ from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo
 from fisheye_svp_ros.scene.photograph_names import list_frames
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
 from fisheye_svp_ros.solve.measured import rms_px, sigma_known
-from fisheye_svp_ros.study.solutions import calibrated
+from fisheye_svp_ros.study.solutions import solve_rigs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     if args.lens and not (args.medium or args.port):
         raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
                              'water, or --port')
-    observations, sizes = measured(args.observations, args)
+    observations, sizes = read_input(args.observations, args)
     sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
     if args.lens:
         air = load_with_notes(args.lens)
@@ -162,7 +162,7 @@ def _rig(
     except ObservationError as cause:
         say(f'rig: {cause}')
         return
-    found = calibrated((left, right), *stereo_views(both))
+    found = solve_rigs((left, right), *stereo_views(both))
     fitted, reason = found.solution, found.reasons[0]
     if reason and sigma_known(both):
         say(f'rig: {reason}')

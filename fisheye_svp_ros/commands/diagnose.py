@@ -14,7 +14,7 @@ from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
-    measured,
+    read_input,
     search_options,
 )
 from fisheye_svp_ros.commands.plan import view_limits
@@ -145,7 +145,7 @@ def _read(
     """Return the views that can be posed, and the lens of all cameras or that of each."""
     from fisheye_svp_ros.diagnosis import posable_observations, remove_copies
 
-    table, sizes = measured(path, args)
+    table, sizes = read_input(path, args)
     note_huge(table)
     try:
         lenses = lenses_of(table.cameras, given)

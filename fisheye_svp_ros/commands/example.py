@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fisheye_svp_ros.commands.render import bowed, write_photographs
+from fisheye_svp_ros.commands.render import parabola, write_photographs
 from fisheye_svp_ros.io.files import together, write_text
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
     lens = Lens('example', 848, 800, 285.0, 285.3, 424.7, 398.2,
                 KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
     printed = Print(9, 6, 0.025)
-    printed = Print(9, 6, 0.025, bow=bowed(printed.corners, 0.0015))
+    printed = Print(9, 6, 0.025, bow=parabola(printed.corners, 0.0015))
     poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
     with together():

@@ -29,7 +29,7 @@ class Workers(NamedTuple):
 
 
 @contextmanager
-def local(count: int) -> Iterator[Workers]:
+def process_pool(count: int) -> Iterator[Workers]:
     """Yield processes on this machine; 0: this process itself.
 
     Raises SweepError when one of them dies.
@@ -69,13 +69,13 @@ class _Processes(ProcessPoolExecutor):
         """Return the future result of a function."""
         result: Future[Any] = Future()
 
-        def done(written: Future[Path]) -> None:
+        def pass_on(written: Future[Path]) -> None:
             try:
                 result.set_result(_load_and_delete(written.result()))
             except Exception as error:
                 result.set_exception(error)
 
-        super().submit(_written, self._folder, fn, *args, **kwargs).add_done_callback(done)
+        super().submit(_written, self._folder, fn, *args, **kwargs).add_done_callback(pass_on)
         return result
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes
-from fisheye_svp_ros.commands.photographs import measured as read
+from fisheye_svp_ros.commands.photographs import read_input as read
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import together, write_json

@@ -54,7 +54,7 @@ def record_sweep(
 
     def look() -> None:
         nonlocal reached
-        told = re.findall(r'scenario (\d+) of', processes.latest('camera'))
+        told = re.findall(r'scenario (\d+) of', processes.log_tail('camera'))
         if told and int(told[-1]) > reached:
             advance(int(told[-1]) - reached)
             reached = int(told[-1])

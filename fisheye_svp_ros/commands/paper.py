@@ -21,12 +21,12 @@ def run(args: argparse.Namespace) -> None:
     """Evaluate and report."""
     import os
 
-    from fisheye_svp_ros.commands.executors import local
+    from fisheye_svp_ros.commands.executors import process_pool
     from fisheye_svp_ros.paper.report import write_report
     from fisheye_svp_ros.paper.results import compute, tasks
     from fisheye_svp_ros.reporting.progress import progress
 
-    with local(os.cpu_count() or 1) as workers:
+    with process_pool(os.cpu_count() or 1) as workers:
         with progress('evaluating', tasks()) as step:
             results = compute(workers.executor, step)
         with progress('drawing'):

@@ -52,7 +52,7 @@ def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
     add_board_arguments(parser)
 
 
-def measured(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
+def read_input(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes]:
     """Return observations from a file, or from photographs, with the image size of each camera.
 
     Raises ObservationError for anything missing or malformed, ParameterError for photographs

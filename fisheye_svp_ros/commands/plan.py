@@ -92,14 +92,15 @@ def view_limits(given: Sequence[float]) -> ViewLimits:
 
 def _note_guessed(lens: Lens, wanted: NextViews) -> None:
     """Name the views that need more of a lens than it was calibrated for."""
-    if lens.reached is None:
+    if lens.calibrated_angle is None:
         return
     seen = wanted.shots.camera.into_body(wanted.board.points)
     angle = incidence(lens, seen).theta.max(axis=-1)
-    further = [str(i + 1) for i in np.flatnonzero(angle > lens.reached)]
+    further = [str(i + 1) for i in np.flatnonzero(angle > lens.calibrated_angle)]
     if further:
-        say(f'lens {lens.name!r} was calibrated up to {np.degrees(lens.reached):.0f} degrees off '
-            f'the axis; views {", ".join(further)} reach further, up to '
+        edge = np.degrees(lens.calibrated_angle)
+        say(f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; '
+            f'views {", ".join(further)} reach further, up to '
             f'{np.degrees(angle.max()):.0f}, where the board may be seen elsewhere than drawn, or '
             'not at all')
 

@@ -88,7 +88,7 @@ class Processes:
         self._running[name].send_signal(signal.SIGINT)
         self.wait([name], _GRACE * 6)
 
-    def latest(self, name: str) -> str:
+    def log_tail(self, name: str) -> str:
         """Return the end of what one has said."""
         with self._log(name).open('rb') as log:
             log.seek(max(0, log.seek(0, os.SEEK_END) - _END))
@@ -98,7 +98,7 @@ class Processes:
         return self._logs / f'{name}.log'
 
     def _last_line(self, name: str) -> str:
-        lines = self.latest(name).splitlines()
+        lines = self.log_tail(name).splitlines()
         return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
 
 

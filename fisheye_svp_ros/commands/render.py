@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:
         printed = Print(pattern.columns, pattern.rows, pattern.size,
-                        bow=bowed(printed.corners, 1e-3 * args.bow))
+                        bow=parabola(printed.corners, 1e-3 * args.bow))
     boards = TARGETS.get(args.target, board)(printed)
     if args.poses:
         poses = read_poses(args.poses).pose
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> None:
           'corners, poses.csv')
 
 
-def bowed(corners: Array, height: float) -> Field:
+def parabola(corners: Array, height: float) -> Field:
     """Return a board's height, m: a parabola across its longer side, `height` from end to top."""
     low, high = corners[:, :2].min(axis=0), corners[:, :2].max(axis=0)
     longer = int(np.argmax(high - low))

@@ -6,7 +6,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from fisheye_svp_ros.commands.executors import dask, local
+from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.notes import note_formats, say
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
@@ -101,7 +101,7 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> N
     if count < len(plan.sweep):
         say(f'{len(plan.sweep) - count} of {len(plan.sweep)} scenarios are done already')
     with (
-        dask(args.dask) if args.dask else local(args.workers) as workers,
+        dask(args.dask) if args.dask else process_pool(args.workers) as workers,
         progress('sweeping', count) as advance,
     ):
         for numbers, columns in solve_sweep(plan, remaining, engine, *workers):

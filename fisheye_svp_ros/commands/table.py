@@ -71,12 +71,12 @@ def _print(bag: str, columns: Columns) -> None:
 
 def _blocks(tags: Cells, metrics: Cells) -> Iterator[Cells]:
     """Yield the tags and as many of the metrics as a line has room for, until all are told."""
-    def wide(columns: Cells) -> int:
+    def total_width(columns: Cells) -> int:
         return sum(3 + max(map(len, (name, *cells))) for name, cells in columns.items())
 
     block: Cells = {}
     for name, cells in metrics.items():
-        if block and wide({**tags, **block, name: cells}) > console().width:
+        if block and total_width({**tags, **block, name: cells}) > console().width:
             yield tags | block
             block = {}
         block[name] = cells

@@ -164,7 +164,7 @@ class GatheredPoints(NamedTuple):
         board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
         for i, one in enumerate(boards):
             mine = shown & (number == one.id)
-            board[mine], local[mine] = i, one.local(points[mine])[:, :2]
+            board[mine], local[mine] = i, one.to_board(points[mine])[:, :2]
             place[mine] = place[mine] @ one.axes.T
         of_landmark, at = np.zeros(len(known), dtype=np.int64), np.zeros((len(known), 2))
         if geometry is None:
@@ -173,7 +173,7 @@ class GatheredPoints(NamedTuple):
             of_landmark = np.searchsorted([one.id for one in boards], geometry.board)
             for i, one in enumerate(boards):
                 mine = of_landmark == i
-                at[mine] = one.local(geometry.points[mine])[:, :2]
+                at[mine] = one.to_board(geometry.points[mine])[:, :2]
         return cls(used, uv, weight, camera, slot, known, board, local, place, extents, boards,
                    of_landmark, at)
 

@@ -332,4 +332,4 @@ def project(lens: Lens, points: Array) -> Image:
 def back_project(lens: Lens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px, through a lens with its corrections."""
     rays = ForwardModel(lens).back_project(uv.reshape(1, -1, 2))
-    return rays.shaped(uv.shape[:-1])
+    return rays.reshape(uv.shape[:-1])

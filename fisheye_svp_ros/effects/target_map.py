@@ -70,7 +70,7 @@ class KnownTarget(NamedTuple):
         for one in find_boards(self.points, self.board):
             mine = self.board == one.id
             local = less_similarity(self.points[mine], moved[mine]) @ one.axes.T
-            place = one.local(self.points[mine])[:, :2] * one.size
+            place = one.to_board(self.points[mine])[:, :2] * one.size
             maps.append(BoardMap(one.id, place, local[:, 2], local[:, :2]))
         return maps
 

@@ -135,7 +135,7 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
     }
     if lens.viewpoint_shift is not None:
         parts = [_curve_to_dict(part, VIEWPOINT_SHIFTS, 'e')
-                 for part in lens.viewpoint_shift.pieces()]
+                 for part in lens.viewpoint_shift.summands()]
         document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
     document |= {'corrections': own | dict(lens.corrections), 'target': dict(lens.target)}

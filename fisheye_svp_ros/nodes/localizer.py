@@ -24,7 +24,7 @@ from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.study.metrics import LOCALIZATION_METRICS
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import SetSolutions, localized, residual_points
+from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets, residual_points
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import LensErrors
@@ -71,7 +71,7 @@ class Localizer(SolverNode):
             sigma = errors.allowing(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
-        found = self._localized(model, views, true).checked()
+        found = self._localized(model, views, true).require()
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         camera = self.settings.camera_frame or seen.frame
@@ -109,11 +109,11 @@ class Localizer(SolverNode):
         """
         start, before = self._before
         searched = self._misfits % _SEARCHED_EACH == 0
-        found = localized(model, views, true, start, examined=True, searched=searched)
+        found = localize_sets(model, views, true, start, examined=True, searched=searched)
         if start is not None and not (
             _rms_px(found) < _AS_WELL * before and _is_near(start, found.solution.pose, views)
         ):
-            found = localized(model, views, true, examined=True)
+            found = localize_sets(model, views, true, examined=True)
         rms, pose = _rms_px(found), found.solution.pose
         self._before = (pose, max(rms, _EXACT)) if np.isfinite(rms) else (None, 0.0)
         whole = found.metrics['points'][0] == views.used.sum()

@@ -16,7 +16,7 @@ from fisheye_svp_ros.scene.observations import STEREO, stereo_views
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.metrics import STEREO_CALIBRATION_METRICS
 from fisheye_svp_ros.study.settings import StereoCalibratorSettings
-from fisheye_svp_ros.study.solutions import SetSolutions, calibrated
+from fisheye_svp_ros.study.solutions import SetSolutions, solve_rigs
 
 
 class StereoCalibrator(SolverNode):
@@ -48,7 +48,7 @@ class StereoCalibrator(SolverNode):
         one = collected_set(stamp, landmarks, items, self.CAMERAS)
         window = [*known, one][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
-        found = calibrated(self.models(stamp, items), left, right, true=true_rig(items)).checked()
+        found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require()
         # Only now: a set that cannot be used must not spoil those to come.
         self._window, self._scenario = window, scenario
         self._publish(stamp, items, found)

@@ -30,7 +30,7 @@ from fisheye_svp_ros.solve.reliability import doubt_of_pairs
 from fisheye_svp_ros.solve.stereo_depth import epipolar_curves
 from fisheye_svp_ros.study.metrics import STEREO_DEPTH_METRICS
 from fisheye_svp_ros.study.settings import SolverSettings, StereoDepthSettings
-from fisheye_svp_ros.study.solutions import Pair, measured
+from fisheye_svp_ros.study.solutions import Pair, measure_points
 
 
 class StereoDepth(SolverNode):
@@ -76,10 +76,10 @@ class StereoDepth(SolverNode):
             left.landmark, right.landmark, assume_unique=True, return_indices=True
         )
         uv = left.uv[in_left], right.uv[in_right]
-        found = measured(
+        found = measure_points(
             models, rig.take(None), uv[0][None], uv[1][None],
             _true_points(known_points(landmarks, right)[in_right], items), self.settings.optimal,
-        ).checked()
+        ).require()
         points = found.solution.points[0]
         seen = np.isfinite(points[:, 0])
         cloud = structured(LANDMARKS, ids[seen], *points[seen].T)

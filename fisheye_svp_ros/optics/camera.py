@@ -93,7 +93,7 @@ class Rays(NamedTuple):
     theta: Array
     valid: Mask
 
-    def shaped(self, shape: tuple[int, ...]) -> Rays:
+    def reshape(self, shape: tuple[int, ...]) -> Rays:
         """Return as many rays in another leading shape."""
         return Rays(self.origin.reshape(*shape, 3), self.direction.reshape(*shape, 3),
                     self.theta.reshape(shape), self.valid.reshape(shape))
@@ -187,7 +187,7 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     if lens.viewpoint_shift is not None:
         origin[..., 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
     if lens.port is not None:
-        at, way = ported.traced(lens, direction.reshape(-1, 3))
+        at, way = ported.trace_rays(lens, direction.reshape(-1, 3))
         back = (at.value * way.value).sum(axis=-1, keepdims=True)
         origin = (at.value - back * way.value).reshape(direction.shape)
         direction = way.value.reshape(direction.shape)

@@ -39,7 +39,7 @@ class Curve:
         """Values of the coefficients, in the order of `coefficient_names`."""
         return tuple(getattr(self, name) for name in self.coefficient_names)
 
-    def changed(self, **coefficients: float) -> Self:
+    def with_values(self, **coefficients: float) -> Self:
         """Return the curve with some coefficients replaced."""
         return replace(self, **coefficients)  # type: ignore[type-var]
 
@@ -122,8 +122,8 @@ class SumOfHeights(ImageHeight):
     def coefficients(self) -> tuple[float, ...]:
         return self.base.coefficients
 
-    def changed(self, **coefficients: float) -> Self:
-        return replace(self, base=self.base.changed(**coefficients))
+    def with_values(self, **coefficients: float) -> Self:
+        return replace(self, base=self.base.with_values(**coefficients))
 
     @cached_property
     def limit(self) -> float:
@@ -172,15 +172,16 @@ class ViewpointShift(Curve):
         """Return the derivatives of s with respect to the coefficients, shape (..., K)."""
         return np.empty((*np.shape(theta), 0))
 
-    def scaled(self, factor: float) -> ViewpointShift:
+    def scale_by(self, factor: float) -> ViewpointShift:
         """Return the curve times a factor."""
-        return self.changed(**{name: factor * value for name, value in self._lengths().items()})
+        lengths = {name: factor * value for name, value in self._lengths().items()}
+        return self.with_values(**lengths)
 
     def plus(self, other: ViewpointShift) -> ViewpointShift:
         """Return the sum, as one curve where both are of one kind."""
-        return reduce(SumOfShifts.joined, other.pieces(), SumOfShifts(self.pieces())).simplest()
+        return reduce(SumOfShifts.add, other.summands(), SumOfShifts(self.summands())).simplest()
 
-    def pieces(self) -> tuple[ViewpointShift, ...]:
+    def summands(self) -> tuple[ViewpointShift, ...]:
         """Return the curves whose sum this is."""
         return (self,)
 
@@ -188,14 +189,14 @@ class ViewpointShift(Curve):
         names = self.coefficient_names if self.lengths is None else self.lengths
         return {name: getattr(self, name) for name in names}
 
-    def merged(self, other: ViewpointShift) -> ViewpointShift | None:
+    def merge(self, other: ViewpointShift) -> ViewpointShift | None:
         """Return the sum with a curve of the same kind; None for another kind."""
         if type(self) is not type(other):
             return None
         mine, more = self._lengths(), other._lengths()
-        if self.changed(**more) != other:
+        if self.with_values(**more) != other:
             return None
-        return self.changed(**{name: value + more[name] for name, value in mine.items()})
+        return self.with_values(**{name: value + more[name] for name, value in mine.items()})
 
 
 @dataclass(frozen=True)
@@ -222,12 +223,12 @@ class SumOfShifts(ViewpointShift):
     def coefficients(self) -> tuple[float, ...]:
         return tuple(value for part in self.parts for value in part.coefficients)
 
-    def changed(self, **coefficients: float) -> Self:
+    def with_values(self, **coefficients: float) -> Self:
         values = dict(zip(self.coefficient_names, self.coefficients, strict=True)) | coefficients
         left, parts = list(values.values()), []
         for part in self.parts:
             names = part.coefficient_names
-            parts.append(part.changed(**dict(zip(names, left, strict=False))))
+            parts.append(part.with_values(**dict(zip(names, left, strict=False))))
             left = left[len(names):]
         return replace(self, parts=tuple(parts))
 
@@ -241,20 +242,20 @@ class SumOfShifts(ViewpointShift):
     def columns(self, theta: Array) -> Array:
         return np.concatenate([part.columns(theta) for part in self.parts], axis=-1)
 
-    def scaled(self, factor: float) -> SumOfShifts:
-        return SumOfShifts(tuple(part.scaled(factor) for part in self.parts))
+    def scale_by(self, factor: float) -> SumOfShifts:
+        return SumOfShifts(tuple(part.scale_by(factor) for part in self.parts))
 
-    def pieces(self) -> tuple[ViewpointShift, ...]:
+    def summands(self) -> tuple[ViewpointShift, ...]:
         return self.parts
 
     def simplest(self) -> ViewpointShift:
         """Return the only part itself where there is one."""
         return self if len(self.parts) > 1 else self.parts[0]
 
-    def joined(self, other: ViewpointShift) -> SumOfShifts:
+    def add(self, other: ViewpointShift) -> SumOfShifts:
         """Return the sum with one more curve, within the part of its kind if there is one."""
         for number, part in enumerate(self.parts):
-            merged = part.merged(other)
+            merged = part.merge(other)
             if merged is not None:
                 return SumOfShifts((*self.parts[:number], merged, *self.parts[number + 1:]))
         return SumOfShifts((*self.parts, other))

@@ -85,7 +85,7 @@ class Lens:
                 raise LensError(f'lens {self.name!r} has no parameter {name!r}; it has {known}')
         for curve, coefficients in curves.items():
             if coefficients:
-                changes[curve] = getattr(self, curve).changed(**coefficients)
+                changes[curve] = getattr(self, curve).with_values(**coefficients)
         return replace(self, **changes)
 
     def svp(self) -> Lens:
@@ -103,7 +103,7 @@ class Lens:
         return (self.fx + self.fy) / 2
 
     @property
-    def reached(self) -> float | None:
+    def calibrated_angle(self) -> float | None:
         """The incidence angle up to which it was calibrated, rad; None if unknown, or by a port.
 
         Past it the curve is a guess, and where the image of the lens ends is not known.

@@ -107,7 +107,7 @@ class FlatGlass(Port):
         return self.medium_index
 
     def starts(self) -> list[Self]:
-        return [self.changed(distance=distance) for distance in _DISTANCES]
+        return [self.with_values(distance=distance) for distance in _DISTANCES]
 
     @property
     def reach(self) -> float:
@@ -169,7 +169,7 @@ class DomeGlass(Port):
     placed = ('x', 'y', 'z')
 
     def starts(self) -> list[Self]:
-        return [self.changed(z=share * self.radius) for share in _OFF_CENTRE]
+        return [self.with_values(z=share * self.radius) for share in _OFF_CENTRE]
 
     @property
     def reach(self) -> float:

@@ -72,7 +72,7 @@ def scaled_shift(lens: Lens, factor: float) -> Lens:
     shift = lens.viewpoint_shift
     if shift is None:
         return lens
-    return replace(lens, viewpoint_shift=shift.scaled(factor))
+    return replace(lens, viewpoint_shift=shift.scale_by(factor))
 
 
 def calibrated_shift(lens: Lens) -> Lens:

@@ -23,7 +23,7 @@ from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, scalars, simulate_scenario
 from fisheye_svp_ros.study.settings import LocalizerSettings
-from fisheye_svp_ros.study.solutions import localized, residual_points
+from fisheye_svp_ros.study.solutions import localize_sets, residual_points
 from fisheye_svp_ros.study.sweep import CAMERA, plan_sweep, sweep_rows
 
 # Poses of the right camera for depth, x, y, z, qx, qy, qz, qw: one a lens (section 5).
@@ -114,7 +114,7 @@ def compute_demo(
 def _residual_field(scenario: Scenario) -> ResidualSet:
     views = group_views(simulate_scenario(scenario).observations)
     model = model_of(scenario.lens, 1.0, LocalizerSettings().solves_svp)
-    points = residual_points(model, views, localized(model, views).checked().solution)
+    points = residual_points(model, views, localize_sets(model, views).require().solution)
     tags = {name: str(value) for name, value in scalars(scenario).items()}
     return ResidualSet('/localization/localizer/residuals', 0, points, tags)
 

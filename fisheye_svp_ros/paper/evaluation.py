@@ -25,7 +25,7 @@ from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.stereo_calibration import StereoCalibration
 from fisheye_svp_ros.study.metrics import Metrics
-from fisheye_svp_ros.study.solutions import calibrated, localized, measured
+from fisheye_svp_ros.study.solutions import localize_sets, measure_points, solve_rigs
 
 
 class LocalizedSpread(NamedTuple):
@@ -36,7 +36,7 @@ class LocalizedSpread(NamedTuple):
     views: Views
 
 
-class Measured(NamedTuple):
+class Measurement(NamedTuple):
     """Stereo measurement of N landmarks, NaN where a camera does not see one (section 5).
 
     uv_left, uv_right (N, 2), px; foot (N, 2), px: nearest point of the epipolar curve; distance,
@@ -65,7 +65,7 @@ class Evaluation(NamedTuple):
     localization: Array
     calibration: Array
     localized: tuple[LocalizedSpread, ...]
-    measured: tuple[Measured, ...]
+    measured: tuple[Measurement, ...]
 
     def panels(self, metric: str) -> Array:
         """Return a stereo depth metric of the nine panels, (9,)."""
@@ -112,7 +112,7 @@ def localize_environments(
     true = paper_pose(len(points))
     views = views_of(points, ForwardModel(lens).predict(true, views_of(points)).uv)
     model = ForwardModel(lens.svp() if solver is None else solver)
-    found = localized(model, views, true, true if start is None else start)
+    found = localize_sets(model, views, true, true if start is None else start)
     return LocalizedSpread(_rows(found.metrics), found.solution, views)
 
 
@@ -148,14 +148,14 @@ def calibrate_rigs(
             seen.append(views_of(points, model.predict(pose, blank).uv))
     left_views, right_views = map(Views.concatenate, views)
     known = ForwardModel(lens.svp() if solver is None else solver)
-    found = calibrated((known, known), left_views, right_views, len(systems),
+    found = solve_rigs((known, known), left_views, right_views, len(systems),
                        Pose.stack([true for _, true in systems]))
     table = _rows(found.metrics)
     table[:, :3] = table[:, :3] @ PAPER_FROM_OPTICAL
     return table.reshape(len(RADII), len(STYLE_NAMES), -1), found.solution
 
 
-def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measured:
+def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -> Measurement:
     """Measure the Whole landmarks with a rig that is known (section 5, figures 9 and 10)."""
     home = paper_pose(1)
     ahead = np.array([0.0, 0.0, RIGHT_CAMERA_Z.get(lens.name, 0.0)])
@@ -167,10 +167,10 @@ def measure(lens: Lens, radius: float, style: str, solver: Lens | None = None) -
     uv_right = model.predict(right, blank).uv
     uv_left = model.predict(right.compose(left_in_right.take(None)), blank).uv
     known = ForwardModel(lens.svp() if solver is None else solver)
-    solved = measured((known, known), left_in_right.take(None), uv_left, uv_right,
+    solved = measure_points((known, known), left_in_right.take(None), uv_left, uv_right,
                       right.into_body(points))
     found = solved.solution
-    return Measured(
+    return Measurement(
         uv_left[0], uv_right[0], found.foot[0], found.distance[0], found.vertical[0], points,
         found.points[0] @ right.rotation[0].T + right.position[0],
         {name: float(value[0]) for name, value in solved.metrics.items()},

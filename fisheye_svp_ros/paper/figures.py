@@ -17,7 +17,7 @@ from fisheye_svp_ros.paper.beyond import NOISES, Crossings
 from fisheye_svp_ros.paper.evaluation import (
     Evaluation,
     LocalizedSpread,
-    Measured,
+    Measurement,
     landmarks_at,
     shift_at,
 )
@@ -54,10 +54,10 @@ def draw_shift(path: Path, lenses: dict[str, Lens], family: Family) -> None:
         axis = figure.subplots()
         for name, lens in lenses.items():
             theta = np.linspace(0, lens.max_incidence, 200)
-            curves = 1e3 * shift_curves(family.fits, name, theta)
+            curves = 1e3 * shift_curves(family.matching, name, theta)
             axis.plot(np.degrees(theta), curves.T, color=_COLOURS[name], alpha=0.18, linewidth=0.8)
             axis.plot(np.degrees(theta), 1e3 * shift_at(lens, theta), color=_COLOURS[name],
-                      linewidth=2, label=f'{NAMES[name]} (light: all {len(family.fits)} fits)')
+                      linewidth=2, label=f'{NAMES[name]} (light: all {len(family.matching)} fits)')
         axis.axvline(88, color=FAINT, linestyle=':')
         axis.annotate('outermost landmarks', (88, axis.get_ylim()[1]), ha='right', va='top',
                       rotation=90, color=_INK, fontsize=8)
@@ -259,7 +259,7 @@ def _caption(panel: Panel) -> str:
             f'{panel.published_error3:.2f} mm')
 
 
-def _draw_left_image(axis: Any, found: Evaluation, measured: Measured, style: str) -> None:
+def _draw_left_image(axis: Any, found: Evaluation, measured: Measurement, style: str) -> None:
     lens = found.lens
     _draw_image_frame(axis, lens)
     both = np.isfinite(measured.distance)
@@ -272,7 +272,7 @@ def _draw_left_image(axis: Any, found: Evaluation, measured: Measured, style: st
     axis.plot([u, u], [v, ends], color=OURS, linewidth=1.2)
 
 
-def _draw_points(axis: Any, measured: Measured, across: int, up: int) -> None:
+def _draw_points(axis: Any, measured: Measurement, across: int, up: int) -> None:
     known = np.isfinite(measured.measured[:, 0])
     true, solved = measured.true[known], measured.measured[known]
     axis.plot([true[:, across], solved[:, across]], [true[:, up], solved[:, up]], color=FAINT,

@@ -108,7 +108,7 @@ def _summary(results: Results) -> Iterator[Block]:
 
 
 def _recovery(results: Results) -> Iterator[Block]:
-    fits, count = results.family.fits, len(results.family.members)
+    fits, count = results.family.matching, len(results.family.members)
     yield Heading('What the tables determine')
     yield Text(
         'The lens curves, focal lengths and landmarks are not printed. They were solved for from '

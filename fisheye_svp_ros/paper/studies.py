@@ -50,7 +50,7 @@ class Family(NamedTuple):
     high: Array
 
     @property
-    def fits(self) -> list[Member]:
+    def matching(self) -> list[Member]:
         """The members that reproduce tables 1 and 2."""
         return [one for one in self.members if one.within_10 >= CELLS_NEEDED]
 

@@ -180,8 +180,8 @@ def plan(
     """
     board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     state = State(identity(1), identity(1), lens, ())
-    if lens.reached is not None:
-        room = room._replace(field=max_view_angle(lens, lens.reached))
+    if lens.calibrated_angle is not None:
+        room = room._replace(field=max_view_angle(lens, lens.calibrated_angle))
     shots = candidate_shots(state, board, room, np.random.default_rng(0))
     blank = make_observations(np.zeros(len(points), int), board.landmark, 0.0 * points[:, :2],
                               points)

@@ -149,7 +149,7 @@ def _field_over_width(lens: Lens) -> float:
     """Return the field of view over the width of the image, rad, to both sides alike."""
     across = min(lens.cx + 0.5, lens.width - 0.5 - lens.cx) / lens.fx
     seen = float(lens.image_height.angle(np.asarray(max(across, 0.0))))
-    return float(2 * min(seen, lens.max_incidence, lens.reached or np.inf))
+    return float(2 * min(seen, lens.max_incidence, lens.calibrated_angle or np.inf))
 
 
 def _widest_field(projection: str, along_baseline: bool) -> float:

@@ -137,7 +137,7 @@ class Rectification:
 
         NaN where the lens has no ray.
         """
-        rays = self._model.back_project(uv.reshape(1, -1, 2)).shaped(uv.shape[:-1])
+        rays = self._model.back_project(uv.reshape(1, -1, 2)).reshape(uv.shape[:-1])
         turn = self.rotation.T
         places = meet_sphere(rays.origin @ turn, rays.direction @ turn, self._center, self.range)
         return self.camera.project(places)

@@ -30,7 +30,7 @@ class Board(NamedTuple):
         """The highest degree of a polynomial over the board that its landmarks can tell."""
         return 6 if self.landmarks >= _MIN_LANDMARKS_DEGREE_6 else 4
 
-    def local(self, points: Array) -> Array:
+    def to_board(self, points: Array) -> Array:
         """Return points (..., 3) in the board's axes, over its size."""
         return np.asarray((points - self.centre) @ self.axes.T / self.size)
 

@@ -173,7 +173,7 @@ def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
     shift = loaded.viewpoint_shift
     if shift is None or shift_scale == 1.0:
         return loaded
-    return replace(loaded, viewpoint_shift=shift.scaled(shift_scale) if shift_scale else None)
+    return replace(loaded, viewpoint_shift=shift.scale_by(shift_scale) if shift_scale else None)
 
 
 def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:

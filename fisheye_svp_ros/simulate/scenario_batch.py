@@ -20,7 +20,7 @@ from fisheye_svp_ros.simulate.scenario import (
     scenario_rig,
     true_lens,
 )
-from fisheye_svp_ros.simulate.simulation import Prediction, blank_views, predicted, recorded
+from fisheye_svp_ros.simulate.simulation import Prediction, add_noise, blank_views, predict_points
 
 
 class Batch(NamedTuple):
@@ -82,10 +82,11 @@ def _simulate(scenes: Sequence[_Scene], first: int) -> Batch:
     uv = []
     for number, camera in enumerate(cameras):
         views = blank_views(landmark[sets], points[sets], flat)
-        seen = predicted(model, camera.reshape(flat), views._replace(camera=views.camera + number))
+        views = views._replace(camera=views.camera + number)
+        seen = predict_points(model, camera.reshape(flat), views)
         ideal = Prediction(seen.uv.reshape(*shape, 2), seen.scale.reshape(*shape, 1))
         uv.append(np.stack([
-            recorded(model, Prediction(*parts), scene.scenario.noise_px, rng)
+            add_noise(model, Prediction(*parts), scene.scenario.noise_px, rng)
             for scene, rng, *parts in zip(scenes, noise, *ideal, strict=True)
         ]))
     row = np.array([scene.row for scene in scenes])

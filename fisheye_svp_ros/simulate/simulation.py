@@ -39,7 +39,7 @@ def simulate(
     Raises ParameterError for a sigma below 0.
     """
     views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t, board)
-    seen = recorded(model, predicted(model, poses, views), sigma, rng)
+    seen = add_noise(model, predict_points(model, poses, views), sigma, rng)
     return _table(seen[:, None], landmarks, sigma, t, board, ('',))
 
 
@@ -60,8 +60,9 @@ def simulate_stereo(
     """
     views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t)
     seen = [
-        recorded(model, predicted(model, place, views._replace(camera=views.camera + camera)),
-                 sigma, rng)
+        add_noise(
+            model, predict_points(model, place, views._replace(camera=views.camera + camera)),
+            sigma, rng)
         for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
     ]
     return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, STEREO)
@@ -86,12 +87,12 @@ def blank_views(
     )
 
 
-def predicted(model: ForwardModel, poses: Pose, views: Views) -> Prediction:
+def predict_points(model: ForwardModel, poses: Pose, views: Views) -> Prediction:
     """Return what a camera at poses (S,) sees of views (S, N) before the noise."""
     return Prediction(model.predict(poses, views).uv, _noise_scale(model, poses, views))
 
 
-def recorded(
+def add_noise(
     model: ForwardModel, seen: Prediction, sigma: float, rng: np.random.Generator
 ) -> Array:
     """Return image points (S, N, 2), px, with noise; NaN where there is none."""

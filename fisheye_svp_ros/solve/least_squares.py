@@ -13,9 +13,9 @@ from fisheye_svp_ros.optics.engines.marquardt import (
     FIRST_GROWTH,
     MAX_ITERATIONS,
     STUCK,
-    adjusted,
     is_better,
     is_last,
+    update_damping,
 )
 
 Arrays = tuple[Array, ...]
@@ -98,7 +98,7 @@ def levenberg_marquardt(
             state=_with_rows(found.state, accepted, trial, better),
             normal=_with_rows(found.normal, accepted, fresh, better),
         )
-        damping[active], growth[active] = adjusted(
+        damping[active], growth[active] = update_damping(
             damping[active], growth[active], better, before - cost, moved
         )
         active = active[damping[active] < STUCK]

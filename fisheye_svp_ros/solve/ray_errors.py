@@ -98,7 +98,7 @@ def ray_model(
 
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:
     """Return the points (R, G, 3), m, that image points (G, 2), px, see at ranges; NaN: none."""
-    rays = ForwardModel(lens).back_project(uv[None]).shaped((len(uv),))
+    rays = ForwardModel(lens).back_project(uv[None]).reshape((len(uv),))
     origin = np.where(rays.valid[:, None], rays.origin, np.nan)
     along = (origin * rays.direction).sum(axis=-1)
     rest = (origin**2).sum(axis=-1) - along**2

@@ -100,12 +100,12 @@ def widest_spread(lens: Lens) -> float:
 def default_spread(lens: Lens) -> float:
     """Return the spread to be asked about where none is named, rad.
 
-    It is the widest, but for a lens that was calibrated up to a smaller angle (`Lens.reached`).
+    It is the widest, or the smaller angle up to which the lens was calibrated.
     """
     widest = widest_spread(lens)
-    if lens.reached is None:
+    if lens.calibrated_angle is None:
         return widest
-    return float(np.clip(lens.reached, _MIN_SPREAD, widest))
+    return float(np.clip(lens.calibrated_angle, _MIN_SPREAD, widest))
 
 
 def nearest_range(lens: Lens) -> float:

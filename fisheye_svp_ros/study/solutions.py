@@ -60,14 +60,14 @@ class SetSolutions(NamedTuple, Generic[T]):
     unsolved: str
     reasons: tuple[str, ...] = ('',)
 
-    def checked(self) -> SetSolutions[T]:
+    def require(self) -> SetSolutions[T]:
         """Return it as it is; raise GeometryError where a set has no solution."""
         if not self.solved.all():
             raise GeometryError(self.unsolved)
         return self
 
 
-def localized(
+def localize_sets(
     model: ForwardModel, views: Views, true: Pose | None = None, start: Pose | None = None,
     examined: bool = False, searched: bool = True,
 ) -> SetSolutions[Localization]:
@@ -94,7 +94,7 @@ def residual_points(model: ForwardModel, views: Views, solution: Localization) -
     return structured(RESIDUALS, views.landmark[0], *columns)
 
 
-def calibrated(
+def solve_rigs(
     models: Pair, left: Views, right: Views, systems: int = 1, true: Pose | None = None
 ) -> SetSolutions[StereoCalibration]:
     """Calibrate S rigs from S * V views; models: left, right; true: rigs (S,).
@@ -115,7 +115,7 @@ def calibrated(
     return SetSolutions(found, metrics, found.converged, _NO_RIG, reasons)
 
 
-def measured(
+def measure_points(
     models: Pair, rig: Pose, uv_left: Array, uv_right: Array, true: Array | None = None,
     optimal: bool = False,
 ) -> SetSolutions[Measurement]:

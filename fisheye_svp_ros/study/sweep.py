@@ -131,16 +131,16 @@ def solve_sweep(
     """
     under_way: dict[Future[Columns], range] = {}
 
-    def finished() -> Iterator[tuple[range, Columns]]:
+    def completed_tasks() -> Iterator[tuple[range, Columns]]:
         for future in wait(under_way, return_when=FIRST_COMPLETED).done:
             yield under_way.pop(future), future.result()
 
     for numbers in remaining:
         under_way[executor.submit(_rows_of, engine, plan, numbers)] = numbers
         if len(under_way) >= ahead:
-            yield from finished()
+            yield from completed_tasks()
     while under_way:
-        yield from finished()
+        yield from completed_tasks()
 
 
 def _rows_of(engine: str, plan: Plan, numbers: range) -> Columns:

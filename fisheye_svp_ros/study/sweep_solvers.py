@@ -25,7 +25,7 @@ from fisheye_svp_ros.study.settings import (
     StereoCalibratorSettings,
     StereoDepthSettings,
 )
-from fisheye_svp_ros.study.solutions import SetSolutions, calibrated, localized, measured
+from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets, measure_points, solve_rigs
 
 _SETS_PER_SOLVE = 512  # sets solved at once: more take more memory and no less time
 
@@ -94,7 +94,8 @@ def localizer(batch: Batch, settings: LocalizerSettings) -> Outcome:
     outcome = Outcome(len(sets.landmark), LOCALIZATION_METRICS)
 
     def solve(index: Index) -> SetSolutions[Any]:
-        return localized(model, sets.views(0, index, settings.sigma_px), sets.poses[0].take(index))
+        views = sets.views(0, index, settings.sigma_px)
+        return localize_sets(model, views, sets.poses[0].take(index))
 
     for index in _chunks(np.arange(len(sets.landmark))):
         outcome.attempt(index, solve)
@@ -116,7 +117,7 @@ def stereo_calibrator(batch: Batch, settings: StereoCalibratorSettings) -> Outco
         of = index // per_scenario
         rows = np.array([windows[scenario] for scenario in of])
         left, right = (sets.views(i, rows.ravel(), settings.sigma_px) for i in (0, 1))
-        return calibrated((model, model), left, right, len(index), rig.take(of))
+        return solve_rigs((model, model), left, right, len(index), rig.take(of))
 
     for number in range(per_scenario):
         index = np.arange(scenarios) * per_scenario + number
@@ -143,7 +144,7 @@ def stereo_depth(batch: Batch, settings: StereoDepthSettings) -> Outcome:
         true = sets.poses[1].take(index).into_body(sets.points[index])
         left, right = (uv[index] for uv in sets.uv)
         rigs = rig.take(index // per_scenario)
-        return measured((model, model), rigs, left, right, true, settings.optimal)
+        return measure_points((model, model), rigs, left, right, true, settings.optimal)
 
     for index in _chunks(np.arange(len(sets.landmark))):
         outcome.attempt(index, solve)

@@ -18,7 +18,7 @@ from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
-from fisheye_svp_ros.commands.photographs import measured
+from fisheye_svp_ros.commands.photographs import read_input
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations
@@ -51,7 +51,7 @@ def test_beside_photographs_a_table_is_a_table(tmp_path: Path) -> None:
     table = make_observations(np.zeros(4, dtype=int), np.arange(4), np.ones((4, 2)),
                               np.ones((4, 3)))
     write_observations(tmp_path / 'test.csv', table)
-    read, sizes = measured(str(tmp_path / 'test.csv'), Namespace(board=BOARD))
+    read, sizes = read_input(str(tmp_path / 'test.csv'), Namespace(board=BOARD))
     assert len(read) == 4 and not sizes
 
 

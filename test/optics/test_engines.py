@@ -204,12 +204,13 @@ def test_the_rules_of_damping_are_the_same_compiled(compiled):
     cost[::7] = np.inf
     moved[::11], cost[1::13] = 0.0, before[1::13]
     quick = [njit_of(rule) for rule in (
-        marquardt.is_last, marquardt.is_better, marquardt.adjusted)]
+        marquardt.is_last, marquardt.is_better, marquardt.update_damping)]
     better = marquardt.is_better(cost, before)
     arguments = ((moved, moved_before, before, damping), (cost, before),
                  (damping, growth, better, before - cost, moved))
     for rule, compiled_rule, given in zip(
-        (marquardt.is_last, marquardt.is_better, marquardt.adjusted), quick, arguments, strict=True
+        (marquardt.is_last, marquardt.is_better, marquardt.update_damping), quick, arguments,
+        strict=True,
     ):
         want = np.stack(np.atleast_2d(rule(*given)), axis=-1)
         found = [np.atleast_1d(compiled_rule(*numbers)) for numbers in zip(*given, strict=True)]
@@ -262,7 +263,7 @@ def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
     shift = SumOfShifts((FISH214.viewpoint_shift, Gennery(0.001)))
     lens = replace(FISH214, viewpoint_shift=shift)
     points = points_around(np.random.default_rng(96), 50, 0.3, 2.0, 90.0)
-    assert compiled.packed(lens) is None
+    assert compiled.pack_lens(lens) is None
     both_equal(numpy_engine.project(lens, points, True), compiled.project(lens, points, True))
     views = *identity(1), points[None]
     both_equal(numpy_engine.linearise_views(lens, *views, True),
@@ -291,7 +292,7 @@ def unsettled(monkeypatch):
 def test_the_compiled_engine_comes_where_it_pays(
     compiled, unsettled, monkeypatch, filled, points, chosen
 ):
-    monkeypatch.setattr(engines.cache, 'filled', lambda: filled)
+    monkeypatch.setattr(engines.cache, 'is_compiled', lambda: filled)
     assert engines.settle(points) == chosen
     assert engines.settle(1) == chosen
 
@@ -320,7 +321,7 @@ def test_what_another_installation_compiled_is_not_there(tmp_path):
     shutil.copytree(here / 'fisheye_svp_ros', there / 'fisheye_svp_ros')
     code = ('from fisheye_svp_ros.optics.engines import cache\n'
             'cache.folder().mkdir(parents=True, exist_ok=True)\n'
-            '{} or print(cache.filled())')
+            '{} or print(cache.is_compiled())')
 
     def run(where, line):
         environment = os.environ | {'XDG_CACHE_HOME': str(tmp_path), 'PYTHONPATH': str(where)}

@@ -120,7 +120,7 @@ def test_a_shift_of_several_kinds_is_a_list():
     np.testing.assert_allclose([value, slope], np.sum(parts, axis=0), rtol=1e-14)
     moved = lens.with_parameters(['e0', 'thickness'], [0.02, 0.03])
     assert moved.viewpoint_shift.coefficients == (0.0, 0.02, 0.0, 0.0, 0.03, 1.5)
-    double = lens.viewpoint_shift.scaled(2.0)
+    double = lens.viewpoint_shift.scale_by(2.0)
     assert double.coefficients == (0.0, 0.02, 0.0, 0.0, 0.02, 1.5)
     columns = lens.viewpoint_shift.columns(theta)
     np.testing.assert_array_equal(columns[:, 4:], FlatPort(0.01, 1.5).columns(theta))
@@ -131,7 +131,7 @@ def test_a_shift_of_several_kinds_is_a_list():
     assert two.plus(FlatPort(0.01, 1.3)).coefficients == (0.01, 1.5, 0.03, 1.3)
     assert Gennery(0.1).plus(two).parts == (Gennery(0.1), *two.parts)
     assert two.plus(two).coefficients == (0.02, 1.5, 0.04, 1.3)
-    assert 'above 1' in two.changed(refractive_index_2=0.9).check()
+    assert 'above 1' in two.with_values(refractive_index_2=0.9).check()
 
 
 @pytest.mark.parametrize(('model', 'degrees'), [

@@ -248,8 +248,8 @@ def test_the_evaluation_is_deterministic(ours):
 def test_the_family_holds_the_lenses_in_use():
     family = load_family()
     best = min(family.members, key=lambda one: one.cost)
-    assert any(one is best for one in family.fits)
-    assert len(family.fits) >= 10
+    assert any(one is best for one in family.matching)
+    assert len(family.matching) >= 10
     for numbers, name in zip(best.lens_numbers, LENSES, strict=True):
         lens = load_lens(lens_path(name))
         shift = lens.viewpoint_shift.coefficients

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fisheye_svp_ros.optics.engines.marquardt import FIRST_GROWTH, STEP_TOLERANCE, adjusted
+from fisheye_svp_ros.optics.engines.marquardt import FIRST_GROWTH, STEP_TOLERANCE, update_damping
 from fisheye_svp_ros.solve.least_squares import (
     dense_step,
     levenberg_marquardt,
@@ -142,7 +142,7 @@ def test_rounded_residuals_do_not_stop_the_iteration():
 
 def test_damping_falls_with_a_good_step_and_grows_ever_faster_with_bad_ones():
     """A step that gains what was predicted, half of it, and two that gain nothing."""
-    damping, growth = adjusted(
+    damping, growth = update_damping(
         np.full(4, 1e-3), np.array([2.0, 8.0, 2.0, 8.0]), np.array([True, True, False, False]),
         gained=np.array([1.0, 0.5, -1.0, -1.0]), moved=np.ones(4))
     np.testing.assert_allclose(damping, [1e-4, 1e-3, 2e-3, 8e-3])

@@ -28,7 +28,7 @@ def pulls(result, port):
 @pytest.mark.parametrize('port', [FLAT, DOME], ids=['flat', 'dome'])
 def test_a_port_is_found_for_a_lens_calibrated_in_air(port):
     seen = photographs(AIR, port)
-    start = port.changed(**dict.fromkeys(port.placed, 0.0))
+    start = port.with_values(**dict.fromkeys(port.placed, 0.0))
     result = calibrate_port(seen, AIR, start)
     assert result.adjusted.converged
     assert np.abs(pulls(result, port)).max() < 4

@@ -22,7 +22,7 @@ from fisheye_svp_ros.solve.initial_pose import (
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured import localize_measured
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
-from fisheye_svp_ros.study.solutions import localized
+from fisheye_svp_ros.study.solutions import localize_sets
 
 
 @pytest.mark.parametrize('kind', SCENES)
@@ -54,7 +54,7 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     model, views, true = spoilt('clean', 'room', 1, np.random.default_rng(5))
     views.uv[0, [3, 11]] += [[40.0, -5.0], [3.0, 30.0]]
     kept = views._replace(weight=np.where(np.isin(views.landmark, [3, 11]), 0.0, views.weight))
-    found, want = localized(model, views, true, examined=True), localize(model, kept)
+    found, want = localize_sets(model, views, true, examined=True), localize(model, kept)
     reason, = found.reasons
     assert reason.startswith('gross errors left out: landmarks 3 (4') and ', 11 (3' in reason
     np.testing.assert_allclose(found.solution.pose.position, want.pose.position, atol=1e-8)

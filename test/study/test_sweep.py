@@ -19,7 +19,7 @@ import pytest
 from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.commands.executors import local
+from fisheye_svp_ros.commands.executors import process_pool
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
@@ -341,7 +341,7 @@ def test_a_result_that_cannot_be_read_is_an_error(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(tempfile, 'tempdir', str(tmp_path))
-    with local(1) as workers:
+    with process_pool(1) as workers:
         folder, = tmp_path.iterdir()
         gone = workers.executor.submit(shutil.rmtree, str(folder))
         assert isinstance(gone.exception(timeout=60), FileNotFoundError)

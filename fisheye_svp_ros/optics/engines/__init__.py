@@ -46,7 +46,7 @@ def settle(points: float) -> str:
     """
     if os.environ.get(VARIABLE, 'auto') == 'auto' and find_spec('numba') is not None:
         with suppress(ParameterError):
-            if points >= (LOADING if cache.filled() else _COMPILING):
+            if points >= (LOADING if cache.is_compiled() else _COMPILING):
                 use('numba')
     return 'numpy' if _engine is numpy_engine else 'numba'
 

@@ -24,7 +24,7 @@ from fisheye_svp_ros.optics.engines.kernels import (
 )
 from fisheye_svp_ros.optics.engines.marquardt import FIRST_DAMPING, FIRST_GROWTH, STUCK
 
-for rule in (marquardt.is_last, marquardt.is_better, marquardt.adjusted):
+for rule in (marquardt.is_last, marquardt.is_better, marquardt.update_damping):
     register_jitable(**OPTIONS)(rule)
 
 POSE, NORMAL = (4, 3), (13, 6)
@@ -208,7 +208,7 @@ def minimise(w, left, right, cameras, work, limit):
             ended = -1
             break
         better = marquardt.is_better(cost, total)
-        damping, growth = marquardt.adjusted(damping, growth, better, total - cost, moved)
+        damping, growth = marquardt.update_damping(damping, growth, better, total - cost, moved)
         if better:
             total, moved_before, at, known = cost, moved, 1 - at, 1 - known
         elif damping >= STUCK:

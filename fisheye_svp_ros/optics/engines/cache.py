@@ -28,7 +28,7 @@ def folder() -> Path:
     return Path(root) / 'fisheye_svp_ros' / digest.hexdigest()[:16]
 
 
-def filled() -> bool:
+def is_compiled() -> bool:
     """Say whether all of it has been compiled before, by this installation."""
     return _mark().exists()
 

@@ -125,14 +125,14 @@ def _dest(dimensions: int, kind: Any = types.float64) -> types.Array:
 def _entry(result: Any, *arguments: Any) -> Any:
     """Compile for these types only, and keep it in the engine's own folder."""
 
-    def compiled(function: Any) -> Any:
+    def compile_entry(function: Any) -> Any:
         before, config.CACHE_DIR = config.CACHE_DIR, str(cache.folder())
         try:
             return njit(result(*arguments), cache=True, nogil=True, **OPTIONS)(function)
         finally:
             config.CACHE_DIR = before
 
-    return compiled
+    return compile_entry
 
 
 _LENS = (_arg(1), types.float64)

@@ -3,7 +3,7 @@
 A block of points is a set of rows of `B` numbers in one flat array: separate arrays would make the
 compiler check them for overlap, and calls of libm would end vectorisation.  So would an index that
 might be negative: what starts at a variable place is a slice first.  A lens is one array, see
-`numba_engine.packed`.
+`numba_engine.pack_lens`.
 """
 
 from __future__ import annotations

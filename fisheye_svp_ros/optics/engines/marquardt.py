@@ -37,7 +37,7 @@ def is_better(cost: Array, before: Array) -> Mask:
     return cost <= before * (1.0 + _ROUNDING) + _NOISE * np.sqrt(before)
 
 
-def adjusted(
+def update_damping(
     damping: Array, growth: Array, better: Mask, gained: Array, moved: Array
 ) -> tuple[Array, Array]:
     """Return the next damping and its growth from what a step gained in cost, and |J d|^2."""

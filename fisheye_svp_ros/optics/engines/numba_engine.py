@@ -35,7 +35,7 @@ _lenses: dict[int, tuple[Lens, Array | None]] = {}
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """See `engines.project`."""
-    numbers = packed(lens)
+    numbers = pack_lens(lens)
     if numbers is None:
         return numpy_engine.project(lens, points, limited)
     points, limit = np.ascontiguousarray(points, dtype=float), edge(lens, limited)
@@ -55,7 +55,7 @@ def linearise_views(
     lens: Lens, rotation: Array, position: Array, points: Array, limited: bool
 ) -> tuple[Array, Mask, Array]:
     """See `engines.linearise_views`."""
-    numbers = packed(lens)
+    numbers = pack_lens(lens)
     if numbers is None:
         return numpy_engine.linearise_views(lens, rotation, position, points, limited)
     systems, count = points.shape[:2]
@@ -85,7 +85,7 @@ def localize(
     lens: Lens, seen: Seen, row: Index, minimum: int, start: Pose, limit: int = MAX_ITERATIONS
 ) -> tuple[Localization, int, int] | None:
     """See `engines.localize`; limit: of the iterations."""
-    numbers = packed(lens)
+    numbers = pack_lens(lens)
     if numbers is None:
         return None
     systems, count = row.shape
@@ -111,7 +111,7 @@ def adjust_rigs(
     lenses: tuple[Lens, Lens], seen: tuple[Seen, Seen], state: tuple[Array, ...]
 ) -> Rigs | None:
     """See `engines.adjust_rigs`."""
-    left, right = map(packed, lenses)
+    left, right = map(pack_lens, lenses)
     if left is None or right is None:
         return None
     systems, views = state[0].shape[:2]
@@ -133,7 +133,7 @@ def adjust_rigs(
     )
 
 
-def packed(lens: Lens) -> Array | None:
+def pack_lens(lens: Lens) -> Array | None:
     """Return a lens as the kernels know it, None where it has a curve that they do not."""
     kept = _lenses.get(id(lens))
     if kept is None:

@@ -125,7 +125,7 @@ def _ray_miss(
     slopes (M, 2, 2 + more): of off by the turn of the ray in air along `across` (M, 2, 3), then by
     the lens's viewpoint shift and the coefficients of the port.
     """
-    at, way = traced(lens, direction, across, more)
+    at, way = trace_rays(lens, direction, across, more)
     arm = points - at.value
     along = (arm * way.value).sum(axis=-1, keepdims=True)
     # A point between the camera and the port is not seen through it.
@@ -135,7 +135,7 @@ def _ray_miss(
     return side, (side @ arm[..., None])[..., 0], -np.einsum('mij,tmj->mit', side, slope)
 
 
-def traced(
+def trace_rays(
     lens: Lens, direction: Array, across: Array | None = None, more: int = 0
 ) -> tuple[Varying, Varying]:
     """Return where rays in air of directions (M, 3) leave the port, and which way.
