@@ -66,10 +66,10 @@ setup(
         'test': [
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
-            'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10',
+            'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10', 'statsmodels>=0.14',
         ],
         'docs': ['sphinx>=7.2', 'myst-parser>=2.0', 'furo'],
-        'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.0', 'types-PyYAML', 'scipy-stubs'],
+        'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.17', 'types-PyYAML', 'scipy-stubs'],
     },
     zip_safe=True,
     maintainer='fisheye_svp_ros maintainers',

@@ -56,16 +56,21 @@ class RandomColumns(NamedTuple):
     components: Components
 
     @property
+    def point_label(self) -> Index:
+        """Components (G, N, w) of the offsets of each point's unit, -1 for none."""
+        none = np.full((1, self.unit_label.shape[1]), -1)
+        return np.asarray(np.concatenate([self.unit_label, none])[self.unit])
+
+    @property
     def unit_columns(self) -> sparse.csr_array:
         """Columns (G M, U w) of the offsets of units, sparse; zero for what is absent."""
         rows, width = self.offset.shape[2:]
-        row, offset = np.arange(self.unit.size * rows), self.offset.reshape(-1, width)
-        unit = np.repeat(self.unit.ravel(), rows)
-        values = np.where((unit >= 0)[:, None] & (self.unit_label[unit] >= 0), offset, 0.0)
-        column = width * np.maximum(unit, 0)[:, None] + np.arange(width)
+        group, point, axis = np.nonzero(self.point_label >= 0)
+        values = self.offset[group, point, :, axis]
+        row = rows * (self.unit.shape[1] * group + point)[:, None] + np.arange(rows)
+        column = np.repeat(width * self.unit[group, point] + axis, rows)
         return sparse.csr_array(
-            (values.ravel(), (np.repeat(row, width), column.ravel())),
-            (len(row), self.unit_label.size),
+            (values.ravel(), (row.ravel(), column)), (self.unit.size * rows, self.unit_label.size)
         )
 
     def select(self, alive: Mask) -> RandomColumns:
@@ -131,15 +136,16 @@ def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -
         of_rows = pool.map(
             lambda row: _multiply_shared(shared, own, border, row, rows), range(rows))
         ss, sg, sx = (reduce(np.add, parts) for parts in zip(*of_rows, strict=True))
-    offset = random.offset * (random.unit >= 0)[..., None, None]
+    offset, of_unit = random.offset[random.unit >= 0], random.unit[random.unit >= 0]
     uu = np.zeros((units, width, width))
-    np.add.at(uu, random.unit, np.swapaxes(offset, -1, -2) @ offset)
+    np.add.at(uu, of_unit, np.swapaxes(offset, -1, -2) @ offset)
     present = random.unit_label >= 0
     uu *= present[:, :, None] & present[:, None, :]
     return Products(
-        across @ own, uu, ug.reshape(units, width, groups, -1), ss, sg,
-        (offsets.T @ shared).toarray().reshape(units, width, -1), across @ border,
-        (offsets.T @ flat).reshape(units, width, -1), sx, flat.T @ flat,
+        across @ own, uu, ug.reshape(units, width, groups, own.shape[-1]),
+        ss, sg,
+        (offsets.T @ shared).toarray().reshape(units, width, shared.shape[1]), across @ border,
+        (offsets.T @ flat).reshape(units, width, edge), sx, flat.T @ flat,
     )
 
 
@@ -198,7 +204,7 @@ def arrange_blocks(
     if by_group:
         by_unit = np.moveaxis(p.ug, (2, 3), (0, 1)).reshape(count, width, size * units)
         er = np.concatenate([np.moveaxis(p.sg, 0, -1), by_unit], axis=-1)
-        rr = _assemble(p.ss, p.us.reshape(size * units, -1).T, p.uu, False)
+        rr = _assemble(p.ss, p.us.reshape(size * units, len(p.ss)).T, p.uu, False)
         rx = np.concatenate([p.sx, p.ux.reshape(size * units, edge)])
         label = np.concatenate([s_label, u_label.ravel()])
         return Blocks(p.gg, er, rr, p.gx, rx, p.xx, g_label, label)

@@ -283,7 +283,7 @@ def _unit_rows(eq: Equations, random: RandomColumns, group: int) -> tuple[Index,
     order[eq.units] = np.arange(len(eq.units))
     unit = random.unit[group]
     at = order[unit]
-    present = (random.unit_label[unit] >= 0) & (at >= 0)[:, None]
+    present = (random.point_label[group] >= 0) & (at >= 0)[:, None]
     return at, np.where(present[:, None], random.offset[group], 0.0)
 
 
