@@ -125,7 +125,7 @@ def test_a_score_test_is_a_wald_test_where_the_variances_are_held(case):
 
 
 def test_a_group_left_out_is_predicted_as_by_a_fit_without_it(case):
-    (y, columns, border), eq, now, f, _, _ = case
+    (_, columns, border), _, now, f, _, _ = case
     left_out = leave_groups_out(f, columns, np.zeros((GROUPS, ROWS, 0)), border)
     keep = np.arange(GROUPS) != 4
     gone = columns._replace(group=columns.group * keep[:, None, None])
@@ -139,7 +139,7 @@ def test_a_group_left_out_is_predicted_as_by_a_fit_without_it(case):
 
 def test_units_that_are_exact_leave_all_as_it_is(case):
     """Offsets of units, a second grouping factor, of which the variance is zero."""
-    (y, columns, border), _, now, f, _, _ = case
+    (_, columns, border), _, now, f, _, _ = case
     rng = np.random.default_rng(0)
     crossed = columns._replace(
         offset=rng.normal(size=(GROUPS, ROWS // 2, 2, 1)),
