@@ -209,7 +209,7 @@ class Linearization:
         return self.data.blocks(self.weight[..., None] * np.ones(2))
 
     @property
-    def is_observation(self) -> Mask:
+    def row_mask(self) -> Mask:
         """Which rows (F, M) are observations and not padding."""
         return self.row_weight > 0
 
