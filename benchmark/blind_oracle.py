@@ -12,10 +12,11 @@ from benchmark.blind_projection import Nuisance, basis
 from benchmark.blind_scene import Scene, World
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import SIGNIFICANCE
-from fisheye_svp_ros.diagnosis.model import Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.optics.lens import intrinsic_names
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
 
 
 class LinearScene:
@@ -27,11 +28,11 @@ class LinearScene:
     def __init__(self, scene: Scene, ideal: Array, held_out: bool = False) -> None:
         self.scene, self.ideal = scene, ideal
         self._chosen = scene.seen & (scene.held_out[scene.frame] == held_out)[:, None]
-        data = prepare(scene.table(ideal, held_out))
+        data = group_by_frame(scene.table(ideal, held_out))
         frames = np.flatnonzero(scene.held_out == held_out)
-        state = State(scene.trajectory.at(scene.times[frames]), scene.rig, scene.lens, ())
+        state = RigState(scene.trajectory.at(scene.times[frames]), scene.rig, scene.lens, ())
         free = intrinsic_names(scene.lens) if scene.free else ()
-        self.linear = Linearised(data, state, free)
+        self.linear = Linearization(data, state, free)
         self.nuisance = Nuisance(self.linear)
 
     def rows(self, moved: Array) -> Array:
@@ -77,7 +78,7 @@ def oracle_finds(
     if name == 'noise_vs_angle':
         return _growth_p_value(linear, residual) < level
     if name == 'wrong_ids':
-        size = np.median(np.abs(residual[linear.linear.used])) / 0.6745
+        size = np.median(np.abs(residual[linear.linear.row_mask])) / 0.6745
         p = 2 * stats.norm.sf(np.abs(residual).max() / size) * linear.nuisance.rows
         return bool(p < level)
     return True  # rounded numbers show without a test
@@ -126,7 +127,7 @@ def _f_test(
 
 def _growth_p_value(linear: LinearScene, residual: Array) -> float:
     """Likelihood-ratio test of sigma(theta) = sigma0 exp(growth theta^2)."""
-    used = linear.linear.used
+    used = linear.linear.row_mask
     theta = linear.linear.data.blocks(linear.linear.scene.theta[..., None] * np.ones(2))[used]
     z = theta**2 - np.mean(theta**2)
     e2 = residual[used] ** 2

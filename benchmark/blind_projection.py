@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.model import Linearised, flat_rows
+from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.mixed_model import group_basis
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 IDENTIFIABLE = 1e-4  # of a column's norm: what is left less cannot be told from what is free
 
@@ -17,9 +17,9 @@ class Nuisance:
     residual (F, M): the whitened residual outside that space; rows, rank: its dimensions.
     """
 
-    def __init__(self, linear: Linearised) -> None:
+    def __init__(self, linear: Linearization) -> None:
         self.shape = linear.residual.shape
-        self.rows = int(linear.used.sum())
+        self.rows = int(linear.row_mask.sum())
         self._blocks = group_basis(linear.frame_columns)
         norms = np.sqrt((linear.shared_columns**2).sum(axis=(0, 1)))
         self._shared = basis(self.outside_blocks(linear.shared_columns), norms)

@@ -16,8 +16,8 @@ from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import Needs, Scene, World, draw_scene
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, EffectTests, NullModel, diagnose
-from fisheye_svp_ros.diagnosis.model import intrinsic_names
 from fisheye_svp_ros.mixed_model import eliminate
+from fisheye_svp_ros.optics.lens import intrinsic_names
 
 MODES = ('one', 'clean', 'outside', 'two', 'background')
 _WEAKEST = 0.02  # an effect of which what is free leaves less than this is drawn again

@@ -34,8 +34,6 @@ from fisheye_svp_ros.diagnosis import (
     localize_with_errors,
     pose_maps,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit_poses, start_poses
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
@@ -48,7 +46,10 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.simulate.targets import board_views
+from fisheye_svp_ros.solve.bundle_adjustment import adjust_poses
+from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 
 WITHIN = 1.959964  # standard deviations, 95 %
@@ -170,9 +171,9 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
 
     Poses from the left and the right half of the points, and from the upper and the lower one.
     """
-    data = prepare(test)
-    state = start_poses(data, found.after.state)
-    linear, pulls = Linearised(data, state, found.after.free), []
+    data = group_by_frame(test)
+    state = localize_frames(data, found.after.state)
+    linear, pulls = Linearization(data, state, found.after.free), []
     for axis in (0, 1):
         middle = np.array([np.median(v[w > 0]) for v, w in zip(
             data.views.uv[..., axis], data.views.weight, strict=True)])
@@ -183,12 +184,12 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
     return np.concatenate(pulls)
 
 
-def side(data: Data, state: State, mask: Mask) -> tuple[State, Array]:
+def side(data: RigViews, state: RigState, mask: Mask) -> tuple[RigState, Array]:
     """Pose the frames from some of their points; return also what makes poses of points."""
     kept = replace(data, views=data.views._replace(
         weight=np.where(mask, data.views.weight, 0.0)))
-    posed = fit_poses(kept, state)
-    return posed, pose_maps(Linearised(kept, posed, ()).frame_columns)
+    posed = adjust_poses(kept, state)
+    return posed, pose_maps(Linearization(kept, posed, ()).frame_columns)
 
 
 def joined(tables: Sequence[Observations]) -> Observations:

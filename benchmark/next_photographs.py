@@ -24,8 +24,6 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -33,7 +31,7 @@ from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.optics.camera import lens_columns, project_with_jacobian
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import (
     Criterion,
     Design,
@@ -45,10 +43,13 @@ from fisheye_svp_ros.planning.optimal_design import (
 )
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.scene.observations import Observations, make_observations
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.render import Print
 from fisheye_svp_ros.simulate.simulation import blank_views
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 NOISE, SHIFT, MOST, RANDOM = 0.1, 0.002, 60, 10
 _ORDERS = 10  # random orders of real frames that are diagnosed
@@ -118,7 +119,7 @@ def camera(number: int) -> dict[str, Any]:
     }
 
 
-def simulated(rng: np.random.Generator) -> tuple[Design, Linearised]:
+def simulated(rng: np.random.Generator) -> tuple[Design, Linearization]:
     """Return a random camera with nothing known, and all photographs that may be taken."""
     half = np.radians(rng.uniform(65, 95))
     curve = KannalaBrandt(rng.normal(scale=0.02), rng.normal(scale=0.004), 0.0, 0.0)
@@ -128,13 +129,11 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearised]:
     points = Print(9, 6, rng.uniform(0.02, 0.04)).corners
     board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
     room = ViewLimits(float(rng.uniform(0.15, 0.25)), float(rng.uniform(0.8, 1.5)))
-    shots = candidate_shots(State(identity(1), identity(1), lens, ()), board, room, rng)
-    blank = make_observations(
-        np.zeros(len(points), int), board.landmark, 0 * points[:, :2], points)
+    shots = candidate_shots(RigState(identity(1), identity(1), lens, ()), board, room, rng)
     count = len(shots.distance)
-    data = Data(blank, blank_views(board.landmark, points, count), np.arange(count),
-                np.zeros(count, int))
-    linear = Linearised(data, State(shots.camera, identity(1), lens, ()), intrinsic_names(lens))
+    data = RigViews.of_one_camera(blank_views(board.landmark, points, count))
+    state = RigState(shots.camera, identity(1), lens, ())
+    linear = Linearization(data, state, intrinsic_names(lens))
     alike = confounded_effects(linear, ('radial_profile', 'target_shape'))
     return Design(linear, [EFFECT, *alike], board, shots, NOISE, known=False), linear
 
@@ -169,7 +168,7 @@ def sure(question: Criterion, design: Design, order: Index) -> float:
         design.known + design.added[order[:n]].sum(axis=0)) >= SURE), np.inf)
 
 
-def over_the_image(linear: Linearised, design: Design) -> Array:
+def over_the_image(linear: Linearization, design: Design) -> Array:
     """Return W (K, K): trace(W cov) is the mean variance that the lens gives image points."""
     lens = linear.state.lens
     angle, turn = np.meshgrid(np.linspace(0.05, 0.98, 16) * lens.max_incidence,
@@ -193,7 +192,7 @@ def greedy(design: Design, weight: Array, count: int) -> Index:
 
 
 def refitted(
-    linear: Linearised, design: Design, taken: Index, rng: np.random.Generator
+    linear: Linearization, design: Design, taken: Index, rng: np.random.Generator
 ) -> float:
     """Return the error of e0 in a refit of simulated photographs over its predicted error."""
     state = linear.state
@@ -201,11 +200,11 @@ def refitted(
     shots, board = design.shots.take(taken), design.board
     model = replace(state, pose=shots.camera, lens=true)
     views = blank_views(board.landmark, board.points, len(taken))
-    data = Data(linear.data.observations, views, np.arange(len(taken)), np.zeros(len(taken), int))
-    uv = Linearised(data, model, ()).linear.uv
+    data = RigViews.of_one_camera(views)
+    uv = Linearization(data, model, ()).linear.uv
     data = replace(data, views=views._replace(uv=uv + NOISE * rng.normal(size=uv.shape)))
     begun = replace(model, lens=state.lens, terms=((EFFECT, np.zeros(1)),))
-    fitted = fit(data, begun, linear.free)
+    fitted = adjust(data, begun, linear.free)
     predicted = plain(design, design.question('e0'))(taken)
     return float((fitted.terms[0][1][0] - SHIFT) / predicted)
 
@@ -214,11 +213,11 @@ def on_data(path: Path, image_size: tuple[int, int]) -> dict[str, Any]:
     """Choose among the frames of a real table: how many tell e0 nearly as well as all."""
     table = read_observations(path)
     lens = calibrate(table, 'kannala_brandt', image_size).adjusted.lens
-    data, free = prepare(table), intrinsic_names(lens)
-    state = start(data, lens)
-    state = fit(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
-    linear = Linearised(data, state, free)
-    square = float((linear.residual**2).sum()) / int(linear.used.sum())
+    data, free = group_by_frame(table), intrinsic_names(lens)
+    state = initial_state(data, lens)
+    state = adjust(data, replace(state, terms=((EFFECT, np.zeros(1)),)), free)
+    linear = Linearization(data, state, free)
+    square = float((linear.residual**2).sum()) / int(linear.row_mask.sum())
     design = Taken(linear, confounded_effects(linear, ('radial_profile', 'target_shape')), square)
     e0 = without(design, design.question('e0'))
     name = design.question('viewpoint_shift', ('radial_profile', 'target_shape'))
@@ -267,7 +266,7 @@ def diagnosed(table: Observations, lens: Lens, chosen: Callable[[int], Index]) -
 class Taken(Design):
     """The photographs that there are, in place of those that might be taken."""
 
-    def __init__(self, linear: Linearised, effects: Sequence[Effect], square: float) -> None:
+    def __init__(self, linear: Linearization, effects: Sequence[Effect], square: float) -> None:
         """Take a fit, effects that are not in it, and the mean square of whitened residuals."""
         terms = [*linear.state.terms, *((e, np.zeros(len(e.parameters))) for e in effects)]
         self.names = (*linear.free, *(f'{e.name}.{p.name}' for e, _ in terms

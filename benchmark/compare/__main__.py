@@ -39,12 +39,12 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     posable_observations,
     predict_other_data,
 )
-from fisheye_svp_ros.diagnosis.adjustment import start_poses  # noqa: E402
-from fisheye_svp_ros.diagnosis.model import prepare  # noqa: E402
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
 from fisheye_svp_ros.library import Localized  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
+from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
+from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 
 _DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'
 _MARK = '<!-- figures -->'
@@ -123,9 +123,9 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
 
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
     """Return the rms of all held-out points, gross errors among them."""
-    data, known = prepare(test), found.after.data.observations.t
+    data, known = group_by_frame(test), found.after.data.observations.t
     terms = tuple(e for e in found.after.state.terms if e[0].holds_for(test.t, known))
-    solved = start_poses(data, replace(found.after.state, terms=terms))
+    solved = localize_frames(data, replace(found.after.state, terms=terms))
     return predict_other_data(data, solved, local).rms
 
 

@@ -13,8 +13,6 @@ from benchmark.speed.harness import Side, exponent, measure
 from benchmark.speed.report import Table, number
 from benchmark.speed.scenes import LANDMARKS, localization, points, shift_lens, stereo, svp_lens
 from fisheye_svp_ros.diagnosis import NullModel, diagnose
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
@@ -23,7 +21,10 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
 _TEXT = """Time is the median of repeats in turns, memory the peak of what was allocated on top (as
@@ -98,8 +99,8 @@ def _stereo(count: int) -> Callable[[], Any]:
 
 
 def _evidence(count: int) -> Callable[[], Any]:
-    data = prepare(_seen(30))
-    state = fit(data, start(data, shift_lens().svp()), ())
+    data = group_by_frame(_seen(30))
+    state = adjust(data, initial_state(data, shift_lens().svp()), ())
     left_out = list(CATALOGUE)[count:]
     return lambda: NullModel.fit(data, state, (), left_out=left_out)
 

@@ -188,8 +188,8 @@ def _common_frames(observations: Observations, lenses: dict[str, Lens]) -> Obser
     Raises ObservationError where there is no such frame, or no rig explains most of them.
     """
     from fisheye_svp_ros.diagnosis import FRAME, find_outliers, is_unrelated, posable_observations
-    from fisheye_svp_ros.diagnosis.adjustment import start
-    from fisheye_svp_ros.diagnosis.model import prepare
+    from fisheye_svp_ros.solve.initial_rig import initial_state
+    from fisheye_svp_ros.solve.rig_state import group_by_frame
 
     def shared(table: Observations) -> Observations:
         one, other = (table.frame[table.camera == camera] for camera in (0, 1))
@@ -202,8 +202,8 @@ def _common_frames(observations: Observations, lenses: dict[str, Lens]) -> Obser
     if not len(both):
         raise ObservationError(f'{observations.source}: no frame was seen by both cameras; '
                                'photographs of one moment must have one frame number')
-    data, (left, right) = prepare(both), lenses.values()
-    state = start(data, left, [right])
+    data, (left, right) = group_by_frame(both), lenses.values()
+    state = initial_state(data, left, [right])
     if is_unrelated(data, state):
         raise ObservationError(
             f'{observations.source}: none explains where {" and ".join(lenses)} stand in most '

@@ -154,7 +154,7 @@ def _vary_views(views: RepeatedErrors) -> Advice:
 def _retake_frames(evaluation: Evaluation) -> list[Advice]:
     """Return the frames that scatter more than the others."""
     squares = evaluation.fitted.standardized_squares()
-    used = evaluation.null.linear.used
+    used = evaluation.null.linear.row_mask
     size = squares.sum(axis=1) / np.maximum(used.sum(axis=1), 1)
     numbers = _frame_numbers(evaluation)
     bad = size > _OUTSTANDING_RATIO * np.median(size)

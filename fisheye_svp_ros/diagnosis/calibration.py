@@ -14,16 +14,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
-from fisheye_svp_ros.diagnosis.model import (
-    Data,
-    Linearised,
-    State,
-    intrinsic_names,
-    is_shared,
-    prepare,
-)
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.outliers import (
     NO_OUTLIERS,
@@ -35,10 +26,18 @@ from fisheye_svp_ros.diagnosis.uncertainty import total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import stage_of
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import pseudo_inverse
-from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names, parameter_values
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import Calibration
+from fisheye_svp_ros.solve.rig_state import (
+    Linearization,
+    RigState,
+    RigViews,
+    group_by_frame,
+    is_shared,
+)
 
 _SHIFT_NAMES = ('s0', 'e0', 'e1', 'e2', 'thickness')
 _INTERVAL_SIGMAS = 2.0  # standard errors of an interval
@@ -98,8 +97,8 @@ def calibrate_without_outliers(
         result = calibrate(observations.take(rows))
         rows = rows[~np.isin(observations.frame[rows], result.left_out)]
         table = observations.take(rows)
-        data = prepare(table)
-        found = find_outliers(data, start(data, result.adjusted.lens))[1]
+        data = group_by_frame(table)
+        found = find_outliers(data, initial_state(data, result.adjusted.lens))[1]
         rounds += 1
         if not len(found.rows) or rounds == _MAX_ROUNDS:
             return result, table, rejected
@@ -112,8 +111,8 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
 
     names: the parameters that were fitted.
     """
-    data = prepare(observations)
-    null = NullModel.fit(data, fit(data, start(data, lens), names), names)
+    data = group_by_frame(observations)
+    null = NullModel.fit(data, adjust(data, initial_state(data, lens), names), names)
     # What else the lens has, its corrections, is fitted along and follows them.
     errors = total_errors(null)[: len(names)]
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
@@ -219,7 +218,7 @@ class InAir:
         return float(lens.fx * height[np.argmax(open_)]) if open_.any() else np.inf
 
     def fit_behind_port(
-        self, everything: Data, lens: Lens, place: tuple[str, ...], index: str
+        self, everything: RigViews, lens: Lens, place: tuple[str, ...], index: str
     ) -> Lens | None:
         """Return the lens with the intrinsics that photographs behind its port call for.
 
@@ -230,16 +229,16 @@ class InAir:
         """
         names, reach = (*place, index, *self.names), self.reach
         while near := self.select_points(everything, reach):
-            data, _ = find_outliers(near, start(near, lens))
-            state = fit(data, start(data, lens), place)
-            state = fit(data, state, names, self._prior(data, state, index))
+            data, _ = find_outliers(near, initial_state(near, lens))
+            state = adjust(data, initial_state(data, lens), place)
+            state = adjust(data, state, names, self._prior(data, state, index))
             lens = replace(state.lens, max_incidence=field_of_view(state.lens))
             if near.views.used.sum() == everything.views.used.sum():
                 break
             reach *= _REACH_GROWTH
         return lens if self.squared_distance(lens) < _MAX_SIGMAS**2 * len(self.names) else None
 
-    def select_points(self, data: Data, reach: float) -> Data | None:
+    def select_points(self, data: RigViews, reach: float) -> RigViews | None:
         """Return the points up to a distance from the principal point, px; None if too few."""
         off = np.linalg.norm(data.views.uv - [self.lens.cx, self.lens.cy], axis=-1)
         inside = data.views.used & (off <= reach)
@@ -259,10 +258,10 @@ class InAir:
         values, vectors = np.linalg.eigh(self.covariance / np.outer(size, size))
         return np.asarray((vectors / np.sqrt(np.maximum(values, _MIN_EIGENVALUE))).T / size)
 
-    def _prior(self, data: Data, state: State, index: str) -> Prior:
+    def _prior(self, data: RigViews, state: RigState, index: str) -> Prior:
         """Return what is known of index and intrinsics, beside rows as noisy as a fit's."""
-        linear = Linearised(data, state, ())
-        noise = float(np.median(np.abs(linear.residual[linear.used]))) / _MEDIAN_SIZE
+        linear = Linearization(data, state, ())
+        noise = float(np.median(np.abs(linear.residual[linear.row_mask]))) / _MEDIAN_SIZE
         others = sum(len(values) for effect, values in state.terms if is_shared(effect))
         mean = np.concatenate([[state.lens.parameters[index]],
                                parameter_values(self.lens, self.names),

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, moved
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets, refit
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.pose import Pose, axis_angle_between
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
+from fisheye_svp_ros.solve.initial_rig import localize_cameras
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 from fisheye_svp_ros.solve.stereo_depth import triangulate
 
 _RESAMPLES = 2000
@@ -124,22 +125,22 @@ def _excess_gain(before: HeldOut, after: HeldOut, noise: float, rows: Index) -> 
 
 
 def predict_other_data(
-    test: Data, state: State, offsets: PredictedOffsets | None = None
+    test: RigViews, state: RigState, offsets: PredictedOffsets | None = None
 ) -> HeldOut:
     """Predict other frames of the same camera and target, from poses in the state."""
     # In px every point counts alike, however noisy it is.
     plain = replace(state, terms=tuple(t for t in state.terms if t[0].stage != 'noise'))
     data = test if offsets is None else offsets.apply(test)
-    fitted = fit_poses(data, plain)
+    fitted = adjust_poses(data, plain)
     if offsets is not None and offsets.views is not None:
-        repeating = offsets.views.at(Linearised(data, replace(fitted, terms=state.terms), ()))
+        repeating = offsets.views.at(Linearization(data, replace(fitted, terms=state.terms), ()))
         data = replace(data, views=data.views._replace(uv=data.views.uv - repeating))
-        fitted = fit_poses(data, fitted)
-    linear = Linearised(data, fitted, ())
+        fitted = adjust_poses(data, fitted)
+    linear = Linearization(data, fitted, ())
     return _sum_squares(linear, linear.residual)
 
 
-def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str]) -> State:
+def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str]) -> RigState:
     """Return the state without some of its effects, the rest fitted anew.
 
     By one linear step; where that is too long to be linear, step by step.
@@ -148,12 +149,12 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
     kept, change, _ = _refit_shared(null, null.information, names, ())
     shared = np.zeros(null.own)
     shared[kept] = change
-    moves = (linear.shared_columns @ shared)[linear.used] / linear.row_weight[linear.used]
+    moves = (linear.shared_columns @ shared)[linear.row_mask] / linear.row_weight[linear.row_mask]
     if np.sqrt(2 * np.mean(moves**2)) > _LINEAR_PX:
-        state = fit(linear.data, linear.state.without(names), free)
+        state = adjust(linear.data, linear.state.without_effects(names), free)
         return refit(linear.data, state, free, null.variances)
     frame = np.zeros((linear.data.frames, 6))
-    return moved(linear.data, linear.state, free, frame, shared).without(names)
+    return linear.state.retract(free, frame, shared).without_effects(names)
 
 
 def _refit_shared(
@@ -208,21 +209,21 @@ def cross_validate(
     return _sum_squares(linear, residual / ratio)
 
 
-def _noise_ratio(linear: Linearised) -> Array:
+def _noise_ratio(linear: Linearization) -> Array:
     """Return what takes the weights (F, M) of uneven noise out of whitened rows."""
     weight = linear.data.blocks(linear.data.views.weight[..., None] * np.ones(2))
     own = linear.row_weight
     return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
 
 
-def _sum_squares(linear: Linearised, whitened: Array) -> HeldOut:
+def _sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
     weight = linear.row_weight
     px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
     return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)
 
 
 def known_errors(
-    before: Linearised, after: Linearised, free: Sequence[str]
+    before: Linearization, after: Linearization, free: Sequence[str]
 ) -> dict[str, Comparison]:
     """Compare the errors of two states of the same data, each fitted without the judged frames.
 
@@ -231,7 +232,7 @@ def known_errors(
     in doubt, or where the cameras stood at each moment: mean distance of triangulated landmarks
     from where poses and rig say they are.
     """
-    measured: dict[str, Callable[[Data, State], Array]] = {}
+    measured: dict[str, Callable[[RigViews, RigState], Array]] = {}
     if after.data.poses is not None:
         measured |= {'position_error_m': _position_errors, 'axis_error_rad': _axis_errors}
     doubtful = any(effect.stage in ('target', 'pose') for effect, _ in after.state.terms)
@@ -247,41 +248,43 @@ def known_errors(
             if np.isfinite(both[0] + both[1]).any()}
 
 
-def _train_folds(linear: Linearised, free: Sequence[str]) -> Iterator[tuple[Data, State]]:
+def _train_folds(
+    linear: Linearization, free: Sequence[str]
+) -> Iterator[tuple[RigViews, RigState]]:
     """Yield held-out data and a state with the poses of the first camera's views in it."""
     data = linear.data
     folds = np.arange(data.frames) % min(_FOLDS, data.frames)
     for fold in np.unique(folds):
         kept = folds != fold
         part = replace(linear.state, pose=linear.state.pose.take(np.flatnonzero(kept)))
-        trained = fit(chosen_views(data, kept[data.frame_of]), part, free)
-        held_out = chosen_views(data, ~kept[data.frame_of])
-        solved = trained.cameras.localize(held_out.views.take(_first_camera(held_out)))
+        trained = adjust(data.select(kept[data.frame_of]), part, free)
+        held_out = data.select(~kept[data.frame_of])
+        solved = localize_cameras(trained.model, held_out.views.take(_first_camera(held_out)))
         yield held_out, replace(trained, pose=solved)
 
 
-def _first_camera(data: Data) -> Index:
+def _first_camera(data: RigViews) -> Index:
     """Return the views of the first camera."""
     return np.flatnonzero(data.camera_of == 0)
 
 
-def _true_poses(data: Data) -> Pose:
+def _true_poses(data: RigViews) -> Pose:
     assert data.poses is not None
     return data.poses.take(data.frame_of[_first_camera(data)])
 
 
-def _position_errors(held_out: Data, state: State) -> Array:
+def _position_errors(held_out: RigViews, state: RigState) -> Array:
     off = state.pose.position - _true_poses(held_out).position
     return np.asarray(np.linalg.norm(off, axis=-1))
 
 
-def _axis_errors(held_out: Data, state: State) -> Array:
+def _axis_errors(held_out: RigViews, state: RigState) -> Array:
     return axis_angle_between(state.pose, _true_poses(held_out))
 
 
-def _depth_errors(held_out: Data, state: State) -> Array:
+def _depth_errors(held_out: RigViews, state: RigState) -> Array:
     """Return the mean error of each frame, m; NaN where the cameras share no landmark."""
-    first, second = (state.cameras.model(camera) for camera in (0, 1))
+    first, second = (state.model.camera(camera) for camera in (0, 1))
     place = state.pose if held_out.poses is None else _true_poses(held_out)
     right_pose = place.compose(state.rig.take(1))
     rig = state.rig.take(1).inverse()
@@ -294,7 +297,7 @@ def _depth_errors(held_out: Data, state: State) -> Array:
     return np.array(errors)
 
 
-def _shared_points(data: Data, view: int) -> tuple[Array, Array, Array]:
+def _shared_points(data: RigViews, view: int) -> tuple[Array, Array, Array]:
     """Return what a view of the first camera shares with the second: points (N, 3), uv (N, 2)."""
     other = np.flatnonzero((data.frame_of == data.frame_of[view]) & (data.camera_of == 1))
     ids = np.where(data.views.used, data.views.landmark, -1 - data.camera_of[:, None])
@@ -323,7 +326,7 @@ class PointResiduals(NamedTuple):
     outlier: Mask
 
 
-def point_residuals(before: Linearised, after: Linearised) -> PointResiduals:
+def point_residuals(before: Linearization, after: Linearization) -> PointResiduals:
     """Return the residuals of two states of the same data."""
     views = after.data.views
     seen = views.landmark >= 0

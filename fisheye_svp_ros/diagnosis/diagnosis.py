@@ -25,7 +25,6 @@ from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
-from fisheye_svp_ros.diagnosis.model import Linearised, State
 from fisheye_svp_ros.diagnosis.problem import (
     ROUNDING,
     DiagnosisOptions,
@@ -54,6 +53,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
 
 class Figures(NamedTuple):
@@ -178,12 +178,12 @@ class Diagnosis:
         return self.record.gross
 
     @property
-    def before(self) -> Linearised:
+    def before(self) -> Linearization:
         """The simulation as it was fitted, for whoever draws it."""
         return self.evaluation.before
 
     @property
-    def after(self) -> Linearised:
+    def after(self) -> Linearization:
         """The extended model, for whoever draws it."""
         return self.evaluation.null.linear
 
@@ -401,7 +401,7 @@ def _remaining(
 
 
 def extended_lenses(
-    lenses: Mapping[str, Lens], state: State, observations: Observations
+    lenses: Mapping[str, Lens], state: RigState, observations: Observations
 ) -> dict[str, Lens]:
     """Return the lenses that were fitted, with their effects, for every command and node."""
     # What happened to one recording is no part of the lens.

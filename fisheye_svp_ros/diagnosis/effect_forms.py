@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.cameras import RigScene
-from fisheye_svp_ros.diagnosis.model import Linearised, State
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
 _LONGEST_PAUSES = 4
 _CURVE_DEGREE = 5  # degree of smooth curves over an angle
@@ -47,7 +46,7 @@ class EffectForms:
         return len(CATALOGUE) - len(self.untestable)
 
 
-def effect_forms(linear: Linearised, left_out: Sequence[str] = ()) -> EffectForms:
+def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectForms:
     """Return the columns of the catalogue, without the effects left out."""
     effects, richest, untestable = _catalogue_effects(linear, left_out)
     ends = np.cumsum([0, *(len(effect.parameters) for effect in effects)])
@@ -64,7 +63,7 @@ def effect_forms(linear: Linearised, left_out: Sequence[str] = ()) -> EffectForm
 
 
 def _catalogue_effects(
-    linear: Linearised, left_out: Sequence[str]
+    linear: Linearization, left_out: Sequence[str]
 ) -> tuple[list[Effect], list[Effect], dict[str, str]]:
     """Return all forms, the richest of each effect, and why others are untestable, by name."""
     effects: list[Effect] = []
@@ -91,7 +90,7 @@ def _catalogue_effects(
     return effects, richest, untestable
 
 
-def simplest_form(kind: type[Effect], linear: Linearised) -> Effect:
+def simplest_form(kind: type[Effect], linear: Linearization) -> Effect:
     """Return the simplest form of an effect, of every camera of a rig where lenses have it.
 
     Raises Untestable where there is none.
@@ -101,18 +100,18 @@ def simplest_form(kind: type[Effect], linear: Linearised) -> Effect:
     return together(own) if own else first[0]
 
 
-def _forms(kind: type[Effect], linear: Linearised) -> list[Sequence[Effect]]:
+def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
     """Return the forms of an effect; what a lens has, each lens of a rig has for itself.
 
     Raises Untestable where there is none.
     """
     scene, labels = linear.scene, linear.state.labels
     of_lens = kind.stage in ('ray', 'image', 'detector') and not kind.of_target
-    if not isinstance(scene, RigScene) or not of_lens:
+    if not scene.cameras or not of_lens:
         return [_catalogue_forms(kind, scene, linear.free)]
     found: list[Sequence[Effect]] = []
     reason = Untestable('no camera sees anything')
-    for _, camera, own in scene.parts:
+    for _, camera, own in scene.cameras:
         try:
             forms = _catalogue_forms(kind, own, linear.free)
             found.append(by_camera(camera, labels[camera], forms))
@@ -153,7 +152,7 @@ def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:
     return [steps[i] for i in np.sort(np.argsort(-pauses, kind='stable')[:_LONGEST_PAUSES])]
 
 
-def smooth_fields(linear: Linearised) -> dict[str, Array]:
+def smooth_fields(linear: Linearization) -> dict[str, Array]:
     """Generic smooth fields (F, M, P) over each variable, at the image stage."""
     scene, views = linear.scene, linear.data.views
     m = scene.normalised()
@@ -181,11 +180,11 @@ def smooth_fields(linear: Linearised) -> dict[str, Array]:
             for field in _on_both_axes([np.ones_like(x), x, y]) for i in (1, 2, 3)
         ]
     return {
-        name: linear.whitened(np.stack(columns, axis=-1)) for name, columns in fields.items()
+        name: linear.whiten(np.stack(columns, axis=-1)) for name, columns in fields.items()
     }
 
 
-def intrinsic_walks(linear: Linearised) -> tuple[Array, Array]:
+def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
     """Smooth paths (F, M, P) of each camera's focal length and centre, in the order of time.
 
     Cosines over the frames, each half period of three frames at least; and the precision (P,) of
@@ -203,7 +202,7 @@ def intrinsic_walks(linear: Linearised) -> tuple[Array, Array]:
     step = np.concatenate([growth, np.broadcast_to(np.eye(2), (*growth.shape[:-1], 2))], axis=-1)
     columns = step[..., None] * moves[:, None, None, None]
     roughness = np.tile(np.repeat(waves**4.0, data.cameras), step.shape[-1])
-    return linear.whitened(columns.reshape(*growth.shape[:-1], -1)), roughness
+    return linear.whiten(columns.reshape(*growth.shape[:-1], -1)), roughness
 
 
 def _polar(x: Array, y: Array) -> tuple[Array, Array]:
@@ -231,7 +230,7 @@ def _on_both_axes(scalars: list[Array]) -> list[Array]:
     return [np.stack(pair, axis=-1) for pair in pairs]
 
 
-def with_effect(state: State, effect: Effect, values: Array | None = None) -> State:
+def with_effect(state: RigState, effect: Effect, values: Array | None = None) -> RigState:
     """Return the state with one more effect, joined with an earlier form of the same."""
     start = np.zeros(len(effect.parameters)) if values is None else values
     for i, (old, known) in enumerate(state.terms):

@@ -298,7 +298,7 @@ def _cluster_p_value(
     inverse, _ = pseudo_inverse(info[np.ix_(both, both)])
     residual[both] -= inverse @ (info[both] @ residual)
     weight, remaining = _border_rows(null, combination, residual)
-    used = null.linear.used
+    used = null.linear.row_mask
     landmark = np.repeat(null.random.columns.unit, 2, axis=-1)[used]
     parts = np.bincount(landmark, weights=(weight * remaining)[used])
     expected = float(combination @ info @ combination) * null.variances.sigma**2

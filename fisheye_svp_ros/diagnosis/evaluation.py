@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.adjustment import fit, start_poses
 from fisheye_svp_ros.diagnosis.calibration import stated_parameters
 from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
@@ -28,7 +27,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, rms_px
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, prepare
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
 from fisheye_svp_ros.diagnosis.problem import (
@@ -49,6 +47,9 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
 )
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import localize_frames
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ class HeldOutData:
     itself; another_target: whether landmarks of one number stand in other places.
     """
 
-    data: Data
+    data: RigViews
     pose: Pose
     outliers: Outliers
     rig_differs: bool
@@ -98,19 +99,21 @@ class HeldOutData:
         """
         trained = selection.null.linear.data
         another_target = is_another_target(trained.observations, held_out)
-        table = prepare(held_out)
+        table = group_by_frame(held_out)
         if has_no_rig(trained):
             table = unpair_cameras(table)
         state = valid_state(selection.state, table, trained, another_target)
-        data, outliers = find_outliers(table, start_poses(table, state))
+        data, outliers = find_outliers(table, localize_frames(table, state))
         differs = rig_differs(data, state)
         if differs:
             table = unpair_cameras(table)
-            data, outliers = find_outliers(table, start_poses(table, state))
-        return cls(data, start_poses(data, state).pose, outliers, differs, another_target)
+            data, outliers = find_outliers(table, localize_frames(table, state))
+        return cls(data, localize_frames(data, state).pose, outliers, differs, another_target)
 
 
-def valid_state(state: State, test: Data, trained: Data, another_target: bool) -> State:
+def valid_state(
+    state: RigState, test: RigViews, trained: RigViews, another_target: bool
+) -> RigState:
     """Return the state without what trained frames or their target had, and the test has not."""
     t, known = test.observations.t, trained.observations.t
     return replace(state, terms=tuple(
@@ -245,7 +248,7 @@ class Evaluation:
         return 1.0 if stated else self.null.variances.sigma**2
 
     @property
-    def before(self) -> Linearised:
+    def before(self) -> Linearization:
         """The simulation as it was fitted."""
         return self.selection.problem.linear if self.medium is None else self.medium.air
 
@@ -269,7 +272,7 @@ class Evaluation:
         if set(self._not_of_lens) < set(self.names):
             state = fit_without_causes(self.null, self._not_of_lens, self.free)
             data = self.null.linear.data
-            linear = Linearised(data, fit(data, state, self.free), self.free)
+            linear = Linearization(data, adjust(data, state, self.free), self.free)
         return FitQuality(rms_px(linear), self._lens_prediction.rms)
 
     @cached_property

@@ -5,9 +5,8 @@ Fifth stage of a diagnosis: what random effects are predicted to be, and what is
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -15,8 +14,6 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.adjustment import moved
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column_norms
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
@@ -39,10 +36,9 @@ from fisheye_svp_ros.mixed_model import (
     predict_rows,
     solve_equations,
 )
+from fisheye_svp_ros.solve.bundle_adjustment import gauss_newton
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
-_STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
-_MAX_RISE = 1.5  # of the sum of squares: what is random may take up a rise, but no more
-_MAX_STEPS = 4
 _CONVERGED = 3e-3  # of the noise: what a step moves predictions by
 _MIN_MODE, _MAX_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _PROBES = 24
@@ -68,7 +64,7 @@ class RepeatedErrors(Protocol):
     @property
     def lasting(self) -> float: ...
 
-    def at(self, linear: Linearised) -> Array: ...
+    def at(self, linear: Linearization) -> Array: ...
 
 
 class PredictedOffsets(NamedTuple):
@@ -87,7 +83,7 @@ class PredictedOffsets(NamedTuple):
         """What of them is valid for another target, too."""
         return self._replace(offset=np.zeros_like(self.offset), views=None)
 
-    def apply(self, data: Data) -> Data:
+    def apply(self, data: RigViews) -> RigViews:
         """Return data with landmarks where they are predicted and the image field taken out.
 
         What depends on the views takes poses, and stays.
@@ -109,7 +105,7 @@ class FittedModel:
     scale (K,): norms that the fixed columns of the model were divided by.
     """
 
-    linear: Linearised
+    linear: Linearization
     random: RandomEffects
     factored: FactoredEquations
     solution: Solution
@@ -123,7 +119,7 @@ class FittedModel:
             null.linear, null.called_for, eq, null.variances, null.scale[: null.own])
 
     @classmethod
-    def of_state(cls, linear: Linearised, variances: Variances) -> FittedModel:
+    def of_state(cls, linear: Linearization, variances: Variances) -> FittedModel:
         """Solve the mixed-model equations of one linearization, with given variances."""
         finest = bool(variances.alive[NAMES.index(FINEST_FIELD)])
         random = make_random_effects(linear, finest).select(variances.alive)
@@ -136,7 +132,7 @@ class FittedModel:
 
     @classmethod
     def _solve(
-        cls, linear: Linearised, random: RandomEffects, eq: Equations, variances: Variances,
+        cls, linear: Linearization, random: RandomEffects, eq: Equations, variances: Variances,
         scale: Array,
     ) -> FittedModel:
         # What the data leave open stays where it is.
@@ -144,7 +140,7 @@ class FittedModel:
         return cls(linear, random, f, solve_equations(f), scale)
 
     @property
-    def state(self) -> State:
+    def state(self) -> RigState:
         """The state around which the model is linear."""
         return self.linear.state
 
@@ -172,7 +168,7 @@ class FittedModel:
         remaining = self.linear.residual - self.predict_rows(
             solution.e[..., None], solution.r[:, None], solution.values[:, None]
         )[..., 0]
-        return np.asarray(remaining * self.linear.used)
+        return np.asarray(remaining * self.linear.row_mask)
 
     def leverages(self) -> Array:
         """Return the diagonal (F, M) of the hat matrix, from random signs.
@@ -180,7 +176,7 @@ class FittedModel:
         Source: Hutchinson, A stochastic estimator of the trace of the influence matrix,
         Communications in Statistics 19 (1990).
         """
-        shape, used = self.linear.residual.shape, self.linear.used
+        shape, used = self.linear.residual.shape, self.linear.row_mask
         signs = np.random.default_rng(0).choice([-1.0, 1.0], (*shape, _PROBES)) * used[..., None]
         hat = self.predict_rows(*self.solve_rows(signs))
         return np.asarray(np.clip((signs * hat).mean(axis=-1), 0.0, 0.8))
@@ -198,7 +194,7 @@ class FittedModel:
         linear = self.linear
         remaining = self.residuals().reshape(*linear.residual.shape[:1], -1, 2)
         uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
-        used = linear.used[:, ::2]
+        used = linear.row_mask[:, ::2]
         frame = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
         at, errors = uv[used], remaining[used]
         reach = float(np.ptp(at, axis=0).max()) / _PAIR_REACH
@@ -274,57 +270,26 @@ class FittedModel:
         return offset
 
 
-def refit(data: Data, state: State, free: Sequence[str], variances: Variances) -> State:
+def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Variances) -> RigState:
     """Fit poses, rig, free intrinsics and effects by Gauss-Newton with the null's covariance.
 
     All steps are solved with the equations of the first: its columns change little.
     """
-    fitted = FittedModel.of_state(Linearised(data, state, free), variances)
-    linear, eq = fitted.linear, fitted.factored.equations
-    e, r, values = fitted.solution.e, fitted.solution.r, fitted.solution.values
-    most = _MAX_RISE * float((linear.residual**2).sum())
-    for step in range(_MAX_STEPS):
-        frame, _, _ = eq.split(e, r)
-        change = frame[:, :6] / eq.group_scale, values / fitted.scale
-        moves = (linear.frame_columns @ change[0][..., None])[..., 0]
-        moves += linear.shared_columns @ change[1]
-        state, residual = limit_step(
-            data, free, partial(_after_step, data, state, free, change), most)
-        converged = np.sqrt((moves**2).mean()) < _CONVERGED * variances.sigma
-        if step == _MAX_STEPS - 1 or converged:
-            break
+    fitted = FittedModel.of_state(Linearization(data, state, free), variances)
+    eq = fitted.factored.equations
+
+    def solve(residual: Array) -> tuple[Array, Array]:
         e, r, values = (part[..., 0] for part in fitted.solve_rows(residual[..., None]))
-    return state
+        return eq.split(e, r)[0][:, :6] / eq.group_scale, values / fitted.scale
+
+    return gauss_newton(fitted.linear, solve, _CONVERGED * variances.sigma)
 
 
-def _after_step(
-    data: Data, state: State, free: Sequence[str], change: tuple[Array, Array], fraction: float
-) -> State:
-    return moved(data, state, free, *(fraction * step for step in change))
-
-
-def limit_step(
-    data: Data, free: Sequence[str], after: Callable[[float], State], most: float = np.inf
-) -> tuple[State, Array]:
-    """Return the state after so much of a step that all points are still seen, and its residual.
-
-    A step far beyond where the columns hold may take points out of sight, or lead away from them.
-    after: makes a state of a part of the step, 1 for all of it; most: sum of squares allowed.
-    """
-    for fraction in _STEP_FRACTIONS:
-        state = after(fraction)
-        residual = Linearised(data, state, free).residual
-        squares = float((residual**2).sum())
-        if np.isfinite(squares) and squares <= most:
-            break
-    return state, residual
-
-
-def rms_px(linear: Linearised, whitened: Array | None = None) -> float:
+def rms_px(linear: Linearization, whitened: Array | None = None) -> float:
     """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
 
     Without any: of those of the fit itself.
     """
-    weight, used = linear.row_weight, linear.used
+    weight, used = linear.row_weight, linear.row_mask
     rows = linear.residual if whitened is None else whitened
     return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.adjustment import moved
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, ColumnGeometry
 from fisheye_svp_ros.diagnosis.uncertainty import (
     ErrorParts,
@@ -27,17 +25,18 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, Variances
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations, Views, make_observations, views_of
+from fisheye_svp_ros.scene.observations import Observations, Views, views_of
 from fisheye_svp_ros.solve.localization import Localization
 from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 _STEP_SIGMAS = 1e-3  # of a standard error
 _MAX_POINTS = 500  # stereo points
 
 
 def with_uncertainty(
-    errors: ModelErrors, linear: Linearised, noise: float, misfit: float,
-    lenses_of: Callable[[State], Mapping[str, Lens]],
+    errors: ModelErrors, linear: Linearization, noise: float, misfit: float,
+    lenses_of: Callable[[RigState], Mapping[str, Lens]],
 ) -> dict[str, Lens]:
     """Return the lenses of a diagnosis, each with what is known of its errors.
 
@@ -52,7 +51,7 @@ def with_uncertainty(
             continue  # of the rig
         step = np.zeros(len(errors.covariance))
         step[k] = _STEP_SIGMAS * stderr
-        one, other = (lenses_of(moved(linear.data, linear.state, linear.free, frames, way))
+        one, other = (lenses_of(linear.state.retract(linear.free, frames, way))
                       for way in (step, -step))
         for name, columns in by.items():
             values = [np.array([*_numbers(lens[name]).values()]) for lens in (one, other)]
@@ -173,15 +172,14 @@ class LensErrors:
         parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
         return ErrorParts(*(part * excess[:, None, None] for part in parts))
 
-    def linearised(self, views: Views, pose: Pose) -> Linearised:
+    def linearised(self, views: Views, pose: Pose) -> Linearization:
         """Linearise views of this lens, with the numbers that are uncertain free."""
         model = ForwardModel(self.lens)
         views, terms = model.labelled(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})
         own = [name for name in self.model.names if name in bare.parameters]
-        count = len(views.frame)
-        data = Data(_table(views), views, np.arange(count), np.zeros(count, dtype=np.int64))
-        return Linearised(data, State(pose, identity(1), bare, terms), own)
+        state = RigState(pose, identity(1), bare, terms)
+        return Linearization(RigViews.of_one_camera(views), state, own)
 
 
 def localize_with_errors(
@@ -209,7 +207,7 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
         pairs = [(errors, errors.linearised(views, pose)) for errors, pose in (
             (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
-        by = [linear.whitened(linear.linear.d_target) / errors.noise for errors, linear in pairs]
+        by = [linear.whiten(linear.linear.d_target) / errors.noise for errors, linear in pairs]
         seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
         by = [np.where(seen[:, None, None], one, np.eye(2, 3)) for one in by]
         rows_of_both = np.concatenate(by, axis=1)
@@ -229,9 +227,3 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
 def _split_rows(rows: Index) -> Iterator[Index]:
     for first in range(0, len(rows), _MAX_POINTS):
         yield rows[first:first + _MAX_POINTS]
-
-
-def _table(views: Views) -> Observations:
-    used = views.used
-    frame = np.broadcast_to(views.frame[:, None], used.shape)[used]
-    return make_observations(frame, views.landmark[used], views.uv[used], views.points[used])

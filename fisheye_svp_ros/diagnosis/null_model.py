@@ -20,7 +20,6 @@ from fisheye_svp_ros.diagnosis.effect_forms import (
     intrinsic_walks,
     smooth_fields,
 )
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.diagnosis.random_effects import (
     NAMES,
     STAGE_OF,
@@ -47,6 +46,7 @@ from fisheye_svp_ros.mixed_model import (
     make_equations,
     no_variances,
 )
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 FINEST_FIELD = 'image_finest'
 _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
@@ -76,7 +76,7 @@ class FixedColumns:
     roughness: Array
 
     @classmethod
-    def of(cls, linear: Linearised, left_out: Sequence[str]) -> FixedColumns:
+    def of(cls, linear: Linearization, left_out: Sequence[str]) -> FixedColumns:
         """Return the columns of a linearized state, without the effects left out."""
         forms = effect_forms(linear, left_out)
         fields, (walks, roughness) = smooth_fields(linear), intrinsic_walks(linear)
@@ -100,7 +100,7 @@ class NullModel:
     random, full: of all components; variances: of those that the data call for.
     """
 
-    linear: Linearised
+    linear: Linearization
     fixed: FixedColumns
     random: RandomEffects
     full: Equations
@@ -108,7 +108,7 @@ class NullModel:
 
     @classmethod
     def fit(
-        cls, data: Data, state: State, free: Sequence[str], before: Variances | None = None,
+        cls, data: RigViews, state: RigState, free: Sequence[str], before: Variances | None = None,
         left_out: Sequence[str] = (), finest: bool = False,
     ) -> NullModel:
         """Linearize a state and estimate the variances of its random effects (REML).
@@ -120,7 +120,8 @@ class NullModel:
 
     @classmethod
     def with_variances(
-        cls, data: Data, state: State, free: Sequence[str], variances: Variances | None = None
+        cls, data: RigViews, state: RigState, free: Sequence[str],
+        variances: Variances | None = None,
     ) -> NullModel:
         """Return the null model of known variances, without effects that could be added.
 
@@ -134,11 +135,11 @@ class NullModel:
 
     @classmethod
     def _linearize(
-        cls, data: Data, state: State, free: Sequence[str], left_out: Sequence[str],
+        cls, data: RigViews, state: RigState, free: Sequence[str], left_out: Sequence[str],
         finest: bool, alive: Mask | None = None,
     ) -> NullModel:
         """Return the model before any variance is known; alive: its components, None for all."""
-        linear = Linearised(data, state, free)
+        linear = Linearization(data, state, free)
         fixed, random = FixedColumns.of(linear, left_out), make_random_effects(linear, finest)
         if alive is not None:
             random = random.select(alive)
@@ -146,13 +147,16 @@ class NullModel:
         return cls(linear, fixed, random, full, initial_variances(full))
 
     def relinearize(
-        self, data: Data, state: State, free: Sequence[str], left_out: Sequence[str], finest: bool
+        self, data: RigViews, state: RigState, free: Sequence[str], left_out: Sequence[str],
+        finest: bool,
     ) -> NullModel:
         """Return the model around another state, the variances as they are."""
         return replace(self._linearize(data, state, free, left_out, finest),
                        variances=self.variances)
 
-    def calls_for_finest_field(self, data: Data, state: State, left_out: Sequence[str]) -> bool:
+    def calls_for_finest_field(
+        self, data: RigViews, state: RigState, left_out: Sequence[str]
+    ) -> bool:
         """Return whether a state calls for the finest image field beside these variances."""
         alive = self.variances.alive | (np.array(NAMES) == FINEST_FIELD)
         bare = self._linearize(data, state, self.linear.free, left_out, True, alive)

@@ -9,12 +9,13 @@ import numpy as np
 from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.cameras import Cameras
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.model import Data, State, chosen_views
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
+from fisheye_svp_ros.solve.initial_rig import localize_cameras, prediction_distances
+from fisheye_svp_ros.solve.rig_state import RigState, RigViews
 
 _OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not its landmark's
 _SWAP_SIGMAS = 6.0  # and within which it belongs to another one
@@ -73,14 +74,14 @@ class NoiseGrowth(NamedTuple):
     variance: Array
 
 
-def find_outliers(data: Data, state: State) -> tuple[Data, Outliers]:
+def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     """Return the data without outliers, and what these were.
 
     A view that a model error bends as a whole holds no outlier, nor does a landmark that is off in
     most of its views.  A view out of all proportion belongs elsewhere as a whole.  A point whose
     own sigma is larger than most may lie so much further off.
     """
-    model, views = state.cameras, data.views
+    model, views = state.model, data.views
     pose, alone, scale, offset = _localize_robustly(data, state)
     of_landmark = _landmark_scale(views, offset)
     typical = float(np.median(scale))
@@ -100,25 +101,25 @@ def find_outliers(data: Data, state: State) -> tuple[Data, Outliers]:
     return without_points(data, far | (views.used & (whole | torn)[:, None])), outliers
 
 
-def _localize_robustly(data: Data, state: State) -> tuple[Pose, Pose, Array, Array]:
+def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Array, Array]:
     """Localize every view with weights that fade for points far from their prediction (Cauchy).
 
     On the scale of the median residual of that view or of all, whichever is larger.  Returns poses
     (S,), those of each view by itself (S,), scales (S, 1) and offsets (S, N) over the points' own
     relative sigma, px.
     """
-    model, views, pose = state.cameras, data.views, state.view_poses(data)
-    alone = model.localize(views) if data.cameras > 1 else pose
+    model, views, pose = state.model, data.views, state.view_poses(data)
+    alone = localize_cameras(model, views) if data.cameras > 1 else pose
     sigma = _relative_sigma(views)
-    scale, offset = _robust_scale(views, model.offsets(pose, views) / sigma)
+    scale, offset = _robust_scale(views, prediction_distances(model, pose, views) / sigma)
     if not np.nanmax(offset / scale) > _SUSPICIOUS_SIGMAS:
         return pose, alone, scale, offset
     for _ in range(_MAX_ITERATIONS):
         before = offset
         fading = 1 / np.sqrt(1 + (offset / (_CAUCHY_SCALE * scale)) ** 2)
         weight = np.where(views.used, views.weight * fading, 0.0)
-        pose = model.localize(views._replace(weight=weight), pose)
-        scale, offset = _robust_scale(views, model.offsets(pose, views) / sigma)
+        pose = localize_cameras(model, views._replace(weight=weight), pose)
+        scale, offset = _robust_scale(views, prediction_distances(model, pose, views) / sigma)
         with np.errstate(invalid='ignore'):  # what is out of sight stays so
             change = np.nanmax(np.abs(offset - before) / scale)
         if change < _CONVERGED:
@@ -127,7 +128,7 @@ def _localize_robustly(data: Data, state: State) -> tuple[Pose, Pose, Array, Arr
 
 
 def _inconsistent_frames(
-    data: Data, state: State, alone: Pose, typical: float
+    data: RigViews, state: RigState, alone: Pose, typical: float
 ) -> tuple[Mask, Array]:
     """Return the views (S,) of frames whose cameras contradict each other, and by how much, px.
 
@@ -147,14 +148,14 @@ def _inconsistent_frames(
     return np.asarray(torn & (torn.sum() < _MAX_INCONSISTENT_SHARE * several.sum())), apart
 
 
-def cross_camera_offsets(data: Data, state: State, alone: Pose) -> tuple[Array, Array]:
+def cross_camera_offsets(data: RigViews, state: RigState, alone: Pose) -> tuple[Array, Array]:
     """Return how far off, px, each view is from where another camera of its frame has it.
 
     alone: poses (S,) of the views, each by itself; another camera is the one that predicts it
     best, by the rig of the state.  Returns medians (S,), infinite where no other camera saw the
     frame, and the distances (S, N) of all points.
     """
-    views, model = data.views, state.cameras
+    views, model = data.views, state.model
     apart = np.zeros(views.used.shape)
     place = state.rig.take(data.camera_of)
     body = alone.compose(place.inverse())
@@ -164,25 +165,25 @@ def cross_camera_offsets(data: Data, state: State, alone: Pose) -> tuple[Array, 
         other = np.arange(len(views.frame))
         for mine in (np.flatnonzero(data.frame_of == f) for f in range(data.frames)):
             other[mine] = np.roll(mine, step)
-        offset = model.offsets(body.take(other).compose(place), views)
+        offset = prediction_distances(model, body.take(other).compose(place), views)
         median = np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=1)
         mine = (other != np.arange(len(other))) & (median < misfit)
         apart[mine], misfit[mine] = np.nan_to_num(offset[mine], posinf=_UNSEEN_PX), median[mine]
     return misfit, apart
 
 
-def without_points(data: Data, mask: Mask) -> Data:
+def without_points(data: RigViews, mask: Mask) -> RigViews:
     """Return the data without some points (S, N), and without views that have none left."""
     views = data.views
     views = views._replace(
         weight=np.where(mask, 0.0, views.weight), row=np.where(mask, -1, views.row)
     )
-    return chosen_views(replace(data, views=views), np.asarray(views.used.any(axis=1)))
+    return replace(data, views=views).select(np.asarray(views.used.any(axis=1)))
 
 
 def reject_outliers(
-    data: Data, fitted: FittedModel, outliers: Outliers, squares: Array
-) -> tuple[Data, Outliers]:
+    data: RigViews, fitted: FittedModel, outliers: Outliers, squares: Array
+) -> tuple[RigViews, Outliers]:
     """Reject points that are too far off once every random part is predicted.
 
     squares: of the standardised residuals (F, M).
@@ -201,8 +202,8 @@ def reject_outliers(
 
 
 def reinstate_outliers(
-    data: Data, fitted: FittedModel, outliers: Outliers
-) -> tuple[Data, Outliers]:
+    data: RigViews, fitted: FittedModel, outliers: Outliers
+) -> tuple[RigViews, Outliers]:
     """Reinstate points that were rejected, where the causes predict them as well as others.
 
     Beside a simulation that is wrong the nearest landmarks look like outliers.
@@ -265,7 +266,7 @@ def noise_growth(fitted: FittedModel, squares: Array) -> NoiseGrowth:
     landmarks do not scatter more at larger angles: some landmarks scatter more than others.
     """
     linear = fitted.linear
-    used = linear.used
+    used = linear.row_mask
     e2 = np.minimum(squares[used], 20.0)
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
     every = theta**2 - (theta[used] ** 2).mean()
@@ -299,14 +300,14 @@ def _growth_within_landmarks(e2: Array, z: Array, landmark: Index, frame: Index)
     return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
 
 
-def with_noise_growth(state: State, growth: float) -> State:
+def with_noise_growth(state: RigState, growth: float) -> RigState:
     """Return the state with weights for noise that grows with the angle."""
     term = (NoiseVsAngleEffect(), np.array([growth]))
     return replace(state, terms=(*state.terms, term))
 
 
 def _find_swaps(
-    model: Cameras, pose: Pose, views: Views, far: Mask, gate: float
+    model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
     """Which far points (S, N) lie where another landmark of the table is predicted.
 

@@ -10,10 +10,8 @@ from itertools import combinations
 import numpy as np
 
 from fisheye_svp_ros.arrays import Index
-from fisheye_svp_ros.diagnosis.adjustment import fit, start, start_poses
 from fisheye_svp_ros.diagnosis.effect_forms import with_effect
 from fisheye_svp_ros.diagnosis.fitted_model import rms_px
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.outliers import (
     Outliers,
     cross_camera_offsets,
@@ -28,10 +26,13 @@ from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
 from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, intrinsic_names
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras, localize_frames
 from fisheye_svp_ros.solve.measured import posable_views
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 Progress = Callable[[str, float], None]
 
@@ -126,10 +127,10 @@ class Problem:
     """
 
     inputs: Inputs
-    table: Data
-    data: Data
+    table: RigViews
+    data: RigViews
     outliers: Outliers
-    base: State
+    base: RigState
     free: tuple[str, ...]
     options: DiagnosisOptions
     step: float
@@ -142,18 +143,18 @@ class Problem:
         Raises GeometryError where a view cannot be posed at all.
         """
         lenses = tuple(inputs.lenses.values())
-        table = prepare(inputs.observations, inputs.poses)
-        simulated = start(table, lenses[0], lenses[1:])
+        table = group_by_frame(inputs.observations, inputs.poses)
+        simulated = initial_state(table, lenses[0], lenses[1:])
         if is_unrelated(table, simulated):
             table = unpair_cameras(table)
-            simulated = start(table, lenses[0], lenses[1:])
+            simulated = initial_state(table, lenses[0], lenses[1:])
         data, outliers = find_outliers(table, simulated)
-        base = fit(data, start(data, lenses[0], lenses[1:]), inputs.free)
+        base = adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
         if has_few_shared_frames(data) or rig_is_inconsistent(data, lenses, base, inputs.free):
             data = unpair_cameras(data)
-            base = fit(data, start(data, lenses[0], lenses[1:]), inputs.free)
+            base = adjust(data, initial_state(data, lenses[0], lenses[1:]), inputs.free)
         step, options = quantization_step(inputs.observations.uv), inputs.options
-        rms = rms_px(Linearised(data, base, inputs.free))
+        rms = rms_px(Linearization(data, base, inputs.free))
         if step / np.sqrt(6) > _STEP_OVER_NOISE * rms:
             # Values on a lattice repeat with the pixel by themselves.
             options = options.without('detector_bias')
@@ -162,9 +163,9 @@ class Problem:
         return cls(inputs, table, data, outliers, base, inputs.free, options, step)
 
     @cached_property
-    def linear(self) -> Linearised:
+    def linear(self) -> Linearization:
         """The simulation as it was fitted, linearized."""
-        return Linearised(self.data, self.base, self.free)
+        return Linearization(self.data, self.base, self.free)
 
     @property
     def observations(self) -> Observations:
@@ -339,43 +340,43 @@ def poses_by_frame(
     return known
 
 
-def unpair_cameras(data: Data) -> Data:
+def unpair_cameras(data: RigViews) -> RigViews:
     """Return the data with a pose for every view, whatever rig the cameras are said to be."""
     return replace(data, frame_of=np.arange(len(data.frame_of)))
 
 
-def is_unpaired(data: Data) -> bool:
+def is_unpaired(data: RigViews) -> bool:
     """Whether there are frames of several cameras that `unpair_cameras` has taken apart."""
     views = len(data.views.frame)
     return data.frames == views > len(np.unique(data.views.frame))
 
 
-def has_no_rig(data: Data) -> bool:
+def has_no_rig(data: RigViews) -> bool:
     """Whether no frame has several views, so that nothing says how the cameras stand."""
     return data.frames == len(data.views.frame)
 
 
-def has_few_shared_frames(data: Data) -> bool:
+def has_few_shared_frames(data: RigViews) -> bool:
     """Whether several cameras saw so few frames that what they say of a rig is no measure."""
     shared = int((np.bincount(data.frame_of) > 1).sum())
     return data.cameras > 1 and data.poses is None and shared < MIN_SHARED_FRAMES
 
 
-def rig_differs(test: Data, state: State) -> bool:
+def rig_differs(test: RigViews, state: RigState) -> bool:
     """Whether the cameras do not stand as in a state fitted to other frames."""
     if has_no_rig(test):
         return False
     alone = unpair_cameras(test)
-    together, own = (rms_px(Linearised(data, start_poses(data, state), ()))
+    together, own = (rms_px(Linearization(data, localize_frames(data, state), ()))
                      for data in (test, alone))
     return together > MAX_RIG_RATIO * own
 
 
-def is_unrelated(data: Data, state: State) -> bool:
+def is_unrelated(data: RigViews, state: RigState) -> bool:
     """Whether no rig explains where the cameras stand in most frames that several of them saw."""
     if data.cameras < 2 or data.poses is not None:
         return False
-    misfit, _ = cross_camera_offsets(data, state, state.cameras.localize(data.views))
+    misfit, _ = cross_camera_offsets(data, state, localize_cameras(state.model, data.views))
     several = np.isfinite(misfit)
     extent = float(np.ptp(data.views.uv[data.views.used], axis=0).max())
     return bool(several.any() and
@@ -383,7 +384,7 @@ def is_unrelated(data: Data, state: State) -> bool:
 
 
 def rig_is_inconsistent(
-    data: Data, lenses: Sequence[Lens], base: State, free: Sequence[str]
+    data: RigViews, lenses: Sequence[Lens], base: RigState, free: Sequence[str]
 ) -> bool:
     """Whether the cameras do not keep their places, beyond what any effect of a rig allows.
 
@@ -393,24 +394,24 @@ def rig_is_inconsistent(
         return False
     alone = unpair_cameras(data)
 
-    def misfits(free: Sequence[str], together: State) -> tuple[float, float]:
-        posed = fit(alone, start(alone, lenses[0], lenses[1:]), free)
-        return rms_px(Linearised(data, together, ())), rms_px(Linearised(alone, posed, ()))
+    def misfits(free: Sequence[str], together: RigState) -> tuple[float, float]:
+        posed = adjust(alone, initial_state(alone, lenses[0], lenses[1:]), free)
+        return rms_px(Linearization(data, together, ())), rms_px(Linearization(alone, posed, ()))
 
     whole, own = misfits(free, base)
     if whole < MAX_RIG_RATIO * own:
         return False
     # Lenses that are wrong look like a rig that moves: they get what they want first.
     every = free_parameters(dict(zip(base.labels, lenses, strict=True)), True)
-    base = fit(data, base, every)
+    base = adjust(data, base, every)
     whole, own = misfits(every, base)
     if whole < MAX_RIG_RATIO * own:
         return False
-    scene = Linearised(data, base, ()).scene
+    scene = Linearization(data, base, ()).scene
     for kind in (RigFlexEffect, StereoTimeOffsetEffect):
         try:
             effect = kind.candidates(scene)[-1]
         except Untestable:
             continue
         base = with_effect(base, effect, np.zeros(len(effect.parameters)))
-    return rms_px(Linearised(data, fit(data, base, every), ())) > _EXPLAINED_RATIO * own
+    return rms_px(Linearization(data, adjust(data, base, every), ())) > _EXPLAINED_RATIO * own

@@ -15,10 +15,10 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.mixed_model import Components, RandomColumns
 from fisheye_svp_ros.scene.boards import Board, find_boards
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
@@ -101,7 +101,9 @@ class ColumnGeometry(NamedTuple):
     alone: Array
 
     @classmethod
-    def of(cls, linear: Linearised, finest: float, modes: Array, alone: Array) -> ColumnGeometry:
+    def of(
+        cls, linear: Linearization, finest: float, modes: Array, alone: Array
+    ) -> ColumnGeometry:
         """Return that of a linearised state; modes, alone: see above."""
         views = linear.data.views
         used = views.used
@@ -135,7 +137,7 @@ class GatheredPoints(NamedTuple):
     at: Array
 
     @classmethod
-    def of(cls, linear: Linearised, geometry: ColumnGeometry | None = None) -> GatheredPoints:
+    def of(cls, linear: Linearization, geometry: ColumnGeometry | None = None) -> GatheredPoints:
         """Gather the points of a linearised state; geometry: None for its own."""
         data, views = linear.data, linear.data.views
 
@@ -160,7 +162,7 @@ class GatheredPoints(NamedTuple):
         slot = np.where(shown, np.searchsorted(known, landmark).clip(max=len(known) - 1), -1)
         if geometry is not None:
             number, points = geometry.board[slot], geometry.points[slot]
-        place = linear.whitened(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
+        place = linear.whiten(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
         board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
         for i, one in enumerate(boards):
             mine = shown & (number == one.id)
@@ -189,7 +191,7 @@ def _extents(uv: Array, used: Mask, camera: Index) -> Array:
 
 
 def make_random_effects(
-    linear: Linearised, finest: bool = False, geometry: ColumnGeometry | None = None
+    linear: Linearization, finest: bool = False, geometry: ColumnGeometry | None = None
 ) -> RandomEffects:
     """Build the columns of every component that the data can hold; finest: of the image, too.
 

@@ -15,11 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.adjustment import fit as fit_least_squares
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form, with_effect
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, limit_step, refit
-from fisheye_svp_ros.diagnosis.model import Data, State
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import (
     NullModel,
     PlacedEffect,
@@ -45,6 +43,8 @@ from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step
+from fisheye_svp_ros.solve.rig_state import RigState, RigViews
 
 _MAX_ROUNDS = 6
 _REFITS_AFTER_REVISION = 2
@@ -76,7 +76,7 @@ class Selection:
     trace: tuple[TraceStep, ...]
 
     @property
-    def state(self) -> State:
+    def state(self) -> RigState:
         """The state with its causes."""
         return self.null.linear.state
 
@@ -90,8 +90,8 @@ class Selection:
 class _Search:
     """A search between two rounds; variances: to start from; revision: None before it is made."""
 
-    data: Data
-    state: State
+    data: RigViews
+    state: RigState
     variances: Variances | None
     revision: Revision | None
     finest: bool
@@ -194,10 +194,10 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
                    refits_left=_REFITS_AFTER_REVISION)
 
 
-def _refit(problem: Problem, search: _Search, null: NullModel) -> State:
+def _refit(problem: Problem, search: _Search, null: NullModel) -> RigState:
     state = search.state
     if _misfit(null) > _LEAST_SQUARES_LIMIT:
-        state = fit_least_squares(search.data, state, problem.free)
+        state = adjust(search.data, state, problem.free)
     assert search.variances is not None
     return refit(search.data, state, problem.free, search.variances)
 
@@ -244,16 +244,16 @@ def _misfit(null: NullModel) -> float:
 
 def _change_state(
     null: NullModel, included: Index, gone: Sequence[str], forms: Sequence[int]
-) -> State:
+) -> RigState:
     """Return the state without some effects and with chosen forms of others."""
-    kept = null.linear.state.without(gone)
+    kept = null.linear.state.without_effects(gone)
     estimated = _estimate_forms(null, included, forms)
 
-    def after(fraction: float) -> State:
+    def after(fraction: float) -> RigState:
         return reduce(lambda state, one: with_effect(state, one[0], fraction * one[1]),
                       estimated, kept)
 
-    return limit_step(null.linear.data, null.linear.free, after)[0]
+    return shorten_step(null.linear.data, null.linear.free, after)[0]
 
 
 def _estimate_forms(
@@ -272,7 +272,7 @@ def _estimate_forms(
     return estimated
 
 
-def _with_included(problem: Problem) -> State:
+def _with_included(problem: Problem) -> RigState:
     """Return the fitted state with the causes that the user knows of, in their simplest forms.
 
     Raises ObservationError for one that the data cannot hold.
@@ -285,4 +285,4 @@ def _with_included(problem: Problem) -> State:
             state = with_effect(state, simplest_form(CATALOGUE[name], problem.linear))
         except Untestable as why:
             raise ObservationError(f'{problem.observations.source}: {name}: {why}') from why
-    return fit_least_squares(problem.data, state, problem.free)
+    return adjust(problem.data, state, problem.free)

@@ -17,7 +17,6 @@ from scipy import special
 from fisheye_svp_ros.arrays import Array, Index, Mask, flat_rows
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.model import Linearised, is_shared
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
@@ -34,6 +33,7 @@ from fisheye_svp_ros.mixed_model import (
     Variances,
     pseudo_inverse,
 )
+from fisheye_svp_ros.solve.rig_state import Linearization, is_shared
 
 _MAX_MODELS = 40
 _MIN_FRAMES = 3
@@ -261,7 +261,7 @@ class ModelErrors:
         return cls(shared_names(null.linear), inverse / np.outer(scale, scale), null.variances,
                    geometry)
 
-    def of_poses(self, linear: Linearised) -> ErrorParts:
+    def of_poses(self, linear: Linearization) -> ErrorParts:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
 
         linear: frames that were posed with the lens of the diagnosis, those it was made of or
@@ -269,7 +269,7 @@ class ModelErrors:
         """
         return self.through(linear, pose_maps(linear.frame_columns))
 
-    def through(self, linear: Linearised, maps: Array) -> ErrorParts:
+    def through(self, linear: Linearization, maps: Array) -> ErrorParts:
         """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
         turned = np.swapaxes(maps, -1, -2)
         shared = maps @ linear.shared_columns
@@ -285,7 +285,7 @@ class ModelErrors:
             misfit[f] += (field * variance[random.shared_label]) @ field.T
         return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
 
-    def of_points(self, linear: Linearised) -> ErrorParts:
+    def of_points(self, linear: Linearization) -> ErrorParts:
         """Return variances (F, M), px^2, of u and v of the points of a fit.
 
         Of the lens alone: a turn of the camera as a whole is taken out, as poses take it up, and
@@ -307,7 +307,7 @@ class ModelErrors:
             'fmk,kl,fml->fm', columns, self._covariance_of(linear), columns)
         return ErrorParts(self.variances.sigma**2 * px, parameters * px, misfit * px)
 
-    def summary(self, linear: Linearised) -> dict[str, dict[str, float]]:
+    def summary(self, linear: Linearization) -> dict[str, dict[str, float]]:
         """Return root mean squares of what each part adds, over the frames and points of a fit.
 
         position_m, rotation_rad: of a pose from one frame; image_px: of a coordinate.
@@ -320,13 +320,13 @@ class ModelErrors:
             return found
         return found | pose_summary(self.of_poses(linear))
 
-    def _covariance_of(self, linear: Linearised) -> Array:
+    def _covariance_of(self, linear: Linearization) -> Array:
         """Return the covariance of what is shared in a linearization, zero for what is exact."""
         at = {name: i for i, name in enumerate(self.names)}
         index = np.array([at.get(name, len(at)) for name in shared_names(linear)], dtype=np.int64)
         return np.pad(self.covariance, (0, 1))[np.ix_(index, index)]
 
-    def _random_columns(self, linear: Linearised) -> tuple[RandomColumns, Array]:
+    def _random_columns(self, linear: Linearization) -> tuple[RandomColumns, Array]:
         """Return the random columns of the frames, and the variance of each component, last 0."""
         alive = self.variances.alive & ~_target_components()
         random = make_random_effects(linear, geometry=self.geometry).select(alive)
@@ -370,7 +370,7 @@ def _target_components() -> Mask:
     return np.array([STAGE_OF[name] == 'target' for name in NAMES])
 
 
-def shared_names(linear: Linearised) -> tuple[str, ...]:
+def shared_names(linear: Linearization) -> tuple[str, ...]:
     """Return the names of what is shared in a linearization: rig, intrinsics, effects."""
     terms = [name for term in linear.state.terms if is_shared(term[0])
              for name in parameter_names(term)]
@@ -383,7 +383,7 @@ def parameter_names(term: Term) -> list[str]:
     return [f'{term[0].name}.{parameter.name}' for parameter in term[0].parameters]
 
 
-def _lens_mask(linear: Linearised) -> Array:
+def _lens_mask(linear: Linearization) -> Array:
     """Return 1 for what is shared (K,) and moves with the lens, 0 for rig and target."""
     terms = [(effect, len(values)) for effect, values in linear.state.terms if is_shared(effect)]
     own = [np.full(count, effect.stage in ('ray', 'image', 'detector')) for effect, count in terms]
@@ -392,7 +392,7 @@ def _lens_mask(linear: Linearised) -> Array:
     return np.concatenate([np.zeros(rig), np.ones(free), *own])
 
 
-def _turn_columns(linear: Linearised) -> Array:
+def _turn_columns(linear: Linearization) -> Array:
     """Return whitened derivatives (F, M, 3) by a turn of the camera that all frames share."""
     rotation = linear.state.view_poses(linear.data).rotation
-    return linear.whitened(np.nan_to_num(linear.linear.d_pose[..., 3:] @ rotation[:, None]))
+    return linear.whiten(np.nan_to_num(linear.linear.d_pose[..., 3:] @ rotation[:, None]))

@@ -223,7 +223,7 @@ def _scatter_tests(fitted: FittedModel, known_noise: bool) -> Iterator[tuple[str
     """Tests of the size of residuals, not of their sign."""
     linear = fitted.linear
     e2 = fitted.standardized_squares()
-    used = linear.used
+    used = linear.row_mask
     # A normal quantile of the heaviest numbers: points in pairs, leverages estimated.
     largest = float(e2[used].max())
     p = min(1.0, used.sum() * float(special.chdtrc(1, largest)))

@@ -17,16 +17,17 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, posable_observations
-from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import ViewLimits
 from fisheye_svp_ros.planning.plan import NextViews, next_photographs, plan
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.simulation import blank_views
+from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 MAX_PHOTOGRAPHS = 40  # photographs; with so many what is still open stays open
 MIN_SCORE = 0.8  # score of a view that is taken
@@ -147,7 +148,7 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
                   tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
 
 
-def _model(linear: Linearised) -> ForwardModel:
+def _model(linear: Linearization) -> ForwardModel:
     """Return how the lens images a board that is as it should be."""
     terms = [term for term in linear.state.terms
              if term[0].stage in ('ray', 'image') and not term[0].of_target]
@@ -166,7 +167,7 @@ def _session_state(
         wanted, tuple(outline), value, stderr, named, alike, settled, session.latest)
 
 
-def _value(linear: Linearised, number: str) -> float:
+def _value(linear: Linearization, number: str) -> float:
     """Return a number of lens or effects; 0 where there is none of it."""
     values = dict(linear.state.parameters)
     for effect, own in linear.state.terms:
@@ -174,14 +175,14 @@ def _value(linear: Linearised, number: str) -> float:
     return values.get(number, 0.0)
 
 
-def _refit(session: Session, table: Observations) -> Linearised:
+def _refit(session: Session, table: Observations) -> Linearization:
     """Return lens and e0 as far as the photographs tell them; the data sheet says the rest."""
     lens, shift = session.latest or (session.lens, 0.0)
-    data, free = prepare(table), intrinsic_names(lens)
-    state = start(data, lens)
+    data, free = group_by_frame(table), intrinsic_names(lens)
+    state = initial_state(data, lens)
     state = replace(state, terms=((_EFFECT, np.array([shift])),))
-    state = fit(data, state, free, _prior(session.lens, free))
-    return Linearised(data, state, free)
+    state = adjust(data, state, free, _prior(session.lens, free))
+    return Linearization(data, state, free)
 
 
 def _prior(lens: Lens, free: Sequence[str]) -> Prior:
@@ -193,7 +194,7 @@ def _prior(lens: Lens, free: Sequence[str]) -> Prior:
                  np.diag([*(1 / loose[name] for name in free), 1 / _EFFECT.parameters[0].large]))
 
 
-def _noise(linear: Linearised) -> float:
+def _noise(linear: Linearization) -> float:
     """Return the noise of u and of v, px, from what the fit leaves, no less than is stated."""
     weight = linear.row_weight
     px = linear.residual[weight > 0] / weight[weight > 0]

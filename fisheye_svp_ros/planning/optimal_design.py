@@ -20,7 +20,6 @@ from scipy.spatial import KDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis import CONFOUNDED_P
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -31,6 +30,7 @@ from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.boards import spacing
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 CANDIDATES = 600
 _TRIES = 12_000
@@ -179,7 +179,7 @@ class Design:
     """
 
     def __init__(
-        self, linear: Linearised, effects: Sequence[Effect], board: FlatBoard, shots: Shots,
+        self, linear: Linearization, effects: Sequence[Effect], board: FlatBoard, shots: Shots,
         noise: float, known: bool = True,
     ) -> None:
         """Take a fit, and effects that are not in it but may be there; noise: of u and v, px.
@@ -205,10 +205,9 @@ class Design:
             mean = float(np.sqrt(np.mean(used[used > 0] ** 2)))
             self.known = self.known + information(linear, effects).sum(axis=0) / (mean * noise)**2
         views = blank_views(board.landmark, board.points, len(shots.distance), board=board.board)
-        count = len(shots.distance)
-        data = Data(linear.data.observations, views, np.arange(count), np.zeros(count, int))
+        data = RigViews.of_one_camera(views)
         posed = replace(state, pose=shots.camera, rig=identity(1), terms=tuple(terms))
-        self.added = information(Linearised(data, posed, free), effects) / noise**2
+        self.added = information(Linearization(data, posed, free), effects) / noise**2
 
     def columns(self, name: str) -> Index:
         """Return the columns of an effect, or of one number, by its name or its last part.
@@ -259,7 +258,7 @@ class Design:
         return np.asarray(self.known + self.added[list(taken)].sum(axis=0))
 
 
-def confounded_effects(linear: Linearised, names: Sequence[str]) -> list[Effect]:
+def confounded_effects(linear: Linearization, names: Sequence[str]) -> list[Effect]:
     """Return the richest forms of effects of lens or target that are not in a fit."""
     there = {effect.name for effect, _ in linear.state.terms}
     found = []
@@ -286,7 +285,7 @@ def max_view_angle(lens: Lens, reached: float) -> float:
 
 
 def candidate_shots(
-    state: State, board: FlatBoard, room: ViewLimits, rng: np.random.Generator
+    state: RigState, board: FlatBoard, room: ViewLimits, rng: np.random.Generator
 ) -> Shots:
     """Return up to CANDIDATES views that can be taken: the board whole, sharp, detectable.
 
@@ -324,7 +323,7 @@ def candidate_shots(
     return shots.take(possible)
 
 
-def _detectable(state: State, board: FlatBoard, shots: Shots, field: float) -> Mask:
+def _detectable(state: RigState, board: FlatBoard, shots: Shots, field: float) -> Mask:
     """Whether boards are in image and field as a whole, their points far enough apart (P,)."""
     model, found = ForwardModel(state.lens, state.terms), np.ones(len(shots.distance), dtype=bool)
     size, rim = np.array([state.lens.width, state.lens.height]), board.rim
@@ -365,7 +364,7 @@ def _unit(name: str) -> str:
     return 'rad' if 'tilt' in name else 'm' if name.startswith('port_') else '1'
 
 
-def information(linear: Linearised, effects: Sequence[Effect]) -> Array:
+def information(linear: Linearization, effects: Sequence[Effect]) -> Array:
     """Return what each frame tells of all that is shared (F, K, K), its pose taken out."""
     columns = np.concatenate(
         [linear.shared_columns, *(linear.effect_columns(effect) for effect in effects)], axis=-1)

@@ -13,13 +13,12 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import Cause
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, intrinsic_names
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
-from fisheye_svp_ros.optics.lens import Lens, field_of_view
+from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import (
     Criterion,
     Design,
@@ -31,8 +30,8 @@ from fisheye_svp_ros.planning.optimal_design import (
     max_view_angle,
 )
 from fisheye_svp_ros.pose import identity, quaternion_from_rotation
-from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.simulation import blank_views
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 # Over those of the photographs that there are: still sharp, still in reach
 _MIN_DISTANCE_RATIO, _MAX_DISTANCE_RATIO = 0.7, 1.5
@@ -73,7 +72,7 @@ class NextViews(NamedTuple):
 
 
 def next_photographs(
-    after: Linearised, causes: Sequence[Cause], noise: float, count: int,
+    after: Linearization, causes: Sequence[Cause], noise: float, count: int,
     number: str | None = None, room: ViewLimits | None = None,
 ) -> NextViews:
     """Choose `count` photographs beside those of a fit, of the same board by the same camera.
@@ -124,7 +123,7 @@ def lens_criterion(design: Design) -> Criterion:
 
 
 def _choose_question(
-    after: Linearised, causes: Sequence[Cause], number: str | None
+    after: Linearization, causes: Sequence[Cause], number: str | None
 ) -> tuple[str, tuple[str, ...], list[Effect]]:
     """Return what is asked for, what it may be mistaken for, and effects to take in."""
     fitted = {effect.name for effect, _ in after.state.terms}
@@ -144,7 +143,7 @@ def _choose_question(
     return 'e0', (), [ViewpointShiftEffect(1)]
 
 
-def _holding(after: Linearised, number: str) -> Effect:
+def _holding(after: Linearization, number: str) -> Effect:
     """Return the simplest form of an effect that has a number by this name, or this name itself.
 
     Raises ParameterError where there is none.
@@ -179,16 +178,14 @@ def plan(
     it does not have.
     """
     board = FlatBoard(np.arange(len(points)), points, np.zeros(len(points), int), np.eye(3))
-    state = State(identity(1), identity(1), lens, ())
+    state = RigState(identity(1), identity(1), lens, ())
     if lens.calibrated_angle is not None:
         room = room._replace(field=max_view_angle(lens, lens.calibrated_angle))
     shots = candidate_shots(state, board, room, np.random.default_rng(0))
-    blank = make_observations(np.zeros(len(points), int), board.landmark, 0.0 * points[:, :2],
-                              points)
     views = blank_views(board.landmark, points, len(shots.distance))
-    data = Data(blank, views, np.arange(len(shots.distance)), np.zeros(len(shots.distance), int))
-    posed = State(shots.camera, identity(1), lens, ())
-    linear = Linearised(data, posed, intrinsic_names(lens))
+    data = RigViews.of_one_camera(views)
+    posed = RigState(shots.camera, identity(1), lens, ())
+    linear = Linearization(data, posed, intrinsic_names(lens))
     design = Design(linear, [ViewpointShiftEffect(1)], board, shots, noise, known=False)
     question = lens_criterion(design) if number is None else design.question(number)
     chosen, answers = design.choose(question, count)

@@ -17,11 +17,12 @@ from benchmark.blind_oracle import LinearScene
 from benchmark.blind_outside import OUTSIDE
 from benchmark.blind_scene import FARTHEST, NEAREST, Needs, draw_scene
 from benchmark.blind_trial import Outcome, Task, draw_case, run_trial
-from fisheye_svp_ros.diagnosis.adjustment import fit
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.optics.lens import intrinsic_names
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 # A sound build misses a threshold less than once in this many runs.
 RUNS = 10_000
@@ -131,8 +132,8 @@ def test_the_size_is_what_a_fit_leaves(name):
     case = draw_case(Task(mode, 0.5, (name,), 11, 1))
     scene, linear = case.scene, case.linear.linear
     free = intrinsic_names(scene.lens) if scene.free else ()
-    data = prepare(scene.table(case.exact))
-    left = Linearised(data, fit(data, linear.state, free), free).residual
+    data = group_by_frame(scene.table(case.exact))
+    left = Linearization(data, adjust(data, linear.state, free), free).residual
     sigma = 1.0 if scene.stated else scene.noise
     rms = np.sqrt((left**2).sum() / case.linear.nuisance.rows) / sigma
     assert rms == pytest.approx(0.5, rel=0.05)

@@ -24,7 +24,6 @@ from fisheye_svp_ros.diagnosis import (
     point_residuals,
     with_effect,
 )
-from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -51,6 +50,7 @@ from fisheye_svp_ros.reporting.headline import VERDICTS, headline
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 # Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
 LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 2.0)
@@ -541,4 +541,4 @@ def test_the_depth_of_a_rig_gains_too():
     assert depth.low <= depth.value <= depth.high
     # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
     late = with_effect(found.after.state, StereoTimeOffsetEffect(), np.array([0.01]))
-    assert known_errors(found.before, Linearised(found.after.data, late, ()), ()) == {}
+    assert known_errors(found.before, Linearization(found.after.data, late, ()), ()) == {}

@@ -5,10 +5,11 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel, with_effect
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.variance_budget import cause_squares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 
 @pytest.fixture
@@ -18,11 +19,11 @@ def state():
     pose, views = scene(rng, 1, 12)
     terms = [(CATALOGUE['decentering'](), np.array([0.004, 0.002])),
              (CATALOGUE['skew'](), np.array([3e-4]))]
-    data = prepare(observe(lens(), tuple(terms), pose, views, 0.1, rng))
-    found = with_effect(start(data, lens()), *terms[0])
+    data = group_by_frame(observe(lens(), tuple(terms), pose, views, 0.1, rng))
+    found = with_effect(initial_state(data, lens()), *terms[0])
     for name in ('sensor_tilt', 'skew'):
         found = with_effect(found, CATALOGUE[name]())
-    return data, fit(data, found, ('cx', 'cy'))
+    return data, adjust(data, found, ('cx', 'cy'))
 
 
 def displacement(null, names):
@@ -39,8 +40,8 @@ def displacement(null, names):
     taken = np.concatenate([poses.reshape(frames * rows, -1),
                             shared[..., :2].reshape(frames * rows, -1)], axis=1)
     apart = signal.ravel() - taken @ np.linalg.lstsq(taken, signal.ravel(), rcond=None)[0]
-    weight = linear.row_weight[linear.used]
-    return 2 * float(np.mean((apart[linear.used.ravel()] / weight) ** 2))
+    weight = linear.row_weight[linear.row_mask]
+    return 2 * float(np.mean((apart[linear.row_mask.ravel()] / weight) ** 2))
 
 
 def test_shares_add_up_to_what_all_causes_do_together(state):

@@ -15,8 +15,6 @@ from fisheye_svp_ros.diagnosis import (
     find_outliers,
     standard_errors,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.outliers import VIEW, quantization_step
 from fisheye_svp_ros.diagnosis.problem import Inputs, thin_out
 from fisheye_svp_ros.diagnosis.selection import select_causes
@@ -26,7 +24,11 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.scene.observations import Observations, views_of
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SIGMA = 0.2
 
@@ -35,9 +37,9 @@ def fitted(seed, terms=(), cameras=1, free=(), simulated=None):
     rng = np.random.default_rng(seed)
     pose, views = scene(rng, cameras)
     observations = observe(simulated or lens(), terms, pose, views, SIGMA, rng)
-    data = prepare(observations)
-    state = fit(data, start(data, lens()), free)
-    return data, state, Linearised(data, state, free)
+    data = group_by_frame(observations)
+    state = adjust(data, initial_state(data, lens()), free)
+    return data, state, Linearization(data, state, free)
 
 
 @pytest.mark.parametrize('cameras', [1, 2])
@@ -49,7 +51,7 @@ def test_linearised_columns_are_derivatives_of_the_residual(cameras):
         change = np.zeros((data.frames, 6))
         change[:, i] = step
         up, down = (
-            Linearised(data, replace(state, pose=state.pose.retract(s * change)), free).residual
+            Linearization(data, replace(state, pose=state.pose.retract(s * change)), free).residual
             for s in (1, -1)
         )
         np.testing.assert_allclose(
@@ -59,7 +61,7 @@ def test_linearised_columns_are_derivatives_of_the_residual(cameras):
         change = np.zeros((cameras, 6))
         change[1, i] = step
         up, down = (
-            Linearised(data, replace(state, rig=state.rig.retract(s * change)), free).residual
+            Linearization(data, replace(state, rig=state.rig.retract(s * change)), free).residual
             for s in (1, -1)
         )
         np.testing.assert_allclose(
@@ -213,8 +215,8 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
     table = observe(hidden, (), pose, views, SIGMA / 2, rng)
     wrong = np.flatnonzero(table.frame == 11)[3]
     table.uv[wrong] += [9.0, -5.0]
-    data = prepare(table)
-    near = find_outliers(data, start(data, lens()))[1]
+    data = group_by_frame(table)
+    near = find_outliers(data, initial_state(data, lens()))[1]
     assert {7, 11} == set(table.frame[near.rows].tolist())
     found = diagnose(table, lens())
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
@@ -234,10 +236,10 @@ def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
     uv = clean.uv + sigma[:, None] * rng.normal(size=clean.uv.shape)
     uv[40] = clean.uv[40] + 10 * SIGMA
     table = replace(clean, uv=uv, sigma=sigma)
-    data = prepare(table)
-    assert not len(find_outliers(data, start(data, lens()))[1].rows)
-    data = prepare(replace(table, sigma=np.full(len(clean), SIGMA)))
-    gross = find_outliers(data, start(data, lens()))[1]
+    data = group_by_frame(table)
+    assert not len(find_outliers(data, initial_state(data, lens()))[1].rows)
+    data = group_by_frame(replace(table, sigma=np.full(len(clean), SIGMA)))
+    gross = find_outliers(data, initial_state(data, lens()))[1]
     assert 40 in gross.rows.tolist()
     assert gross.px[gross.rows == 40] == pytest.approx(10 * SIGMA * np.sqrt(2), rel=0.3)
 
@@ -248,8 +250,8 @@ def test_a_view_is_off_as_a_whole_where_most_are_not(bad, named):
     pose, views = scene(rng)
     clean = observe(lens(), (), pose, views, SIGMA, rng)
     off = 30 * rng.normal(size=clean.uv.shape) * np.isin(clean.frame, bad)[:, None]
-    data = prepare(replace(clean, uv=clean.uv + off))
-    gross = find_outliers(data, start(data, lens()))[1]
+    data = group_by_frame(replace(clean, uv=clean.uv + off))
+    gross = find_outliers(data, initial_state(data, lens()))[1]
     assert (VIEW in gross.why) == named
     frames = {int(clean.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
               if why == VIEW}
@@ -262,8 +264,8 @@ def test_one_camera_of_three_that_the_others_contradict_is_to_blame():
     table = replace(observe(lens(), (), pose, views, SIGMA, rng), cameras=('a', 'b', 'c'))
     bad = np.flatnonzero((table.frame == 5) & (table.camera == 2))
     table.uv[bad] = table.uv[bad[::-1]]
-    data = prepare(table)
-    gross = find_outliers(data, start(data, lens()))[1]
+    data = group_by_frame(table)
+    gross = find_outliers(data, initial_state(data, lens()))[1]
     assert set(gross.why) == {FRAME} and sorted(gross.rows.tolist()) == bad.tolist()
 
 
@@ -500,7 +502,7 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
     table, lenses = rig_table(26, [(skew, np.array([0.002]))])
     found = diagnose(table, lenses, free_intrinsics=True)
-    models = [found.after.state.cameras.model(camera) for camera in (0, 1)]
+    models = [found.after.state.model.camera(camera) for camera in (0, 1)]
     assert [model.lens.name for model in models] == ['fish214', 'right']
     assert [cause.effect for cause in found.causes] == ['skew']
     assert list(found.causes[0].parameters) == ['right.shear']

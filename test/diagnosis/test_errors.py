@@ -14,13 +14,14 @@ from fisheye_svp_ros.diagnosis import (
     refit,
     standard_errors,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
-from fisheye_svp_ros.solve.lens_adjustment import parameter_values
+from fisheye_svp_ros.optics.lens import parameter_values
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SIGMA, SHIFT = 0.1, 0.004
 DRAWS = 14
@@ -36,9 +37,9 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         terms = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
         true = views._replace(points=views.points + moves)
         table = observe(lens(), terms, pose, true, SIGMA, rng)
-        data = prepare(replace(table, xyz=views.points[0][table.landmark]))
-        begin = start(data, lens())
-        state = fit(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
+        data = group_by_frame(replace(table, xyz=views.points[0][table.landmark]))
+        begin = initial_state(data, lens())
+        state = adjust(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
         null = NullModel.fit(data, state, ())
         fitted = refit(data, state, (), null.variances)
         error, = standard_errors(null)
@@ -59,8 +60,8 @@ def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resem
         apart = table.uv[:, None] - rng.uniform(size=(6, 2)) * size
         bumps = np.exp(-(apart**2).sum(axis=-1) / 2 / (0.25 * size.max()) ** 2)
         table = replace(table, uv=table.uv + bumps @ rng.normal(size=(6, 2)) * 3 * SIGMA)
-        data = prepare(table)
-        null = NullModel.fit(data, fit(data, start(data, lens()), free), free)
+        data = group_by_frame(table)
+        null = NullModel.fit(data, adjust(data, initial_state(data, lens()), free), free)
         fitted = refit(data, null.linear.state, free, null.variances)
         found = np.array([getattr(fitted.lens, name) for name in free])
         off.append((found - true) / total_errors(null))
@@ -74,8 +75,8 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     terms = [(CATALOGUE['decentering'](), np.array([size, 0.0]))]
-    data = prepare(observe(lens(), terms, pose, views, SIGMA, rng))
-    state = fit(data, start(data, lens()), ('cx', 'cy'))
+    data = group_by_frame(observe(lens(), terms, pose, views, SIGMA, rng))
+    state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.fit(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
@@ -91,9 +92,10 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     tilt = CATALOGUE['sensor_tilt']
-    data = prepare(observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views,
+    data = group_by_frame(observe(lens(), [(tilt(), np.array([0.01, 0.0]))], pose, views,
                            12 * SIGMA, rng))
-    state, others = fit(data, start(data, lens()), ('cx', 'cy')), {*CATALOGUE} - {tilt.name}
+    state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
+    others = {*CATALOGUE} - {tilt.name}
     null = NullModel.fit(data, state, ('cx', 'cy'), left_out=[*others])
     more = model_uncertainty(null)[1]
     small = tuple(p._replace(large=p.large / 10) for p in tilt.parameters)
@@ -108,10 +110,10 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
     shift, plate = CATALOGUE['viewpoint_shift'](), CATALOGUE['flat_port']()
     near = replace(lens(), max_incidence=1.4)
     terms = [(shift, np.array([3e-3])), (plate, np.array([4e-3]))]
-    data = prepare(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
-    begin = replace(start(data, near), terms=((shift, np.zeros(1)),))
+    data = group_by_frame(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
+    begin = replace(initial_state(data, near), terms=((shift, np.zeros(1)),))
     others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
-    null = NullModel.fit(data, fit(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
+    null = NullModel.fit(data, adjust(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
     more = model_uncertainty(null)
     assert more[1] > 0 and more[2] == 0.0
 
@@ -121,10 +123,10 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
     rng = np.random.default_rng(31)
     pose, views = scene(rng, frames=16)
     tilt, decentering = CATALOGUE['sensor_tilt'](), CATALOGUE['decentering']()
-    data = prepare(observe(
+    data = group_by_frame(observe(
         lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng))
-    begin = replace(start(data, lens()), terms=((tilt, np.zeros(2)),))
-    state = fit(data, begin, ('cx', 'cy'))
+    begin = replace(initial_state(data, lens()), terms=((tilt, np.zeros(2)),))
+    state = adjust(data, begin, ('cx', 'cy'))
     null = NullModel.fit(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
@@ -148,8 +150,8 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
     pose, views = scene(rng, frames=16)
     terms = [(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
              (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
-    data = prepare(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
-    state = fit(data, start(data, lens()), ('cx', 'cy'))
+    data = group_by_frame(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
+    state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.fit(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
@@ -160,8 +162,8 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
 def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     rng = np.random.default_rng(5)
     pose, views = scene(rng, frames=16)
-    data = prepare(observe(lens(), (), pose, views, SIGMA, rng))
-    model_scene = NullModel.fit(data, start(data, lens()), ()).linear.scene
+    data = group_by_frame(observe(lens(), (), pose, views, SIGMA, rng))
+    model_scene = NullModel.fit(data, initial_state(data, lens()), ()).linear.scene
     shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
     bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
     table = observe(lens(), bent, pose, views, SIGMA, rng)
@@ -178,8 +180,8 @@ def test_a_calibration_says_how_far_off_an_effect_that_it_leaves_out_may_bring_i
     pose, views = scene(rng, frames=16)
     shift = [(ViewpointShiftEffect(1), np.array([SHIFT]))]
     table = observe(lens(), shift, pose, views, SIGMA, rng)
-    data, names = prepare(table), ('fx', 'fy')
-    state = fit(data, start(data, lens()), names)
+    data, names = group_by_frame(table), ('fx', 'fy')
+    state = adjust(data, initial_state(data, lens()), names)
     off = abs(state.lens.fx - lens().fx)
     assert off > 5 * standard_errors(NullModel.fit(data, state, names))[0]
     assert off < 2 * assess_lens(table, state.lens, names).stderr['fx'] < 4 * off

@@ -15,14 +15,15 @@ from fisheye_svp_ros.diagnosis import (
     refit,
     with_effect,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
-from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
 from fisheye_svp_ros.effects.base import Scene
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SIGMA = 0.2
 
@@ -154,13 +155,13 @@ def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
     rng = np.random.default_rng(41)
     pose, views = scene(rng, frames=8)
     true = lens().with_parameters(('fx', 'fy'), [1.33 * lens().fx, 1.33 * lens().fy])
-    data = prepare(observe(true, (), pose, views, SIGMA, rng))
-    state = fit(data, start(data, lens()), ())
+    data = group_by_frame(observe(true, (), pose, views, SIGMA, rng))
+    state = adjust(data, initial_state(data, lens()), ())
     variances = NullModel.fit(data, state, ()).variances
     shifted = with_effect(state, CATALOGUE['viewpoint_shift'](), np.array([0.03]))
 
     def misfit(state):
-        return np.sqrt((Linearised(data, state, ()).residual**2).mean())
+        return np.sqrt((Linearization(data, state, ()).residual**2).mean())
 
     assert misfit(refit(data, shifted, (), variances)) < 1.3 * misfit(shifted)
 

@@ -15,15 +15,15 @@ from fisheye_svp_ros.diagnosis import (
     find_outliers,
     with_covariance,
 )
-from fisheye_svp_ros.diagnosis.adjustment import start
 from fisheye_svp_ros.diagnosis.checks.medium import MEDIUM_INDEX, PORT_PLACE
-from fisheye_svp_ros.diagnosis.model import prepare
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
+from fisheye_svp_ros.solve.initial_rig import initial_state, prediction_distances
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
 CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})
@@ -135,7 +135,7 @@ def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
     stderr = {'fx': 0.02 * AIR.fx, 'fy': 0.02 * AIR.fy, 'cx': 2.0, 'cy': 2.0, 'k1': 0.1}
     covariance = np.diag(np.square([*stderr.values()])).tolist()
     known = InAir.of(replace(AIR, calibration={'stderr': stderr, 'covariance': covariance}))
-    data = prepare(photographs(true, true.port, seed=20))
+    data = group_by_frame(photographs(true, true.port, seed=20))
     wet = known.fit_behind_port(data, replace(known.lens, port=PORT), PORT_PLACE, MEDIUM_INDEX)
     assert (wet is not None) == near
 
@@ -162,12 +162,12 @@ def test_a_jump_of_the_intrinsics_is_fitted_beside_a_port_where_it_is_known_alon
 
 def test_a_view_of_which_half_is_out_of_sight_is_posed_by_the_other_half():
     """So it may begin behind a port that is not there."""
-    data = prepare(photographs(AIR, None))
-    state = start(data, replace(AIR, port=FlatGlass(0.03, 1.333)))
+    data = group_by_frame(photographs(AIR, None))
+    state = initial_state(data, replace(AIR, port=FlatGlass(0.03, 1.333)))
     turn = np.tile(np.eye(3), (data.frames, 1, 1))
     turn[0] = rotation_from_vector(np.radians([0.0, -95.0, 0.0]))
     away = replace(state, pose=state.pose.compose(Pose(turn, np.zeros((data.frames, 3)))))
-    offset = away.cameras.offsets(away.pose, data.views)
+    offset = prediction_distances(away.model, away.pose, data.views)
     assert 0.5 < np.isinf(offset[0]).mean() < 0.9
     kept, _ = find_outliers(data, away)
     again, _ = find_outliers(data, state)

@@ -9,9 +9,6 @@ from helpers.scenes import lens, observe, scene
 from scipy import special, stats
 
 from fisheye_svp_ros.diagnosis import NAMES, EffectTests, FittedModel, NullModel, refit
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.fitted_model import limit_step
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.diagnosis.random_effects import OF_LANDMARKS, make_random_effects
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
@@ -30,7 +27,11 @@ from fisheye_svp_ros.mixed_model import (
 )
 from fisheye_svp_ros.mixed_model.reml import update_variances
 from fisheye_svp_ros.mixed_model.solution import deviance_without, solution_without
+from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.reporting.diagnosis_text import COMPONENTS
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SIGMA = 0.2
 TESTED = ('viewpoint_shift', 'decentering', 'skew', 'target_shape')
@@ -48,8 +49,8 @@ def linearised(seed=3, cameras=1, frames=24, offsets=0.0, free=()):
         nominal = dict(enumerate(views.points[0]))
         xyz = np.array([nominal[i] for i in observations.landmark.tolist()])
         observations = replace(observations, xyz=xyz)
-    data = prepare(observations)
-    return Linearised(data, fit(data, start(data, lens()), free), free)
+    data = group_by_frame(observations)
+    return Linearization(data, adjust(data, initial_state(data, lens()), free), free)
 
 
 def dense_columns(linear, random):
@@ -67,14 +68,14 @@ def dense_columns(linear, random):
     label = np.concatenate([
         np.tile(random.group_label, frames), random.unit_label.ravel(), random.shared_label
     ])
-    return columns[linear.used.ravel()], label
+    return columns[linear.row_mask.ravel()], label
 
 
 def dense_poses(linear):
     frames, height, _ = linear.frame_columns.shape
     poses = np.zeros((frames, height, frames, 6))
     poses[np.arange(frames), :, np.arange(frames)] = linear.frame_columns
-    return poses.reshape(frames * height, -1)[linear.used.ravel()]
+    return poses.reshape(frames * height, -1)[linear.row_mask.ravel()]
 
 
 def some_variances(eq, seed=0):
@@ -103,8 +104,9 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
         np.ones(random.shared.shape[1]),
     ])
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
-    x = np.concatenate([dense_poses(linear), probe.reshape(-1, 1)[linear.used.ravel()]], axis=1)
-    y = linear.residual[linear.used]
+    tested = probe.reshape(-1, 1)[linear.row_mask.ravel()]
+    x = np.concatenate([dense_poses(linear), tested], axis=1)
+    y = linear.residual[linear.row_mask]
     poses = x[:, :-1]
     whitened = np.linalg.solve(v, np.column_stack([x, y]))
     inside = poses @ np.linalg.lstsq(poses.T @ whitened[:, : poses.shape[1]],
@@ -159,11 +161,11 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
         np.ones(random.group.shape[-1] * frames), np.repeat(now.weight, 3),
         np.ones(random.shared.shape[1])])
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
-    fixed = np.column_stack([dense_poses(linear), probe.reshape(-1, 1)[linear.used.ravel()]])
+    fixed = np.column_stack([dense_poses(linear), probe.reshape(-1, 1)[linear.row_mask.ravel()]])
     inverse = np.linalg.inv(v)
     across = inverse @ fixed
     p = inverse - across @ np.linalg.lstsq(fixed.T @ across, across.T, rcond=None)[0]
-    y = linear.residual[linear.used]
+    y = linear.residual[linear.row_mask]
     p_values = score_components(eq, now, range(len(NAMES)))
     found = {name: p for name, p in zip(NAMES, p_values, strict=True) if np.isfinite(p)}
     assert len(found) > 10
@@ -219,7 +221,7 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
         np.ones(5 * random.group.shape[-1]), np.repeat(now.weight, 3),
         np.ones(random.shared.shape[1]),
     ])
-    probe = border[..., :1].reshape(-1, 1)[linear.used.ravel()]
+    probe = border[..., :1].reshape(-1, 1)[linear.row_mask.ravel()]
     x = np.concatenate([dense_poses(linear), probe], axis=1)
     full = np.concatenate([x, z], axis=1)
     matrix = full.T @ full + np.diag(np.concatenate([np.zeros(x.shape[1]), precision]))
@@ -297,8 +299,8 @@ def test_without_variances_there_is_nothing_but_noise():
     null = NullModel.fit(linear.data, linear.state, ())
     assert null.variances.sigma == pytest.approx(SIGMA, rel=0.08)
     fitted = FittedModel.of_state(null.linear, null.variances)
-    left = fitted.residuals()[linear.used]
-    freedom = 1 - fitted.leverages()[linear.used].mean()
+    left = fitted.residuals()[linear.row_mask]
+    freedom = 1 - fitted.leverages()[linear.row_mask].mean()
     assert np.sqrt((left**2).mean() / freedom) == pytest.approx(SIGMA, rel=0.08)
 
 
@@ -324,12 +326,12 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
     def after(part):
         return replace(linear.state, terms=((port, np.array([10.0 * part])),))
 
-    assert not np.isfinite(Linearised(linear.data, after(1.0), ()).residual).all()
-    state, residual = limit_step(linear.data, (), after)
+    assert not np.isfinite(Linearization(linear.data, after(1.0), ()).residual).all()
+    state, residual = shorten_step(linear.data, (), after)
     assert np.isfinite(residual).all() and state.terms[0][1] < 10.0
     refitted = refit(linear.data, after(0.0), (), NullModel.fit(
         linear.data, linear.state, ()).variances)
-    assert np.isfinite(Linearised(linear.data, refitted, ()).residual).all()
+    assert np.isfinite(Linearization(linear.data, refitted, ()).residual).all()
 
 
 def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
@@ -342,11 +344,11 @@ def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
     form = next(i for i, e in enumerate(null.fixed.forms.effects) if e.name == 'decentering')
     columns = null.form_columns(form)
     found = EffectTests(bare).score(eliminate(bare.information, own), columns)
-    used = linear.used.ravel()
+    used = linear.row_mask.ravel()
     wide = np.concatenate([dense_poses(linear), linear.shared_columns.reshape(len(used), -1)[used],
                            linear.effect_columns(null.fixed.forms.effects[form])
                            .reshape(len(used), -1)[used]], axis=1)
-    y = linear.residual[linear.used]
+    y = linear.residual[linear.row_mask]
     small, large = (
         float(((y - m @ np.linalg.lstsq(m, y, rcond=None)[0]) ** 2).sum())
         for m in (wide[:, :-2], wide)
@@ -407,8 +409,8 @@ def test_predicted_offsets_are_near_the_true_ones():
     moves = rng.normal(size=views.points[0].shape) * 1e-3
     table = observe(lens(), (), pose, views._replace(points=views.points + moves), SIGMA, rng)
     table = replace(table, xyz=views.points[0][table.landmark])
-    data = prepare(table)
-    state = fit(data, start(data, lens()), ())
+    data = group_by_frame(table)
+    state = adjust(data, initial_state(data, lens()), ())
     null = NullModel.fit(data, state, ())
     found = FittedModel.of_state(null.linear, null.variances).predicted_offsets()
     true = moves[found.landmark]

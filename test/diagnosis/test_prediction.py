@@ -5,10 +5,11 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel, rms_px, with_effect
-from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
-from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 FREE = ('fx', 'fy', 'cx', 'cy')
 
@@ -19,11 +20,11 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     rng = np.random.default_rng(4)
     pose, views = scene(rng, 1, 12)
     cause = CATALOGUE['decentering'](), np.array([size, size / 2])
-    data = prepare(observe(lens(), (cause,), pose, views, 0.1, rng))
-    state = fit(data, with_effect(start(data, lens()), *cause), FREE)
+    data = group_by_frame(observe(lens(), (cause,), pose, views, 0.1, rng))
+    state = adjust(data, with_effect(initial_state(data, lens()), *cause), FREE)
     null = NullModel.with_variances(data, state, FREE)
     without = fit_without_causes(null, ['decentering'], FREE)
     assert not without.terms
-    best = fit(data, start(data, lens()), FREE)
-    rms = [rms_px(Linearised(data, one, ())) for one in (fit_poses(data, without), best)]
+    best = adjust(data, initial_state(data, lens()), FREE)
+    rms = [rms_px(Linearization(data, one, ())) for one in (adjust_poses(data, without), best)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)

@@ -7,11 +7,12 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
-from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.variance_budget import REPEATED
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 NOISE = 0.05
 SESSIONS, FRAMES = 4, 24
@@ -29,8 +30,8 @@ def photographed(spread=0.0, seed=0):
 
 
 def linearised(table):
-    data = prepare(table)
-    return Linearised(data, fit(data, start(data, lens()), ()), ())
+    data = group_by_frame(table)
+    return Linearization(data, adjust(data, initial_state(data, lens()), ()), ())
 
 
 def halves(table: Observations):
@@ -64,7 +65,7 @@ def test_clean_data_have_nothing_of_it():
     linear = linearised(photographed())
     rng = np.random.default_rng(1)
     for _ in range(30):
-        white = linear.used * rng.normal(size=linear.used.shape)
+        white = linear.row_mask * rng.normal(size=linear.row_mask.shape)
         assert similar_views(linear, white) is None
     assert all(c.name != REPEATED for c in diagnose(photographed(), lens()).components)
 

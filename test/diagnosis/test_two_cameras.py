@@ -18,8 +18,6 @@ from fisheye_svp_ros.diagnosis import (
     posable_observations,
     simplest_form,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import Linearised, prepare
 from fisheye_svp_ros.diagnosis.problem import rig_is_inconsistent
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
@@ -28,6 +26,9 @@ from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
 
@@ -67,9 +68,9 @@ def test_a_smooth_field_of_each_frame_is_no_rig_that_moves(seed):
 def test_reversed_frames_are_found_among_cameras_that_fit_badly():
     rough = Hidden((0.003, 0.001), 5e-4, 1e-4, 0.1, 0.1, 0.12, 0.01, 3, 25)
     seen = pair(rough, 1)
-    data = prepare(seen.table)
+    data = group_by_frame(seen.table)
     first, *others = seen.lenses.values()
-    _, gross = find_outliers(data, start(data, first, others))
+    _, gross = find_outliers(data, initial_state(data, first, others))
     torn = {int(data.observations.frame[row]) for row, why in
             zip(gross.rows, gross.why, strict=True) if why == FRAME}
     assert torn == set(seen.reversed_frames) and len(torn) == 2
@@ -79,18 +80,18 @@ def test_a_view_of_few_points_does_not_contradict_the_other_camera():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     table = seen.table
     few = (table.camera == 0) & (table.frame == 3) & (table.landmark >= 8)
-    data = prepare(table.take(~few))
+    data = group_by_frame(table.take(~few))
     first, *others = seen.lenses.values()
-    _, gross = find_outliers(data, start(data, first, others))
+    _, gross = find_outliers(data, initial_state(data, first, others))
     assert FRAME not in gross.why
 
 
 def test_what_the_user_knows_of_lenses_each_camera_of_a_rig_has_for_itself():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
-    data = prepare(seen.table)
+    data = group_by_frame(seen.table)
     first, *others = seen.lenses.values()
-    state = start(data, first, others)
-    effect = simplest_form(ViewpointShiftEffect, Linearised(data, state, ()))
+    state = initial_state(data, first, others)
+    effect = simplest_form(ViewpointShiftEffect, Linearization(data, state, ()))
     assert [parameter.name for parameter in effect.parameters] == ['left.e0', 'right.e0']
     assert effect.kinds == ('left.viewpoint_shift', 'right.viewpoint_shift')
 
@@ -188,8 +189,8 @@ def test_a_wrong_lens_is_no_rig_that_moves():
     seen = pair(replace(SMALL, reversed_frames=0), 1)
     left, right = (replace(lens, calibration=None) for lens in seen.lenses.values())
     right = replace(right, fx=1.03 * right.fx, fy=1.03 * right.fy)
-    data = prepare(seen.table)
-    base = fit(data, start(data, left, [right]), ())
+    data = group_by_frame(seen.table)
+    base = adjust(data, initial_state(data, left, [right]), ())
     assert not rig_is_inconsistent(data, (left, right), base, ())
 
 

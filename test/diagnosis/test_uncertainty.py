@@ -14,15 +14,17 @@ from fisheye_svp_ros.diagnosis import (
     NullModel,
     diagnose,
 )
-from fisheye_svp_ros.diagnosis.adjustment import fit, fit_poses, start
-from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.optics.lens import intrinsic_names
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 
 def errors_of(observations, free):
-    data = prepare(observations)
-    null = NullModel.fit(data, fit(data, start(data, AIR), free), free)
+    data = group_by_frame(observations)
+    null = NullModel.fit(data, adjust(data, initial_state(data, AIR), free), free)
     return ModelErrors.of(null, FittedModel.of(null)), null.linear
 
 
@@ -61,7 +63,7 @@ def test_poses_scatter_as_the_remaining_misfit_says():
     for seed in range(12):
         errors, linear = errors_of(displaced(6, seed), ())
         parts = errors.of_poses(linear)
-        off = fit_poses(linear.data, linear.state).pose.difference(true.pose)
+        off = adjust_poses(linear.data, linear.state).pose.difference(true.pose)
         sd = np.sqrt(np.diagonal(parts.total, axis1=1, axis2=2))
         assert np.trace(parts.misfit.mean(axis=0)) > 5 * np.trace(parts.noise.mean(axis=0))
         pulls.append(off / sd)
@@ -77,8 +79,8 @@ def test_a_diagnosis_tells_how_far_off_poses_may_be():
 
 def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
     """Its landmarks are off by what was predicted, not by as much as any target's might be."""
-    data = prepare(displaced(8, 3))
-    null = NullModel.fit(data, fit(data, start(data, AIR), ()), ())
+    data = group_by_frame(displaced(8, 3))
+    null = NullModel.fit(data, adjust(data, initial_state(data, AIR), ()), ())
     fitted, sigma = FittedModel.of(null), null.variances.sigma
     modes, alone = fitted.target_modes(sigma)
     square = (modes**2).sum(axis=-1) + alone**2

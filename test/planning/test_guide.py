@@ -8,10 +8,9 @@ from helpers.guide import LENS, POINTS, SHEET, present, seen_from, session
 
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.adjustment import Prior, fit, start
-from fisheye_svp_ros.diagnosis.model import intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.planning import guide as module
 from fisheye_svp_ros.planning.guide import (
     DetectedBoard,
@@ -23,6 +22,9 @@ from fisheye_svp_ros.planning.guide import (
 from fisheye_svp_ros.planning.optimal_design import FlatBoard
 from fisheye_svp_ros.planning.plan import next_photographs
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 SYMMETRIC = parse_pattern('chessboard:5x5:30mm').symmetries
 
@@ -122,14 +124,14 @@ def test_views_are_whole_with_the_squares_around_their_corners(first):
 def test_one_photograph_moves_the_data_sheet_no_further_than_it_must(first):
     """Fits without a prior, or with one of the wrong sign, end far outside any lens."""
     seen = present(LENS, first, np.random.default_rng(1))
-    data = prepare(observations_of([seen], POINTS))
+    data = group_by_frame(observations_of([seen], POINTS))
     free = intrinsic_names(SHEET)
     sheet = np.array([SHEET.parameters[name] for name in free])
     loose = np.array([30.0, 30.0, 15.0, 15.0, 0.05, 0.02, 0.01, 0.005])
-    state = fit(data, start(data, SHEET), free, Prior(sheet, np.diag(1 / loose)))
+    state = adjust(data, initial_state(data, SHEET), free, Prior(sheet, np.diag(1 / loose)))
     moved = np.array([state.lens.parameters[name] for name in free]) - sheet
     assert (np.abs(moved) < 2.5 * loose).all()
-    held = fit(data, start(data, SHEET), free, Prior(sheet, np.diag(1e9 / loose)))
+    held = adjust(data, initial_state(data, SHEET), free, Prior(sheet, np.diag(1e9 / loose)))
     assert [held.lens.parameters[name] for name in free] == pytest.approx(sheet, abs=1e-6)
 
 

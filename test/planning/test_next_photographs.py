@@ -10,14 +10,13 @@ from helpers.water import AIR, photographs
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.diagnosis import Cause
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
-from fisheye_svp_ros.diagnosis.model import Linearised, intrinsic_names, prepare
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import (
     Design,
     FlatBoard,
@@ -32,6 +31,9 @@ from fisheye_svp_ros.reporting.shot_list import instruction, purpose, rows
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 ROOM, NOISE = ViewLimits(0.25, 1.5), 0.1
 SHIFTED = replace(AIR, viewpoint_shift=Gennery(e0=0.003))
@@ -39,9 +41,9 @@ FREE = intrinsic_names(AIR)
 
 
 def fitted(observations, terms=()):
-    data = prepare(observations)
-    state = replace(start(data, AIR), terms=terms)
-    return Linearised(data, fit(data, state, FREE), FREE)
+    data = group_by_frame(observations)
+    state = replace(initial_state(data, AIR), terms=terms)
+    return Linearization(data, adjust(data, state, FREE), FREE)
 
 
 @pytest.fixture(scope='module')
@@ -214,8 +216,8 @@ def test_a_board_that_never_fits_is_refused_by_its_corners(monkeypatch, capsys):
 def test_no_view_lies_far_beyond_what_was_seen_or_the_nearest_edge_of_the_image(board):
     """The corners of an image may be dark; nobody has said that they are."""
     wide = replace(AIR, fx=AIR.fx / 2, fy=AIR.fy / 2, max_incidence=3.0)
-    data = prepare(photographs(wide, None, 6))
-    linear = Linearised(data, fit(data, start(data, wide), FREE), FREE)
+    data = group_by_frame(photographs(wide, None, 6))
+    linear = Linearization(data, adjust(data, initial_state(data, wide), FREE), FREE)
     wanted = next_photographs(linear, [], NOISE, 6, room=ROOM)
     limit = max_view_angle(wide, 0.0)
     assert limit == pytest.approx(wide.image_height.angle(AIR.height / AIR.fy), 0.02)

@@ -14,12 +14,10 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, flat_rows
-from fisheye_svp_ros.diagnosis.adjustment import fit, start
 from fisheye_svp_ros.diagnosis.calibration import InAir
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison, HeldOut, predict_other_data
 from fisheye_svp_ros.diagnosis.fitted_model import rms_px
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
@@ -32,6 +30,9 @@ from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
 MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
@@ -63,10 +64,10 @@ class Medium:
     calibration there left open; focal_error: relative standard error of the focal length in air.
     """
 
-    state: State
+    state: RigState
     names: tuple[str, ...]
     outliers: Outliers
-    air: Linearised
+    air: Linearization
     p_value: float
     share: float
     alike: bool
@@ -87,7 +88,7 @@ class Medium:
             return None
         names = tuple(name for name in self.names if name != THICKNESS)
         lens = self.state.lens.with_parameters([THICKNESS], [0.0])
-        state = fit(self.air.data, replace(self.state, lens=lens), names)
+        state = adjust(self.air.data, replace(self.state, lens=lens), names)
         return replace(self, state=state, names=names)
 
     def cross_validate(self) -> HeldOut:
@@ -99,9 +100,9 @@ class Medium:
         squares, counts = np.zeros(data.frames), np.zeros(data.frames)
         for fold in range(int(part.max()) + 1):
             mine = part == fold
-            kept = chosen_views(data, ~mine[data.frame_of])
-            trained = fit(kept, replace(state, pose=state.pose.take(~mine)), self.air.free)
-            test = chosen_views(data, mine[data.frame_of])
+            kept = data.select(~mine[data.frame_of])
+            trained = adjust(kept, replace(state, pose=state.pose.take(~mine)), self.air.free)
+            test = data.select(mine[data.frame_of])
             near = replace(trained, pose=state.pose.take(mine))
             squares[mine], counts[mine] = predict_other_data(test, near)
         return HeldOut(squares, counts)
@@ -127,7 +128,7 @@ class Medium:
 
     def budget(self, parts: Sequence[Component]) -> list[Component]:
         """Return the variance budget of the simulation in air from that behind the port."""
-        square = float(np.mean(self.air.residual[self.air.used] ** 2)) * self.share
+        square = float(np.mean(self.air.residual[self.air.row_mask] ** 2)) * self.share
         square *= float(np.mean(1 / self.air.weight[self.air.weight > 0] ** 2))
         remaining = 1 - self.share
         parts = [p._replace(share=remaining * p.share, named_share=remaining * p.named_share)
@@ -158,7 +159,7 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     progress('asking whether the camera looks into another medium', 0.02)
     curve = _free_curve(data, base)
     if not (_is_magnified(air, lens, curve)
-            or rms_px(Linearised(data, curve, ())) > _SUSPICIOUS_PX):
+            or rms_px(Linearization(data, curve, ())) > _SUSPICIOUS_PX):
         return None
     known = InAir.of(lens)
     media = [_assess_port(table, lens, _start_port(data, lens), free, 0.0)]
@@ -183,7 +184,7 @@ def behind_port(problem: Problem, medium: Medium) -> Problem:
                    free=medium.names, options=options)
 
 
-def _correct_lens(everything: Data, lens: Lens, known: InAir) -> Lens | None:
+def _correct_lens(everything: RigViews, lens: Lens, known: InAir) -> Lens | None:
     """Return a lens behind its port, moved within what photographs in air had left open of it."""
     near = known.select_points(everything, known.reach)
     wet = None if near is None else _start_port(near, lens)
@@ -198,7 +199,7 @@ def _correct_lens(everything: Data, lens: Lens, known: InAir) -> Lens | None:
 
 
 def _assess_port(
-    everything: Data, lens: Lens, wet: Lens | None, free: Sequence[str], moved: float
+    everything: RigViews, lens: Lens, wet: Lens | None, free: Sequence[str], moved: float
 ) -> Medium | None:
     """Return the medium if a port explains as well as a free lens curve would.
 
@@ -209,12 +210,12 @@ def _assess_port(
     if found is None:
         return None
     data, outliers, state, names = found
-    base = fit(data, start(data, lens), free)
-    air, curve = Linearised(data, base, free), _free_curve(data, base)
+    base = adjust(data, initial_state(data, lens), free)
+    air, curve = Linearization(data, base, free), _free_curve(data, base)
     plain = replace(base, lens=replace(state.lens, port=None))
-    before, after, least = (_cost(Linearised(data, fitted, ())) for fitted in (
-        fit(data, plain, ()), state, curve))
-    rows = int(air.used.sum())
+    before, after, least = (_cost(Linearization(data, fitted, ())) for fitted in (
+        adjust(data, plain, ()), state, curve))
+    rows = int(air.row_mask.sum())
     square = min(after, least) / rows
     criteria = (after / square + len(names) * np.log(rows) + moved,
               least / square + (len(INTRINSICS) + _CURVE_TERMS) * np.log(rows))
@@ -238,17 +239,17 @@ def _focal_error(lens: Lens) -> float:
     return 0.0
 
 
-def _start_port(data: Data, lens: Lens) -> Lens | None:
+def _start_port(data: RigViews, lens: Lens) -> Lens | None:
     """Return the lens with a port about where it is, fitted to a few frames."""
     chosen = np.linspace(0, data.frames - 1, min(_START_FRAMES, data.frames)).astype(int)
-    few = chosen_views(data, np.isin(data.frame_of, chosen))
+    few = data.select(np.isin(data.frame_of, chosen))
     tried: list[tuple[float, Lens]] = []
     for port in FlatGlass(0.0, MEDIA['water']).starts():
         try:
-            state = fit(few, start(few, replace(lens, port=port)), PORT_PLACE)
+            state = adjust(few, initial_state(few, replace(lens, port=port)), PORT_PLACE)
         except GeometryError:
             continue  # nothing of a view is seen through a port there
-        tried.append((_cost(Linearised(few, state, PORT_PLACE)), state.lens))
+        tried.append((_cost(Linearization(few, state, PORT_PLACE)), state.lens))
     if not tried or not np.isfinite(min(cost for cost, _ in tried)):
         return None
     found = min(tried, key=lambda one: one[0])[1]
@@ -256,18 +257,18 @@ def _start_port(data: Data, lens: Lens) -> Lens | None:
 
 
 def _fit_port(
-    everything: Data, wet: Lens
-) -> tuple[Data, Outliers, State, tuple[str, ...]] | None:
+    everything: RigViews, wet: Lens
+) -> tuple[RigViews, Outliers, RigState, tuple[str, ...]] | None:
     """Fit the place of a port; free the index where the data tell it.
 
     Returns also the data without the outliers that stand out behind the port: in air other
     points may have seemed to be some.
     """
-    data, outliers = find_outliers(everything, start(everything, wet))
+    data, outliers = find_outliers(everything, initial_state(everything, wet))
     if data.views.used.sum() < _MIN_KEPT_SHARE * everything.views.used.sum():
         return None
-    state = fit(data, start(data, wet), PORT_PLACE)
-    if not np.isfinite(_cost(Linearised(data, state, ()))):
+    state = adjust(data, initial_state(data, wet), PORT_PLACE)
+    if not np.isfinite(_cost(Linearization(data, state, ()))):
         return None
     freed, errors, _ = _free_parameters(data, state, (*PORT_PLACE, MEDIUM_INDEX))
     names: tuple[str, ...] = PORT_PLACE
@@ -279,7 +280,7 @@ def _fit_port(
     there = _is_glass(freed.lens.parameters[THICKNESS])
     if there and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
-    if rms_px(Linearised(data, state, ())) > _LOST_PX:
+    if rms_px(Linearization(data, state, ())) > _LOST_PX:
         return None
     return data, outliers, state, names
 
@@ -289,36 +290,36 @@ def _is_glass(thickness: float) -> bool:
 
 
 def _free_parameters(
-    data: Data, state: State, names: tuple[str, ...]
-) -> tuple[State, Array, float]:
+    data: RigViews, state: RigState, names: tuple[str, ...]
+) -> tuple[RigState, Array, float]:
     """Fit named parameters; return their standard errors, and the last one's likelihood ratio."""
-    freed = fit(data, state, names)
-    linear = Linearised(data, freed, names)
+    freed = adjust(data, state, names)
+    linear = Linearization(data, freed, names)
     basis, clean = group_basis(linear.frame_columns), linear.shared_columns
     flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
     inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
-    square = _cost(linear) / int(linear.used.sum())
-    gain = (_cost(Linearised(data, state, ())) - _cost(linear)) / square
+    square = _cost(linear) / int(linear.row_mask.sum())
+    gain = (_cost(Linearization(data, state, ())) - _cost(linear)) / square
     return freed, np.sqrt(np.diag(inverse) * square), gain
 
 
-def _free_curve(data: Data, base: State) -> State:
+def _free_curve(data: RigViews, base: RigState) -> RigState:
     """Return the fit of a lens curve and a centre of any kind, in air."""
-    theta = Linearised(data, base, ()).scene.theta_max
+    theta = Linearization(data, base, ()).scene.theta_max
     known = [t for t in base.terms if t[0].name != RadialProfileEffect.name]
     effect = RadialProfileEffect(_CURVE_TERMS, round(theta, 6))
     free = replace(base, terms=(*known, (effect, np.zeros(_CURVE_TERMS))))
-    return fit(data, free, INTRINSICS)
+    return adjust(data, free, INTRINSICS)
 
 
-def _is_magnified(air: Linearised, lens: Lens, state: State) -> bool:
+def _is_magnified(air: Linearization, lens: Lens, state: RigState) -> bool:
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
-    model = Linearised(air.data, state, ()).model.model(0).lens
+    model = Linearization(air.data, state, ()).model.camera(0).lens
     height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
                      for one in (model, lens))
     return height > _MIN_MAGNIFICATION * known
 
 
-def _cost(linear: Linearised) -> float:
+def _cost(linear: Linearization) -> float:
     return float((linear.residual**2).sum())

@@ -19,8 +19,8 @@ from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE
-from fisheye_svp_ros.diagnosis.model import Linearised
 from fisheye_svp_ros.diagnosis.random_effects import NAMES
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 _RATIOS = (0.3, 3.0)  # of the noise's variance: where the search starts
 _REACHES = (0.1, 0.4)  # the same, of what separates views
@@ -55,7 +55,7 @@ class Grouped(NamedTuple):
         return Grouped(self.key[landmarks], self.row[at], self.seen[at], self.t[at])
 
     @classmethod
-    def of(cls, linear: Linearised) -> Grouped:
+    def of(cls, linear: Linearization) -> Grouped:
         """Gather the views of a linearisation."""
         views = linear.data.views
         used = np.flatnonzero(views.used)
@@ -90,7 +90,7 @@ class SimilarViews(NamedTuple):
     share: float
     p_value: float
 
-    def at(self, linear: Linearised) -> Array:
+    def at(self, linear: Linearization) -> Array:
         """Return what is predicted of other views (S, N, 2), px, zero where none is like them."""
         other, known = Grouped.of(linear), self.known
         _, label = np.unique(
@@ -168,7 +168,7 @@ class _Process:
             lost, start, method='L-BFGS-B', bounds=around, options={'ftol': _PRECISE}).x)
 
 
-def similar_views(linear: Linearised, whitened: Array) -> SimilarViews | None:
+def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None:
     """Fit the process to residuals (F, M) from which all that was predicted is taken out.
 
     None where no landmark is seen twice, or nothing repeats beyond chance.  Of many landmarks and
@@ -220,7 +220,7 @@ def _three(logarithms: Array) -> tuple[float, float, float]:
     return float(variance), float(reach), float(lasting)
 
 
-def _in_px(linear: Linearised, row: Index, values: Array) -> Array:
+def _in_px(linear: Linearization, row: Index, values: Array) -> Array:
     """Return values (L, V, 2), on the axis, of rows (L, V) as (S, N, 2), px, zero elsewhere."""
     placed, there = np.zeros((linear.weight.size, 2)), row >= 0
     placed[row[there]] = values[there]

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.adjustment import fit
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
@@ -23,7 +22,6 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     rms_reduction,
 )
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
-from fisheye_svp_ros.diagnosis.model import Data, Linearised, State, chosen_views
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import MIN_SHARED_FRAMES, Progress, is_unpaired
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
@@ -34,6 +32,8 @@ from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
 from fisheye_svp_ros.mixed_model import Variances
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 _MIN_COMMON_LANDMARKS = 6  # landmarks, the fewest that two maps are compared by
 
@@ -91,18 +91,18 @@ def effect_names(terms: Sequence[Term]) -> list[str]:
 
 
 def fit_and_predict(
-    data: Data, state: State, free: Sequence[str], held: Collection[str] = ()
-) -> tuple[State, HeldOut]:
+    data: RigViews, state: RigState, free: Sequence[str], held: Collection[str] = ()
+) -> tuple[RigState, HeldOut]:
     """Fit by least squares, and predict frames left out in turn; held: effects left as they are.
 
     Nothing random: what was carried over is tried as whoever uses it would.
     """
-    fitted = fit(data, state, free, held=held)
+    fitted = adjust(data, state, free, held=held)
     return fitted, cross_validate(
         NullModel.with_variances(data, fitted, free), held=held)
 
 
-def landmark_variances(data: Data, variances: Variances, landmark: Index) -> Variances:
+def landmark_variances(data: RigViews, variances: Variances, landmark: Index) -> Variances:
     """Return variances of landmarks (L,) for the landmarks of other data."""
     seen = np.unique(data.views.landmark[data.views.used])
     return replace(variances, weight=variances.weight[np.searchsorted(landmark, seen)])
@@ -119,7 +119,7 @@ def fitted_target(fitted: FittedModel, known: KnownTarget) -> Array:
     return moved
 
 
-def displace_target(data: Data, known: KnownTarget, moved: Array) -> Data:
+def displace_target(data: RigViews, known: KnownTarget, moved: Array) -> RigViews:
     """Return data with displaced landmarks."""
     points = data.views.points + at_landmarks(data.views, known.landmark, moved)
     return replace(data, views=data.views._replace(points=points))
@@ -182,9 +182,9 @@ class _Camera(NamedTuple):
     """One camera by itself: its lens before, and its data and state with the causes."""
 
     name: str
-    before: State
-    data: Data
-    state: State
+    before: RigState
+    data: RigViews
+    state: RigState
     free: tuple[str, ...]
     target: Array | None
 
@@ -223,24 +223,24 @@ def _fit_camera(selection: Selection, camera: int, known: KnownTarget) -> _Camer
     """Fit one camera by itself, under the null model of all."""
     null, base = selection.null, selection.problem.base
     data, mine = null.linear.data, null.linear.data.camera_of == camera
-    own = chosen_views(data, mine)
+    own = data.select(mine)
     own = replace(own, camera_of=np.zeros_like(own.camera_of), poses=None)
     pose = selection.state.view_poses(data).take(np.flatnonzero(mine))
     at = camera if selection.state.others else 0
-    names = tuple(selection.state.own_names(selection.problem.free)[at])
+    names = tuple(selection.state.lens_names(selection.problem.free)[at])
     state = _single_camera(selection.state, pose, at, camera)
     target = None
     if _has_target(selection):
         variances = landmark_variances(own, null.variances, null.random.landmark)
         state = refit(own, state, names, variances)
         target = fitted_target(
-            FittedModel.of_state(Linearised(own, state, names), variances), known)
+            FittedModel.of_state(Linearization(own, state, names), variances), known)
     return _Camera(data.observations.cameras[camera], _single_camera(base, pose, at, camera), own,
                    state, names, target)
 
 
-def _single_camera(state: State, pose: Pose, lens: int, camera: int) -> State:
-    return State(pose, identity(1), state.lenses[lens], camera_terms(state.terms, camera))
+def _single_camera(state: RigState, pose: Pose, lens: int, camera: int) -> RigState:
+    return RigState(pose, identity(1), state.lenses[lens], camera_terms(state.terms, camera))
 
 
 def _has_target(selection: Selection) -> bool:
@@ -253,16 +253,16 @@ def _has_target(selection: Selection) -> bool:
 def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
     carried, poses = [], []
     for mine, source in ((one, other), (other, one)):
-        data, state = mine.data, mine.state.without(effect_names(
+        data, state = mine.data, mine.state.without_effects(effect_names(
             [term for term in mine.state.terms if displaces_landmarks(term)]))
         if source.target is None:
-            after = fit(data, state, mine.free)
+            after = adjust(data, state, mine.free)
         else:
             _, without = fit_and_predict(data, state, mine.free)
             data = displace_target(data, known, less_similarity(known.points, source.target))
             after, there = fit_and_predict(data, state, mine.free)
             carried.append(Transfer.of(source.name, mine.name, without, there))
-        poses.append((fit(mine.data, mine.before, mine.free).pose, after.pose))
+        poses.append((adjust(mine.data, mine.before, mine.free).pose, after.pose))
     return TwoCameras((one.name, other.name), tuple(carried), _maps(one, other, known),
                       _scatter((one.data, other.data), poses))
 
@@ -291,7 +291,7 @@ def _correlation(one: Array, other: Array) -> float:
 
 
 def _scatter(
-    data: tuple[Data, Data], poses: Sequence[tuple[Pose, Pose]]
+    data: tuple[RigViews, RigViews], poses: Sequence[tuple[Pose, Pose]]
 ) -> dict[str, Comparison]:
     """Compare how the rig scatters that each frame gives, before and after."""
     shared, first, second = np.intersect1d(

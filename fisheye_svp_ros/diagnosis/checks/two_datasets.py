@@ -23,12 +23,12 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import (
 )
 from fisheye_svp_ros.diagnosis.effect_forms import with_effect
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
-from fisheye_svp_ros.diagnosis.model import Linearised, State
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.effects.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.optics.lens import INTRINSICS
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
 _SAME_PLACE = 1e-6  # m: no two targets are told apart by less
 
@@ -51,7 +51,7 @@ class SharedParameter(NamedTuple):
 class DatasetModel(NamedTuple):
     """What was found of one data set: the simulation as it was fitted, and the extended model."""
 
-    before: Linearised
+    before: Linearization
     null: NullModel
 
 
@@ -132,9 +132,9 @@ def _transfer_causes(
         return None
     data, free = other.null.linear.data, other.null.linear.free
     own = other.null.linear.state
-    bare = own.without(effect_names([t for t in own.terms if moves_with_lens(t)]))
+    bare = own.without_effects(effect_names([t for t in own.terms if moves_with_lens(t)]))
 
-    def predict(terms: Sequence[Term], state: State = bare, free: Sequence[str] = free) -> Any:
+    def predict(terms: Sequence[Term], state: RigState = bare, free: Sequence[str] = free) -> Any:
         there = replace(state, terms=(*state.terms, *terms))
         return fit_and_predict(data, there, free, effect_names(terms))[1]
 
@@ -163,7 +163,7 @@ def _transfer_target(
         return None
     fitted = FittedModel.of_state(one.null.linear, one.null.variances)
     linear, own = other.null.linear, other.null.linear.state
-    state = own.without(effect_names([t for t in own.terms if displaces_landmarks(t)]))
+    state = own.without_effects(effect_names([t for t in own.terms if displaces_landmarks(t)]))
     shift = less_similarity(known.points, fitted_target(fitted, known))
     _, without = fit_and_predict(linear.data, state, linear.free)
     _, carried = fit_and_predict(displace_target(linear.data, known, shift), state, linear.free)
@@ -181,7 +181,7 @@ def _parameters(one: DatasetModel, other: DatasetModel) -> dict[str, SharedParam
     return found
 
 
-def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> State:
+def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> RigState:
     """Return the state with the other's causes of the lens as well, starting from nothing."""
     state = one.null.linear.state
     known = {effect.name: len(values) for effect, values in state.terms}
@@ -192,7 +192,7 @@ def _with_lens_effects(one: DatasetModel, other: DatasetModel) -> State:
     return state
 
 
-def _estimates(one: DatasetModel, state: State) -> dict[str, tuple[float, float, str]]:
+def _estimates(one: DatasetModel, state: RigState) -> dict[str, tuple[float, float, str]]:
     """Return value, standard error and unit of the intrinsics and the lens's causes."""
     data, free, variances = one.null.linear.data, one.null.linear.free, one.null.variances
     state = refit(data, state, free, variances)
