@@ -69,7 +69,11 @@ setup(
             'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10', 'statsmodels>=0.14',
         ],
         'docs': ['sphinx>=7.2', 'myst-parser>=2.0', 'furo'],
-        'lint': ['ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.17', 'types-PyYAML', 'scipy-stubs'],
+        # mypy takes the types of NumPy 2.5, which are written for Python 3.12, for others.
+        'lint': [
+            'numpy<2.5', 'ruff>=0.6', 'mypy>=1.11', 'import-linter>=2.17', 'types-PyYAML',
+            'scipy-stubs',
+        ],
     },
     zip_safe=True,
     maintainer='fisheye_svp_ros maintainers',

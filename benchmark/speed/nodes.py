@@ -1,4 +1,4 @@
-"""Tables: what a localizer node adds to a round trip, and how much it can take."""
+"""Tables: how soon nodes are ready, what a localizer adds to a round trip, how much it takes."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import json
 import os
 import subprocess
 import sys
+from statistics import median
 from typing import Any
 
 from benchmark.speed.engines import engines
 from benchmark.speed.report import Table, number
+from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.optics.engines import VARIABLE
 
 _GOAL = 1e-3  # s that a localizer may add
@@ -19,6 +21,21 @@ on loopback, the same messages, in turns. "Adds" is the difference of the median
 highest rate at which every set of one second was answered; then the first at which not, and how
 many were. All topics are reliable with a depth of 100."""
 _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
+_START_GOAL = 1.0  # s from the first import to a node that is ready
+_STARTS = 9
+_WITH_FILES = ('measured_camera', 'rectifier')  # which cannot start without any
+_START_TEXT = f"""From the first import to a node that is ready, its lens loaded: medians of
+{_STARTS} starts in turns, on the clock and of processor time, which has Python's own start in it."""
+_START = """
+import sys, time
+begun = time.perf_counter()
+from fisheye_svp_ros.nodes import executables
+kind = executables._kind(sys.argv[1])
+import rclpy
+rclpy.init(args=['--ros-args', '-p', 'lens:=fish214', '-p', 'board:=chessboard:9x6:25mm'])
+node = kind()
+print(time.perf_counter() - begun, time.process_time())
+"""
 
 
 def tables(count: int = 300) -> list[Table]:
@@ -33,7 +50,24 @@ def tables(count: int = 300) -> list[Table]:
         rows.append(_line(name, json.loads(run.stdout)))
     header = ('engine', 'echo node, ms', 'localizer, ms', 'adds, ms', 'goal, ms', 'met',
               'echo node, sets/s', 'localizer, sets/s')
-    return [Table('Nodes', header, rows, _TEXT, notes)]
+    return [_starts(), Table('Nodes', header, rows, _TEXT, notes)]
+
+
+def _starts() -> Table:
+    names = [name for name in NODES if name not in _WITH_FILES]
+    seconds: dict[str, list[list[float]]] = {name: [] for name in names}
+    for _ in range(_STARTS):
+        for name in names:
+            run = subprocess.run([sys.executable, '-c', _START, name], stdout=subprocess.PIPE,
+                                 stderr=subprocess.DEVNULL, text=True, check=True)
+            seconds[name].append([float(word) for word in run.stdout.split()])
+    rows = []
+    for name, several in seconds.items():
+        clock, processor = (median(column) for column in zip(*several, strict=True))
+        rows.append((name, number(clock), number(processor), f'{_START_GOAL:g}',
+                     'yes' if clock < _START_GOAL else 'no'))
+    header = ('node', 'on the clock, s', 'processor, s', 'goal, s', 'met')
+    return Table('Starts of nodes', header, rows, _START_TEXT)
 
 
 def _line(name: str, measured: dict[str, Any]) -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from benchmark.speed.harness import OURS, NotHereError, Row
 _PACKAGES = ('numpy', 'scipy', 'numba', 'opencv-python-headless', 'poselib', 'pycolmap', 'gtsam',
              'ros-jazzy-rclpy')
 # Columns of words; all others hold numbers.
-_WORDS = ('what', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met',
+_WORDS = ('what', 'node', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met',
           'engine', 'against')
 _HEAD = """# Benchmarks
 
