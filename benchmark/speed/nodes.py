@@ -25,7 +25,7 @@ _START_GOAL = 1.0  # s from the first import to a node that is ready
 _STARTS = 9
 _WITH_FILES = ('measured_camera', 'rectifier')  # which cannot start without any
 _START_TEXT = f"""From the first import to a node that is ready, its lens loaded: medians of
-{_STARTS} starts in turns, on the clock and of processor time, which has Python's own start in it."""
+{_STARTS} starts in turns, on the clock and of processor time, with Python's own start in it."""
 _START = """
 import sys, time
 begun = time.perf_counter()
