@@ -40,7 +40,7 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
 from fisheye_svp_ros.simulate.targets import board_views
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.measured import localize_measured, rms_px
+from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px
 
 PAGE = Path('docs/results/blind_images.md')
 KEPT = Path('docs/results/blind/images.jsonl')

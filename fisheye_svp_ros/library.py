@@ -32,7 +32,7 @@ from fisheye_svp_ros.scene.observations import Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
-from fisheye_svp_ros.solve.measured import localize_measured, rms_px, sigma_known
+from fisheye_svp_ros.solve.measured_poses import localize_measured, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
 from fisheye_svp_ros.study import budget as budgets
@@ -265,7 +265,7 @@ def localize(
         measured, _ = localize_with_errors(LensErrors.of(known), table)
     else:
         measured = localize_measured(ForwardModel(known), table)
-    views, result, fitted = measured.views, measured.result, measured.fitted
+    views, result, fitted = measured.views, measured.result, measured.inlier_residual
     residual = np.full((len(table), 2), np.nan)
     residual[views.row[views.used]] = fitted[views.used]
     return Localized(

@@ -35,7 +35,7 @@ from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
 from fisheye_svp_ros.scene.photograph_names import list_frames
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
-from fisheye_svp_ros.solve.measured import rms_px, sigma_known
+from fisheye_svp_ros.solve.measured_poses import rms_px, sigma_known
 from fisheye_svp_ros.study.solutions import solve_rigs
 
 

@@ -20,7 +20,7 @@ from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
-from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured, rms_px
+from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
 
 _MAX_TABLE_ROWS = 40  # frames in the table for people
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
@@ -82,13 +82,13 @@ def _print(
         place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
         rows.append((
             _frame_label(table, int(frame)), str(int(views.used[i].sum())),
-            f'{rms_px(measured.fitted[i]):.4f}', *place,
+            f'{rms_px(measured.inlier_residual[i]):.4f}', *place,
             f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
         ))
     header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm', 'and deg')
     print_table(
         f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
-        f'rms {rms_px(measured.fitted):.4f} px',
+        f'rms {rms_px(measured.inlier_residual):.4f} px',
         header, rows,
     )
     if len(views.frame) > _MAX_TABLE_ROWS:
@@ -132,7 +132,7 @@ def _write(
         {'frame': views.frame, **dict(zip(names, entries, strict=True))},
     )
     write_json(folder / 'localize.json', {
-        'rms_px': rms_px(measured.fitted),
+        'rms_px': rms_px(measured.inlier_residual),
         'frames': len(views.frame),
         'observations': int(used.sum()),
         'left_out': measured.left_out,

@@ -27,7 +27,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, Views, views_of
 from fisheye_svp_ros.solve.localization import Localization
-from fisheye_svp_ros.solve.measured import MeasuredPoses, localize_measured
+from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 _STEP_SIGMAS = 1e-3  # of a standard error

@@ -31,7 +31,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras, localize_frames
-from fisheye_svp_ros.solve.measured import posable_views
+from fisheye_svp_ros.solve.measured_poses import posable_views
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 Progress = Callable[[str, float], None]

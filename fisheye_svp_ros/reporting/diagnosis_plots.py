@@ -18,7 +18,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name
-from fisheye_svp_ros.solve.measured import rms_px
+from fisheye_svp_ros.solve.measured_poses import rms_px
 
 BEFORE, AFTER, NOISE, INK = '#c2410c', '#1d4ed8', '#94a3b8', '#334155'
 _SIDES = (('before', BEFORE), ('after', AFTER))

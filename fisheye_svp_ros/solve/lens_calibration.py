@@ -29,7 +29,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import AdjustedLens, adjust_lens, a
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, select_points
 from fisheye_svp_ros.solve.localization import Localization, localize
-from fisheye_svp_ros.solve.measured import posable_views, rms_px, sigma_known
+from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
 
 MAX_OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are

@@ -10,7 +10,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve import localization
 from fisheye_svp_ros.solve.localization import localize, start_poses
-from fisheye_svp_ros.solve.measured import posable_views
+from fisheye_svp_ros.solve.measured_poses import posable_views
 
 
 @pytest.fixture

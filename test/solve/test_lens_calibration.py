@@ -19,7 +19,7 @@ from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured import localize_measured, posable_views, rms_px
+from fisheye_svp_ros.solve.measured_poses import localize_measured, posable_views, rms_px
 
 OV_PLANE = Path(__file__).resolve().parents[3] / 'shared' / 'data' / 'ov_plane'
 SIZE = (1280, 960)

@@ -20,7 +20,7 @@ from fisheye_svp_ros.solve.initial_pose import (
     initial_poses,
 )
 from fisheye_svp_ros.solve.localization import localize
-from fisheye_svp_ros.solve.measured import localize_measured
+from fisheye_svp_ros.solve.measured_poses import localize_measured
 from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
 from fisheye_svp_ros.study.solutions import localize_sets
 

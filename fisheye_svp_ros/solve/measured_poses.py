@@ -33,7 +33,7 @@ class MeasuredPoses(NamedTuple):
     reasons: tuple[str, ...]
 
     @property
-    def fitted(self) -> Array:
+    def inlier_residual(self) -> Array:
         """Residuals (V, N, 2), px, without those of gross errors."""
         return np.where(self.gross[..., None], np.nan, self.result.residual)
 
