@@ -13,8 +13,8 @@ OUT ?= out
 # Further arguments of pytest, for example PYTEST='-k lens'.
 PYTEST ?=
 # Rooms whose tests start no process, nor diagnose whole sets.
-QUICK := $(patsubst %,test/%,optics scene effects io simulate solve rectify detect study reporting) \
-	$(patsubst %,test/test_%.py,documents library pose registry)
+QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve rectify detect study reporting) \
+	$(patsubst %,test/test_%.py,documents library pose)
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 

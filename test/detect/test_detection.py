@@ -144,6 +144,7 @@ class TestPatterns:
 
 
 class TestCorners:
+    @pytest.mark.slow
     def test_scatter_is_the_stated_sigma(self) -> None:
         pose = poses(3, 1).take(1)
         seen = [find_points(photograph(pose, seed=seed), PATTERN, 'saddle') for seed in range(25)]
@@ -368,6 +369,7 @@ class TestTags:
         why = find_points(flat, pattern, 'aprilgrid')
         assert isinstance(why, str) and 'a border of one cell' in why
 
+    @pytest.mark.slow
     @pytest.mark.parametrize('spec', ['circles:6x5:40mm', 'circles:4x7:40mm:asymmetric'])
     def test_circles(self, spec: str) -> None:
         pattern = parse_pattern(spec)
@@ -435,6 +437,7 @@ class TestPhotographs:
     def detection(cls, folder: Path) -> Detection:
         return found(folder)
 
+    @pytest.mark.slow
     def test_the_odd_ones_are_named_and_the_rest_goes_on(self, detection: Detection) -> None:
         said = reasons(detection)
         assert {name for name, reason in said.items() if not reason} == {
@@ -613,6 +616,7 @@ def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
 
 
 class TestOrder:
+    @pytest.mark.slow
     def test_frames_of_a_symmetric_board_are_turned_alike(self, tmp_path: Path) -> None:
         board = Print(6, 4, 0.030)
         printed = printed_with(0.0003, 5, board)
@@ -630,6 +634,7 @@ class TestOrder:
         sure = detection.certainty[detection.frames >= 0]
         assert sure.min() > 0.8
 
+    @pytest.mark.slow
     def test_a_perfect_board_leaves_the_order_open(self, tmp_path: Path) -> None:
         board = Print(6, 4, 0.030)
         where = poses(8, 6, board)
@@ -639,6 +644,7 @@ class TestOrder:
         # That is said once, not of each photograph, where it would hide what is said of some.
         assert not any(one.notes for one in detection.searched)
 
+    @pytest.mark.slow
     def test_cameras_of_a_rig_have_the_board_in_one_order(self, tmp_path: Path) -> None:
         board = Print(6, 4, 0.030)
         left = poses(12, 6, board)

@@ -42,6 +42,7 @@ def test_errors_that_look_the_same_either_way_hide_nothing(alike):
     assert found.certainty.mean() > 0.95
 
 
+@pytest.mark.slow
 def test_certainty_is_no_more_than_its_share_of_right_ones():
     rng = np.random.default_rng(4)
     for size in (0.0, 0.3, 0.5):

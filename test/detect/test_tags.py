@@ -25,6 +25,7 @@ def aprilgrid(tmp_path: Path) -> Pattern:
     return parse_pattern(f'aprilgrid:{path}')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(('number', 'exposure', 'share'), [
     (0, Exposure(), 0.95), (2, Exposure(noise=6.0), 0.95), (4, Exposure(blur=1.5), 0.85)])
 def test_bent_small_and_noisy_tags(
@@ -50,6 +51,7 @@ def test_corners_without_their_markers() -> None:
     assert np.abs(found.uv - true[found.ids]).max() < 0.1
 
 
+@pytest.mark.slow
 def test_blurred_markers_are_decoded_when_sharpened() -> None:
     pattern = parse_pattern(CHARUCO)
     image, true = pattern_photograph(pattern, 3, Exposure(blur=1.5))
@@ -73,6 +75,7 @@ def test_what_is_hidden_is_not_reached(aprilgrid: Pattern) -> None:
     assert np.abs(found.uv - true[found.ids]).max() < 0.2
 
 
+@pytest.mark.slow
 def test_a_live_board_that_is_half_found_is_not_completed() -> None:
     pattern = parse_pattern(CHARUCO)
     for number, most in ((2, 30), (4, 48)):

@@ -137,6 +137,7 @@ def test_what_a_few_bytes_stand_for_is_not_made_up(recording: Path, change: str)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
 
 
+@pytest.mark.slow
 def test_a_small_file_that_stands_for_gigabytes_is_not_decompressed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

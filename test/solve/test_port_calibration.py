@@ -36,6 +36,7 @@ def test_a_port_is_found_for_a_lens_calibrated_in_air(port):
         AIR, calibration=result.adjusted.lens.calibration, max_incidence=AIR.max_incidence)
 
 
+@pytest.mark.slow
 def test_a_port_is_found_in_front_of_a_lens_with_corrections():
     """As `diagnose` extends a lens in air; what is said of the port's errors is said then, too."""
     tilt = {'parameters': {'about_x': 0.02, 'about_y': -0.01}}

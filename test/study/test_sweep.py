@@ -242,6 +242,7 @@ def test_a_file_that_is_no_sweep_is_refused(
     assert reason in err and err.count('\n') == 1
 
 
+@pytest.mark.slow
 def test_the_result_does_not_depend_on_who_works(
     write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
 ) -> None:
@@ -251,6 +252,7 @@ def test_the_result_does_not_depend_on_who_works(
     assert summary['scenarios'] == summary['metrics']['localizer.rms_px']['solved'] == 5100
 
 
+@pytest.mark.slow
 def test_killed_twice_and_resumed_it_is_the_same_file(
     write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
 ) -> None:
@@ -295,6 +297,7 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     assert 'holds this sweep already' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group('engines')
 def test_it_goes_on_with_the_engine_that_it_was_begun_with(
     write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
@@ -319,6 +322,7 @@ def test_a_worker_that_dies_is_named(write: Callable[[str], Path], tmp_path: Pat
     assert parts_in(out) >= 1
 
 
+@pytest.mark.slow
 def test_workers_that_die_while_they_send_results_are_named(
     write: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -375,6 +379,7 @@ class TestDask:
         ) as cluster:
             yield cluster
 
+    @pytest.mark.slow
     def test_the_same_rows_though_a_worker_is_killed(
         self, cluster: Any, write: Callable[[str], Path], tmp_path: Path, undisturbed: Path
     ) -> None:
