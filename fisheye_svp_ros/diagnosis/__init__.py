@@ -70,7 +70,6 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     Structure,
-    stage_of,
     stage_shares,
 )
 
@@ -138,7 +137,6 @@ __all__ = [
     'rig_lenses',
     'rms_px',
     'simplest_form',
-    'stage_of',
     'stage_shares',
     'standard_errors',
     'with_covariance',

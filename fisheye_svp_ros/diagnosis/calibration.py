@@ -23,7 +23,6 @@ from fisheye_svp_ros.diagnosis.outliers import (
     without_points,
 )
 from fisheye_svp_ros.diagnosis.uncertainty import total_errors
-from fisheye_svp_ros.diagnosis.variance_budget import stage_of
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names, parameter_values
@@ -149,7 +148,7 @@ def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
     own = null.included
     columns, prior = [own], [np.zeros(null.own)]
     for form, effect in enumerate(null.fixed.forms.effects):
-        if stage_of(effect.name) == 'target':
+        if effect.budget_stage() == 'target':
             columns.append(null.form_columns(form))
             prior.append(null.prior_precision(columns[-1], effect))
     every, information = np.concatenate(columns), null.information

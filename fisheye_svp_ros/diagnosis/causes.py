@@ -14,7 +14,6 @@ from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.diagnosis.outliers import NoiseGrowth, Outliers
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_entry
 
@@ -41,6 +40,11 @@ class Cause:
     gain: float
     indistinguishable_from: list[str]
     to_separate: str
+
+    @property
+    def kind(self) -> type[Effect]:
+        """The class of the effect, which says what it is."""
+        return CATALOGUE[self.effect]
 
 
 def selected_causes(
@@ -79,7 +83,7 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
 
 def _confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
     """Return the effects with which in the model this one would no longer be needed."""
-    if name == LandmarkSurveyEffect.name:
+    if CATALOGUE[name].asked_last:
         return []
     rest = np.setdiff1d(tests.null.included, columns)
     strength = tests.score_beside(rest, columns).statistic

@@ -394,10 +394,8 @@ def _remaining(
     remaining = remaining_structure(
         EffectTests(selection.null), evaluation.fitted, components, stated)
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
-    if 'quantisation' in {cause.effect for cause in noise_causes}:
-        # Values on a lattice depend on the place within a pixel by themselves.
-        remaining = [one for one in remaining if one.variable != 'pixel_phase']
-    return remaining
+    hidden = {name for cause in noise_causes for name in cause.kind.hidden_structure}
+    return [one for one in remaining if one.variable not in hidden]
 
 
 def extended_lenses(

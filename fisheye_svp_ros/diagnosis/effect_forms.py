@@ -15,7 +15,6 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
 from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
@@ -77,7 +76,7 @@ def _catalogue_effects(
         except Untestable as why:
             untestable[name] = str(why)
             continue
-        if name == LandmarkSurveyEffect.name:
+        if kind.asked_last:
             continue  # single landmarks are asked last, all at once
         for own in by_lens:
             effects += own

@@ -42,9 +42,9 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     cause_squares,
     component_significance,
     noise_px,
-    stage_of,
     variance_budget,
 )
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -239,7 +239,7 @@ class Evaluation:
 
     @property
     def _not_of_lens(self) -> list[str]:
-        return [name for name in self.names if stage_of(name) != 'lens']
+        return [name for name in self.names if CATALOGUE[name].budget_stage() != 'lens']
 
     @property
     def _noise_square(self) -> float:

@@ -21,7 +21,7 @@ from fisheye_svp_ros.diagnosis.outliers import (
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.quantisation import QuantisationEffect
 from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
 from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
 from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
@@ -50,7 +50,8 @@ _EXPLAINED_RATIO = 1.1  # times that rms, if an effect of a rig is all that move
 
 def can_be_included(name: str) -> bool:
     """Whether an effect can be fitted without a test: not those of noise, or single landmarks."""
-    return CATALOGUE[name].stage != 'noise' and name != LandmarkSurveyEffect.name
+    kind = CATALOGUE[name]
+    return kind.stage != 'noise' and not kind.asked_last
 
 
 @dataclass(frozen=True)
@@ -156,8 +157,7 @@ class Problem:
         step, options = quantization_step(inputs.observations.uv), inputs.options
         rms = rms_px(Linearization(data, base, inputs.free))
         if step / np.sqrt(6) > _STEP_OVER_NOISE * rms:
-            # Values on a lattice repeat with the pixel by themselves.
-            options = options.without('detector_bias')
+            options = options.without(*QuantisationEffect.hides)
         else:
             step = 0.0
         return cls(inputs, table, data, outliers, base, inputs.free, options, step)

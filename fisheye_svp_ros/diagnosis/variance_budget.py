@@ -32,9 +32,6 @@ from fisheye_svp_ros.mixed_model import (
 
 REPEATED = 'frame_similar'
 STAGES = ('lens', 'target', 'frame', 'noise')
-_OF_FRAMES = {'focal_drift', 'session_step', 'rolling_shutter', 'stereo_time_offset', 'rig_flex',
-              'dot_centroid', 'detector_bias'}
-_OF_STAGE = {'target': 'target', 'noise': 'noise'}
 _VARIABLE_OF = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
 _SIGMA_TOLERANCE = 1.2  # a stated sigma is an estimate, too: of a detector, or of a person
 _MIN_FREEDOM = 200  # numbers beyond the poses' own: of fewer no test of structure says anything
@@ -53,13 +50,6 @@ class Component(NamedTuple):
     share: float
     named_share: float
     p_value: float
-
-
-def stage_of(effect: str) -> str:
-    """Return the stage of the budget that an effect belongs to."""
-    if effect in _OF_FRAMES:
-        return 'frame'
-    return _OF_STAGE.get(CATALOGUE[effect].stage, 'lens')
 
 
 def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, float]:
@@ -123,7 +113,7 @@ def variance_budget(
     traces = component_traces(null.full, variances)
     parts: list[tuple[str, str, float, bool, float]] = []
     for stage in STAGES[:3]:
-        there = [name for name in squares if stage_of(name) == stage]
+        there = [name for name in squares if CATALOGUE[name].budget_stage() == stage]
         if there:
             size = sum(squares[name] for name in there)
             parts.append((f'named_{stage}', stage, size, True, min(p_values[n] for n in there)))

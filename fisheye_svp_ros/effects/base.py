@@ -121,6 +121,9 @@ class Effect(ABC):
     abrupt: ClassVar[bool] = False  # whether what changes smoothly is no sign of it
     asked_after: ClassVar[tuple[str, ...]] = ()  # more common ones that it does, too, and more
     of_frames: ClassVar[bool] = False  # whether its size hangs on how each frame was taken
+    asked_last: ClassVar[bool] = False  # whether what it is of stands out only beside all others
+    hides: ClassVar[tuple[str, ...]] = ()  # effects that cannot be told from it where it is
+    hidden_structure: ClassVar[tuple[str, ...]] = ()  # variables on which residuals depend by it
     # How its displacements of landmarks are shown: 'smooth' over boards, 'single' ones; or not
     target_map: ClassVar[str] = ''
     when_untestable: ClassVar[str] = ''  # what to do where frames differ and it cannot be tested

@@ -24,6 +24,7 @@ class LandmarkSurveyEffect(Effect):
     name = 'landmark_survey'
     stage = 'target'
     target_map = 'single'
+    asked_last = True
     signature = 'residuals of one landmark that point to the same place in space from every view'
     to_separate = 'measure the named landmarks again, by other means or from other sides'
 

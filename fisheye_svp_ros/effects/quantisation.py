@@ -15,6 +15,9 @@ class QuantisationEffect(NoiseEffect):
     """u and v are whole multiples of a step."""
 
     name = 'quantisation'
+    # Values on a lattice repeat with the place within a pixel by themselves.
+    hides = ('detector_bias',)
+    hidden_structure = ('pixel_phase',)
     signature = 'every image point is a multiple of one step'
     to_separate = 'store the image points with more digits, or refine to sub-pixel'
 

@@ -26,7 +26,6 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import MIN_SHARED_FRAMES, Progress, is_unpaired
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
-from fisheye_svp_ros.diagnosis.variance_budget import stage_of
 from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.effects.of_cameras import camera_terms
 from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_similarity
@@ -77,7 +76,7 @@ class Transfer:
 def moves_with_lens(term: Term) -> bool:
     """Whether an effect moves with the lens, from one recording and target to the next."""
     effect = term[0]
-    return effect.stage != 'noise' and not effect.of_recording and stage_of(effect.name) == 'lens'
+    return effect.budget_stage() == 'lens' and not effect.of_recording
 
 
 def displaces_landmarks(term: Term) -> bool:
