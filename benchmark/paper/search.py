@@ -84,7 +84,7 @@ def lens_with(lens: Lens, numbers: Array) -> Lens:
 
 
 class _TableFit:
-    """One system of 76 unknowns, see least_squares.Problem.
+    """One system of 76 unknowns, see least_squares.LeastSquares.
 
     Unknowns: of each landmark its angle from -z (rad) times cosine and sine of its azimuth, which
     is regular on the axis; of each lens its numbers over `_SCALE`.

@@ -201,7 +201,7 @@ def _write(
     wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.diagnosis import point_residuals
-    from fisheye_svp_ros.reporting.diagnosis_report import Inputs, write_report
+    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
 
     folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
@@ -216,7 +216,7 @@ def _write(
         cameras, rig = diagnosis.rig
         save_rig(rig, folder / 'rig.yaml', cameras)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations)
-    write_report(diagnosis, points, known, Inputs(
+    write_report(diagnosis, points, known, ReportInputs(
         args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free,
         search_options(args) if args.board else (),
     ), wanted)

@@ -161,7 +161,7 @@ def _holding(after: Linearization, number: str) -> Effect:
     raise ParameterError(f'--for {number}: no number of the lens or of an effect has this name')
 
 
-class Plan(NamedTuple):
+class PhotographPlan(NamedTuple):
     """Wanted photographs, and the standard errors of the lens to expect from them, by name."""
 
     wanted: NextViews
@@ -170,7 +170,7 @@ class Plan(NamedTuple):
 
 def plan(
     lens: Lens, points: Array, room: ViewLimits, count: int, number: str | None, noise: float
-) -> Plan:
+) -> PhotographPlan:
     """Choose photographs of a board with points (N, 3), m, z into the board.
 
     number: whose error is to be small, the whole lens by default; a viewpoint shift is left open.
@@ -191,7 +191,7 @@ def plan(
     chosen, answers = design.choose(question, count)
     information = design.known + design.added[chosen].sum(axis=0)
     errors = np.sqrt(np.diag(np.linalg.inv(information)))
-    return Plan(
+    return PhotographPlan(
         next_views(design, number or 'lens', (), question, chosen, answers),
         {name.rpartition('.')[2]: float(error)
          for name, error in zip(design.names, errors, strict=True)},

@@ -54,7 +54,7 @@ _BAR = 220  # px of a share of 1
 _ROWS = 24
 
 
-class Inputs(NamedTuple):
+class ReportInputs(NamedTuple):
     """What was diagnosed, as the user named it; folder: where the report goes.
 
     search: options of a command that finds the board in the photographs, where these are some.
@@ -70,7 +70,8 @@ class Inputs(NamedTuple):
 
 
 def write_report(
-    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Comparison], inputs: Inputs,
+    diagnosis: Diagnosis, points: PointResiduals, known: Mapping[str, Comparison],
+    inputs: ReportInputs,
     wanted: NextViews | None = None,
 ) -> list[Path]:
     """Write report.html and its pictures into a folder; return the files.
@@ -102,7 +103,7 @@ def write_report(
     return [report, *pictures]
 
 
-def _extended(diagnosis: Diagnosis, inputs: Inputs) -> dict[str, str]:
+def _extended(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
     """Return what commands need to go on: the observations, the extended lenses, the first one."""
     files = {camera: inputs.folder / camera / text.EXTENDED for camera in diagnosis.lenses}
     options = [word for camera, path in files.items()
@@ -147,7 +148,7 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
         yield from ((title, m) for m in diagnosis.board_maps(names) if m.spread_out)
 
 
-def _free(inputs: Inputs) -> str:
+def _free(inputs: ReportInputs) -> str:
     free = {'poses': not inputs.poses, 'intrinsics': inputs.free_intrinsics}
     return text.listed([name for name, fitted in free.items() if fitted]) or 'nothing'
 

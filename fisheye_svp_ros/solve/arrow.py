@@ -46,7 +46,7 @@ def arrow_of_views(
 
     cost (S, V); hessian (S, V, B + K, B + K), gradient (S, V, B + K): `block` = B columns of the
     view's own, then those that all views share.  Returns the costs (S,) and the fields of
-    ArrowEquations, as `least_squares.Problem.linearise` does.
+    ArrowEquations, as `least_squares.LeastSquares.linearise` does.
     """
     equations = ArrowEquations(
         hessian[..., :block, :block],
@@ -59,7 +59,7 @@ def arrow_of_views(
 
 
 def arrow_step(normal: Arrays, damping: Array) -> tuple[Arrays, Array]:
-    """Solve (H + damping diag H) d = -g: `least_squares.Problem.step`; damping (S,).
+    """Solve (H + damping diag H) d = -g: `least_squares.LeastSquares.step`; damping (S,).
 
     Returns ((block steps (S, V, B), shared steps (S, K)), |J d|^2 (S,)).  A parameter that nothing
     depends on stays where it is.

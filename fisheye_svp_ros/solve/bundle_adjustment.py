@@ -182,7 +182,7 @@ def adjust_lens_from(
 
 
 class _Adjustment:
-    """S arrow systems, see least_squares.Problem: frames are blocks, all else is shared."""
+    """S arrow systems, see least_squares.LeastSquares: frames are blocks, all else is shared."""
 
     step = staticmethod(arrow_step)
 

@@ -26,7 +26,7 @@ _FLOOR = 1e-15  # keeps an exactly singular system solvable; far below any data'
 _STALL_TOLERANCE = 1e-6
 
 
-class Problem(Protocol):
+class LeastSquares(Protocol):
     """S independent least-squares systems; `index` (A,) says which of them are asked for.
 
     States, normal equations and steps are tuples of arrays whose leading axis is the system.
@@ -56,7 +56,7 @@ class Minimum(NamedTuple):
 
 
 def levenberg_marquardt(
-    problem: Problem, start: Arrays, max_iterations: int = MAX_ITERATIONS
+    problem: LeastSquares, start: Arrays, max_iterations: int = MAX_ITERATIONS
 ) -> Minimum:
     """Minimise every system from its own start, with a damping of its own.
 

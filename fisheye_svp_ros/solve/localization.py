@@ -188,7 +188,7 @@ def _covariance(hessian: Array) -> tuple[Array, Mask]:
 
 
 class _Localization:
-    """S systems of one pose each, see least_squares.Problem."""
+    """S systems of one pose each, see least_squares.LeastSquares."""
 
     step = staticmethod(dense_step)
 

@@ -87,7 +87,7 @@ def _solve_rigs(
 
 
 class _Rigs:
-    """S systems of one rig and V poses each, see least_squares.Problem.
+    """S systems of one rig and V poses each, see least_squares.LeastSquares.
 
     The state is (rotation, position) of the right camera (S, V) and of the rig (S,).
     """

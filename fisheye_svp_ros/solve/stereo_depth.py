@@ -189,8 +189,8 @@ class _Pairs:
 class _Curve:
     """M searches along rays for the inverse distance seen nearest to an image point.
 
-    The state is the inverse distance (M, 1), 1/m; see least_squares.Problem.  column_only: the
-    distance in u alone counts.
+    The state is the inverse distance (M, 1), 1/m; see least_squares.LeastSquares.  column_only:
+    the distance in u alone counts.
     """
 
     step = staticmethod(dense_step)
@@ -227,7 +227,7 @@ class _Curve:
 
 
 class _Depth:
-    """M points seen by both cameras; the state is (points (M, 3),), see least_squares.Problem."""
+    """M points seen by both cameras, see least_squares.LeastSquares; the state: (M, 3)."""
 
     step = staticmethod(dense_step)
 

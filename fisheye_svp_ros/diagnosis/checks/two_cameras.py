@@ -124,7 +124,7 @@ def displace_target(data: RigViews, known: KnownTarget, moved: Array) -> RigView
     return replace(data, views=data.views._replace(points=points))
 
 
-class Maps(NamedTuple):
+class TargetMaps(NamedTuple):
     """Two maps of one target.
 
     landmarks: how many are in both; correlation, correlation_along: of the displacements off their
@@ -150,7 +150,7 @@ class TwoCameras:
 
     cameras: tuple[str, str]
     target: tuple[Transfer, ...]
-    maps: Maps | None
+    maps: TargetMaps | None
     rig: dict[str, Comparison]
     withdrawn: tuple[str, ...] = ()
     posed_alone: bool = False
@@ -266,7 +266,7 @@ def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
                       _scatter((one.data, other.data), poses))
 
 
-def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> Maps | None:
+def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None:
     """Compare what two cameras found of the target, by the landmarks that both saw."""
     if one.target is None or other.target is None:
         return None
@@ -280,7 +280,7 @@ def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> Maps | None:
         [np.concatenate([getattr(board, name).ravel() for board in shared.maps(moved[both])])
          for moved in (one.target, other.target)] for name in ('height', 'slide')
     )
-    return Maps(int(both.sum()), _correlation(*off), _correlation(*along),
+    return TargetMaps(int(both.sum()), _correlation(*off), _correlation(*along),
                 (float(np.sqrt((off[0]**2).mean())), float(np.sqrt((off[1]**2).mean()))))
 
 
