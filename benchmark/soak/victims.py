@@ -67,7 +67,7 @@ class Wire:
     def hear(self, topic: str, kind: Any) -> deque[Any]:
         """Return a queue that fills with the messages of a topic."""
         heard: deque[Any] = deque()
-        self.node.create_subscription(kind, topic, heard.append, _ALL)
+        self.node.create_subscription(kind, topic, lambda one: heard.append(one), _ALL)
         return heard
 
 
