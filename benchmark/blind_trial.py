@@ -273,22 +273,22 @@ def _recovered(case: Case, found: Diagnosis) -> float | None:
         return None
     moves = np.where(case.scene.seen[..., None], case.exact - case.ideal, 0.0)
     truth = LinearScene(case.scene, case.ideal, held_out=True).pose_rms(case.given - moves)
-    before, after = found.base.heldout_rms_px, found.extended.heldout_rms_px
+    before, after = found.figures.base.heldout_rms_px, found.figures.extended.heldout_rms_px
     return float((before**2 - after**2) / (before**2 - truth**2))
 
 
 def _null_p_values(found: Diagnosis, free: bool) -> dict[str, float]:
     """Return the p-value of the simplest form of each effect beside the null model."""
-    linear = found.before
+    linear = found.simulation
     names = intrinsic_names(linear.state.lens) if free else ()
-    null = NullModel.fit(linear.data, linear.state, names)
-    tests, left = EffectTests(null), eliminate(null.information, null.included)
+    null = NullModel.estimate(linear.data, linear.state, names)
+    tests, left = EffectTests(null), eliminate(null.information, null.included_columns)
     values: dict[str, float] = {}
     for form, effect in enumerate(null.fixed.forms.effects):
         if effect.name in values:
             continue  # the simplest form stands first
         columns = null.form_columns(form)
-        result = tests.adjust_p_value(tests.score(left, columns), null.included, columns)
+        result = tests.adjust_p_value(tests.score(left, columns), null.included_columns, columns)
         wrong = [
             value < 0 for value, parameter in zip(result.estimate, effect.parameters, strict=True)
             if parameter.positive

@@ -139,7 +139,7 @@ def diagnosed(train: Observations, size: tuple[int, int]) -> Diagnosis:
 
 def against_truth(lens: Lens, test: Observations, poses: Pose) -> Array:
     """Return errors of poses over their standard deviations (F, levels, 6), by a lens file."""
-    found, parts = localize_with_errors(LensErrors.of(lens), test)
+    found, parts = localize_with_errors(LensErrors.from_lens(lens), test)
     return _pulls(found.result.pose.difference(poses.take(found.views.frame)), parts)
 
 
@@ -153,7 +153,7 @@ def of_a_rig(cameras: Sequence[Simulated], lenses: Sequence[Lens]) -> Array:
         uv.append(camera.see(pose.into_body(points)) + NOISE * rng.normal(size=(POINTS, 2)))
     models = [ForwardModel(lens) for lens in lenses]
     found = triangulate_optimally(models[0], models[1], RIG, uv[0], uv[1]).points
-    errors = [LensErrors.of(lens) for lens in lenses]
+    errors = [LensErrors.from_lens(lens) for lens in lenses]
     parts = depth_errors(errors[0], errors[1], RIG, found)
     known = np.isfinite(found).all(axis=1)
     return _pulls((found - points)[known], ErrorParts(*(part[known] for part in parts)))
@@ -172,15 +172,15 @@ def pulls_of(found: Diagnosis, test: Observations) -> Array:
     Poses from the left and the right half of the points, and from the upper and the lower one.
     """
     data = group_by_frame(test)
-    state = localize_frames(data, found.after.state)
-    linear, pulls = Linearization(data, state, found.after.free), []
+    state = localize_frames(data, found.model.state)
+    linear, pulls = Linearization(data, state, found.model.free), []
     for axis in (0, 1):
         middle = np.array([np.median(v[w > 0]) for v, w in zip(
             data.views.uv[..., axis], data.views.weight, strict=True)])
         first = data.views.uv[..., axis] < middle[:, None]
         sides = [side(data, state, mask) for mask in (first, ~first)]
         difference = sides[0][0].pose.difference(sides[1][0].pose)
-        pulls.append(_pulls(difference, found.errors.through(linear, sides[0][1] - sides[1][1])))
+        pulls.append(_pulls(difference, found.errors.propagate(linear, sides[0][1] - sides[1][1])))
     return np.concatenate(pulls)
 
 

@@ -288,7 +288,8 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
     return {
         'kind': kind, 'seed': seed, 'seconds': round(process_time() - began, 1),
         'causes': [cause.form for cause in found.causes], 'verdict': found.verdict,
-        'heldout_rms_px': [found.base.heldout_rms_px, found.extended.heldout_rms_px],
+        'heldout_rms_px': [quality.heldout_rms_px for quality in (
+            found.figures.base, found.figures.extended)],
         'external': said.to_dict(), 'reachable': reachable(seen, KINDS[kind]),
     }
 

@@ -144,7 +144,7 @@ def run_trial(number: int, rough: bool = False, air: bool = False) -> Outcome:
     }
     return Outcome(number, kind, free, index, float(distance), float(np.hypot(*tilt)),
                    float(thickness), noise, rough, air, [c.effect for c in found.causes], values,
-                   found.named.rms_px, found.named.heldout_rms_px)
+                   found.figures.named.rms_px, found.figures.named.heldout_rms_px)
 
 
 def _lens(rng: np.random.Generator) -> Lens:

@@ -262,7 +262,7 @@ def localize(
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors, localize_with_errors
 
-        measured, _ = localize_with_errors(LensErrors.of(known), table)
+        measured, _ = localize_with_errors(LensErrors.from_lens(known), table)
     else:
         measured = localize_measured(ForwardModel(known), table)
     views, result, fitted = measured.views, measured.result, measured.inlier_residual
@@ -342,7 +342,7 @@ def stereo_depth(
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
 
-        errors = [LensErrors.of(load_lens(lens)) for lens in (left, right)]
+        errors = [LensErrors.from_lens(load_lens(lens)) for lens in (left, right)]
         covariance = depth_errors(errors[0], errors[1], rig, solved.points).total
     return StereoDepth(frame[both], one.landmark[both], solved.points, solved.gap,
                        epipolar_offset(*known).distance, covariance)

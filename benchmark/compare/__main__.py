@@ -103,14 +103,15 @@ def compared(data: Set) -> list[Row]:
     fair = np.array([place not in gross for place in places])
     start = fsvp.localize(data.test, lens)
     count, names = int(fair.sum()), ', '.join(cause.effect for cause in found.causes)
+    figures = found.figures
     return [
-        Row('ours, `calibrate`', found.base.heldout_rms_px, _nominal(lens, data.test, start),
+        Row('ours, `calibrate`', figures.base.heldout_rms_px, _nominal(lens, data.test, start),
             count, fitting.seconds, ours=True),
-        Row('ours, `diagnose`: lens', found.lens_only.heldout_rms_px, np.nan, count,
+        Row('ours, `diagnose`: lens', figures.lens_only.heldout_rms_px, np.nan, count,
             naming.seconds, names, True),
-        Row('ours, `diagnose`: named', found.named.heldout_rms_px, _whole(found, data.test),
+        Row('ours, `diagnose`: named', figures.named.heldout_rms_px, _whole(found, data.test),
             count, np.nan, ours=True),
-        Row('ours, `diagnose`: extended', found.extended.heldout_rms_px,
+        Row('ours, `diagnose`: extended', figures.extended.heldout_rms_px,
             _whole(found, data.test, found.offsets), count, np.nan, ours=True),
         *(_row(name, data, fair, start, lens.fx) for name in PEERS),
     ]
@@ -123,9 +124,9 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
 
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
     """Return the rms of all held-out points, gross errors among them."""
-    data, known = group_by_frame(test), found.after.data.observations.t
-    terms = tuple(e for e in found.after.state.terms if e[0].holds_for(test.t, known))
-    solved = localize_frames(data, replace(found.after.state, terms=terms))
+    data, known = group_by_frame(test), found.model.data.observations.t
+    terms = tuple(e for e in found.model.state.terms if e[0].holds_for(test.t, known))
+    solved = localize_frames(data, replace(found.model.state, terms=terms))
     return predict_other_data(data, solved, local).rms
 
 

@@ -102,7 +102,7 @@ def _evidence(count: int) -> Callable[[], Any]:
     data = group_by_frame(_seen(30))
     state = adjust(data, initial_state(data, shift_lens().svp()), ())
     left_out = list(CATALOGUE)[count:]
-    return lambda: NullModel.fit(data, state, (), left_out=left_out)
+    return lambda: NullModel.estimate(data, state, (), left_out=left_out)
 
 
 def _diagnosis(count: int) -> Callable[[], Any]:

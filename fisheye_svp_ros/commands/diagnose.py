@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
             else:
                 diagnosis = diagnose_against(observations, other, lens, **settings)
             progress('errors where the truth is known', 0.88)
-            known = known_errors(diagnosis.before, diagnosis.after, names)
+            known = known_errors(diagnosis.simulation, diagnosis.model, names)
         except (GeometryError, np.linalg.LinAlgError) as cause:
             poses_too = (f' Or are the poses of {args.poses} not those of the camera in the world?'
                          if args.poses else '')
@@ -133,7 +133,7 @@ def _plan_next_views(
 
     room = None if args.room is None else view_limits(args.room)
     try:
-        return next_photographs(diagnosis.after, diagnosis.causes, diagnosis.noise_px, args.count,
+        return next_photographs(diagnosis.model, diagnosis.causes, diagnosis.noise_px, args.count,
                                 args.number, room), None
     except FisheyeSvpError as why:
         return None, why
@@ -180,7 +180,7 @@ def _print(
     if diagnosis.causes:
         print_table(
             f'{diagnosis.observations} points in {diagnosis.frames} frames, held-out rms '
-            f'{diagnosis.base.heldout_rms_px:.4f} px without any cause',
+            f'{diagnosis.figures.base.heldout_rms_px:.4f} px without any cause',
             text.CAUSE_HEADER, text.cause_rows(diagnosis), words=text.CAUSE_WORDS,
         )
     for one in external:
@@ -204,7 +204,7 @@ def _write(
     from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
 
-    folder, points = args.output, point_residuals(diagnosis.before, diagnosis.after)
+    folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.model)
     truth = {name: compared.to_dict() for name, compared in known.items()}
     document = {**diagnosis.to_dict(), 'known_truth': truth}
     if wanted:
@@ -215,7 +215,7 @@ def _write(
     if diagnosis.rig:
         cameras, rig = diagnosis.rig
         save_rig(rig, folder / 'rig.yaml', cameras)
-    _write_residuals(folder / 'residuals.csv', points, diagnosis.after.data.observations)
+    _write_residuals(folder / 'residuals.csv', points, diagnosis.model.data.observations)
     write_report(diagnosis, points, known, ReportInputs(
         args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free,
         search_options(args) if args.board else (),

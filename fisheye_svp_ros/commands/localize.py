@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
                     pose_summary,
                 )
 
-                measured, parts = localize_with_errors(LensErrors.of(lens), table)
+                measured, parts = localize_with_errors(LensErrors.from_lens(lens), table)
                 uncertainty = pose_summary(parts)
             else:
                 measured = localize_measured(model, table)

@@ -85,7 +85,7 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
     """Return what to do about held-out frames that are no measure of a model."""
     test = evaluation.held_out
     if test is None:
-        alone = _frame_numbers(evaluation)[~evaluation.predicted]
+        alone = _frame_numbers(evaluation)[~evaluation.counted_frames]
         return [_about_frames(
             evaluation.null.linear.data.observations,
             'take more photographs like these: the others do not predict them, since they '

@@ -111,7 +111,7 @@ def assess_lens(observations: Observations, lens: Lens, names: Sequence[str]) ->
     names: the parameters that were fitted.
     """
     data = group_by_frame(observations)
-    null = NullModel.fit(data, adjust(data, initial_state(data, lens), names), names)
+    null = NullModel.estimate(data, adjust(data, initial_state(data, lens), names), names)
     # What else the lens has, its corrections, is fitted along and follows them.
     errors = total_errors(null)[: len(names)]
     stderr = {name: float(error) for name, error in zip(names, errors, strict=True)}
@@ -145,8 +145,8 @@ def _free_target(null: NullModel, count: int) -> tuple[Array, Array]:
 
     count: of these, the first of what is in the model.
     """
-    own = null.included
-    columns, prior = [own], [np.zeros(null.own)]
+    own = null.included_columns
+    columns, prior = [own], [np.zeros(null.column_count)]
     for form, effect in enumerate(null.fixed.forms.effects):
         if effect.budget_stage() == 'target':
             columns.append(null.form_columns(form))
@@ -180,13 +180,13 @@ class InAir:
     covariance: Array
 
     @classmethod
-    def of(cls, lens: Lens) -> InAir | None:
+    def from_lens(cls, lens: Lens) -> InAir | None:
         """Return what a lens file from `calibrate` or `diagnose` tells; None if it is nothing.
 
         Raises LensError for half of it, or what cannot be.
         """
         if lens.uncertainty is not None:
-            errors = LensErrors.of(lens)
+            errors = LensErrors.from_lens(lens)
             known, whole = errors.model.names, errors.model.covariance
         elif (said := lens.calibration or {}).get('covariance') is None:
             return None
@@ -289,7 +289,7 @@ def stated_parameters(lenses: Mapping[str, Lens]) -> dict[str, tuple[float, floa
     """Return the parameters of lenses as given, each with the error that its file states."""
     stated = {}
     for camera, lens in lenses.items():
-        air = InAir.of(lens)
+        air = InAir.from_lens(lens)
         errors = {} if air is None else dict(
             zip(air.names, np.sqrt(np.diag(air.covariance)).tolist(), strict=True))
         for name, value in lens.parameters.items():

@@ -62,7 +62,7 @@ def selected_causes(
         }
         causes.append(Cause(
             name, effect.key, parameters,
-            tests.test_removal(tests.null.included, columns, effect).p_value,
+            tests.test_removal(tests.null.included_columns, columns, effect).p_value,
             shares[name], _survives(tests, effect, columns), rms, gain,
             _confounded_effects(tests, name, columns), effect.to_separate,
         ))
@@ -73,7 +73,7 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     """Whether an effect is needed whichever one other cause is left out."""
     factor = tests.effect_count
     for _, other, _ in tests.null.terms:
-        included = np.setdiff1d(tests.null.included, other)
+        included = np.setdiff1d(tests.null.included_columns, other)
         if not np.array_equal(other, columns) and (
             tests.test_removal(included, columns, effect).p_value * factor > SIGNIFICANCE
         ):
@@ -85,9 +85,9 @@ def _confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[s
     """Return the effects with which in the model this one would no longer be needed."""
     if CATALOGUE[name].asked_last:
         return []
-    rest = np.setdiff1d(tests.null.included, columns)
+    rest = np.setdiff1d(tests.null.included_columns, columns)
     strength = tests.score_beside(rest, columns).statistic
-    known = tests.null.kinds
+    known = tests.null.effect_kinds
     same: list[str] = []
     for other in tests.candidates(rest):
         if known & set(other.effect.kinds) or other.effect.name in (name, *same):
@@ -114,7 +114,7 @@ def plain_cause(
 def table_causes(observations: Observations, outliers: Outliers, step: float) -> list[Cause]:
     """Return causes in the table: wrong ids, and rounding to a step (px; 0 for none)."""
     causes = []
-    swapped = outliers.swapped
+    swapped = outliers.swap_count
     # One of many outliers is chance.
     if swapped > 1 or 2 * swapped >= len(outliers.rows) > 0:
         fraction = swapped / len(observations)

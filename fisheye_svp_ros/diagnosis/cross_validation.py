@@ -39,7 +39,7 @@ class HeldOut(NamedTuple):
         return float(self.rms_of(np.arange(len(self.squares))))
 
     @property
-    def predicted(self) -> Mask:
+    def is_predictable(self) -> Mask:
         """Which frames (F,) are not far worse than most: those show what no other frame does."""
         size = np.sqrt(self.squares / self.counts)
         return np.asarray(size <= _PREDICTED_RATIO * np.median(size))
@@ -133,7 +133,8 @@ def predict_other_data(
     data = test if offsets is None else offsets.apply(test)
     fitted = adjust_poses(data, plain)
     if offsets is not None and offsets.views is not None:
-        repeating = offsets.views.at(Linearization(data, replace(fitted, terms=state.terms), ()))
+        linear = Linearization(data, replace(fitted, terms=state.terms), ())
+        repeating = offsets.views.predict(linear)
         data = replace(data, views=data.views._replace(uv=data.views.uv - repeating))
         fitted = adjust_poses(data, fitted)
     linear = Linearization(data, fitted, ())
@@ -147,7 +148,7 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
     """
     linear = null.linear
     kept, change, _ = _refit_shared(null, null.information, names, ())
-    shared = np.zeros(null.own)
+    shared = np.zeros(null.column_count)
     shared[kept] = change
     moves = (linear.shared_columns @ shared)[linear.row_mask] / linear.row_weight[linear.row_mask]
     if np.sqrt(2 * np.mean(moves**2)) > _LINEAR_PX:
@@ -166,8 +167,8 @@ def _refit_shared(
     alone.  names: causes that are gone; held: causes that stay as they are.  The last is the
     combination of the border that is the residual then.
     """
-    gone = np.zeros(null.own, dtype=bool)
-    values = np.zeros(null.own)
+    gone = np.zeros(null.column_count, dtype=bool)
+    values = np.zeros(null.column_count)
     for effect, columns, value in null.terms:
         if effect.name in names:
             gone[columns], values[columns] = True, value
@@ -176,7 +177,8 @@ def _refit_shared(
     combination = np.zeros(len(information))
     combination[-1] = 1.0
     # Without an effect its displacement comes back into the residual.
-    combination[: null.own] += np.where(gone, values * null.scale[: null.own], 0.0)
+    scale = null.scale[: null.column_count]
+    combination[: null.column_count] += np.where(gone, values * scale, 0.0)
     kept = np.flatnonzero(~gone)
     inverse, _ = pseudo_inverse(information[np.ix_(kept, kept)], 1e-13)
     change = inverse @ (information[kept] @ combination)
@@ -197,8 +199,9 @@ def cross_validate(
     residual = np.zeros_like(linear.residual)
     repeating = np.zeros_like(residual)
     if offsets is not None and offsets.views is not None:
-        repeating = linear.data.blocks(offsets.views.own * linear.data.views.weight[..., None])
-    at = null.columns_and_residual(null.included)
+        weight = linear.data.views.weight[..., None]
+        repeating = linear.data.blocks(offsets.views.cross_predictions * weight)
+    at = null.columns_and_residual(null.included_columns)
     for frame, information in enumerate(null.information_without_frames(at)):
         _, _, combination = _refit_shared(null, information, without, held)
         rows = null.fixed.border if offsets is None else null.leave_one_out.rows

@@ -39,7 +39,7 @@ from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.stepwise import TraceStep
 from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors
 from fisheye_svp_ros.diagnosis.variance_budget import (
-    REPEATED,
+    REPEATED_COMPONENT,
     Component,
     Structure,
     add_outliers,
@@ -120,37 +120,12 @@ class Diagnosis:
     @property
     def frames(self) -> int:
         """How many frames there are."""
-        return self.after.data.frames
+        return self.model.data.frames
 
     @property
     def observations(self) -> int:
         """How many observations there are."""
         return len(self.problem.observations)
-
-    @property
-    def base(self) -> FitQuality:
-        """The simulation as it was fitted."""
-        return self.figures.base
-
-    @property
-    def named(self) -> FitQuality:
-        """All causes, without random effects."""
-        return self.figures.named
-
-    @property
-    def lens_only(self) -> FitQuality:
-        """Only what moves with the lens."""
-        return self.figures.lens_only
-
-    @property
-    def extended(self) -> FitQuality:
-        """Causes and predicted random effects."""
-        return self.figures.extended
-
-    @property
-    def gain(self) -> Comparison:
-        """Of the best prediction over the simulation, held out."""
-        return self.figures.gain
 
     @property
     def intrinsics(self) -> dict[str, Intrinsic]:
@@ -178,12 +153,12 @@ class Diagnosis:
         return self.record.gross
 
     @property
-    def before(self) -> Linearization:
+    def simulation(self) -> Linearization:
         """The simulation as it was fitted, for whoever draws it."""
-        return self.evaluation.before
+        return self.evaluation.simulation
 
     @property
-    def after(self) -> Linearization:
+    def model(self) -> Linearization:
         """The extended model, for whoever draws it."""
         return self.evaluation.null.linear
 
@@ -215,7 +190,7 @@ class Diagnosis:
     @property
     def rig(self) -> tuple[tuple[str, str], Pose] | None:
         """The two cameras of a rig and the first in the second, by the extended lenses."""
-        data, rig = self.after.data, self.after.state.rig
+        data, rig = self.model.data, self.model.state.rig
         names = rig_cameras(data.observations.cameras)
         if names is None or has_no_rig(data):
             return None
@@ -224,20 +199,21 @@ class Diagnosis:
 
     def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
         """Return how the target differs from what it is said to be; names: by these effects."""
-        state = self.after.state
+        state = self.model.state
         terms = [term for term in state.terms if not names or term[0].name in names]
-        return board_maps(self.after.data.views, terms, state.lens)
+        return board_maps(self.model.data.views, terms, state.lens)
 
     @property
     def scatter_px(self) -> float:
         """Standard deviation of noise and what repeats in similar views, of one coordinate, px."""
-        parts = [part.sd_px for part in self.components if part.name in ('noise', REPEATED)]
+        parts = [part.sd_px for part in self.components
+                 if part.name in ('noise', REPEATED_COMPONENT)]
         return float(np.hypot.reduce(parts))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds (design, section 7)."""
 
-        def plain(fit: FitQuality) -> dict[str, Any]:
+        def entry(fit: FitQuality) -> dict[str, Any]:
             return {name: value for name, value in asdict(fit).items() if value is not None}
 
         external: dict[str, Any] = {}
@@ -250,17 +226,17 @@ class Diagnosis:
             'noise_px': self.noise_px,
             'frames': self.frames,
             'observations': self.observations,
-            'base': plain(self.base),
+            'base': entry(self.figures.base),
             'components': [part._asdict() for part in self.components],
             'causes': [asdict(cause) for cause in self.causes],
-            'named': plain(self.named),
-            'lens': plain(self.lens_only),
-            'extended': plain(self.extended),
+            'named': entry(self.figures.named),
+            'lens': entry(self.figures.lens_only),
+            'extended': entry(self.figures.extended),
             'gross': self.gross,
             'advice': [asdict(advice) for advice in self.advice],
             'remaining': {'structure': [s._asdict() for s in self.remaining]},
             'untestable': [{'effect': e, 'why': why} for e, why in self.untestable.items()],
-            'gain': self.gain.interval,
+            'gain': self.figures.gain.interval,
             'intrinsics': {name: asdict(value) for name, value in self.intrinsics.items()},
             'uncertainty': self.uncertainty,
             'trace': [asdict(step) for step in self.trace],
@@ -322,11 +298,11 @@ def diagnose_against(
     found = diagnose_one(observations, options, 0.0, 0.35, **settings)
     second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
     progress('asking each set what it says of the other', 0.7)
-    models = [DatasetModel(one.before, one.evaluation.null) for one in (found, second)]
+    models = [DatasetModel(one.simulation, one.evaluation.null) for one in (found, second)]
     datasets = compare_datasets(models[0], models[1], observations.source, other.source)
-    gone = tuple(name for name in datasets.refuted if name not in options.included)
+    gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
     if gone:
-        found = diagnose_one(observations, options.without(*gone), 0.7, 0.85,
+        found = diagnose_one(observations, options.leave_out(*gone), 0.7, 0.85,
                              'without what the other set refutes: ', **settings)
         datasets = replace(datasets, withdrawn=gone)
     return replace(found, record=found.record._replace(against=datasets))
@@ -335,7 +311,7 @@ def diagnose_against(
 def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     """Take checked inputs through all stages."""
     progress('fitting the simulation as it is', 0.0)
-    problem = Problem.of(inputs)
+    problem = Problem.prepare(inputs)
     medium = find_medium(problem, progress)
     if medium is not None:
         problem = behind_port(problem, medium)
@@ -346,7 +322,8 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
         selection = select_causes(behind_port(problem, medium), progress)
     selection, cameras = agree_on_target(selection, progress)
     progress('measuring the gain on held-out data', 0.8)
-    evaluation = Evaluation.of(selection, FittedModel.of(selection.null), medium)
+    fitted = FittedModel.solve_null_model(selection.null)
+    evaluation = Evaluation.of_selection(selection, fitted, medium)
     return _conclude(evaluation, cameras)
 
 
@@ -365,7 +342,8 @@ def _conclude(evaluation: Evaluation, cameras: list[TwoCameras]) -> Diagnosis:
         lambda state: extended_lenses(problem.inputs.lenses, state, observations))
     return Diagnosis(
         evaluation,
-        Figures(evaluation.base, evaluation.named, evaluation.lens_only, evaluation.extended,
+        Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,
+                evaluation.extended_quality,
                 evaluation.gain),
         components, causes, _remaining(evaluation, noise_causes, significant),
         advise(evaluation, causes, significant), lenses,

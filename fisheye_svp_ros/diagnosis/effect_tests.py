@@ -82,7 +82,7 @@ class EffectTests:
     def untestable(self) -> dict[str, str]:
         """Effects that the data cannot test, and why."""
         forms = self.null.fixed.forms
-        remaining = eliminate(self.null.information, self.null.included)
+        remaining = eliminate(self.null.information, self.null.included_columns)
         ranks: dict[str, int] = {}
         for form, effect in enumerate(forms.effects):
             rank = self.score(remaining, self.null.form_columns(form)).rank
@@ -164,7 +164,7 @@ class EffectTests:
         if covariance is None or not score.rank:
             return score
         combination = _direction(null, score.estimate * null.scale[columns], included, columns)
-        freedom = satterthwaite_freedom(null.factored, combination, covariance)
+        freedom = satterthwaite_freedom(null.factorization, combination, covariance)
         p = float(special.fdtrc(score.rank, freedom, max(score.statistic, 0.0) / score.rank))
         if p < _DOUBTFUL_P and (
             score.statistic < _CERTAIN_STATISTIC or (effect and effect.abrupt)
@@ -235,7 +235,7 @@ def random_gain(null: NullModel, included: Index, columns: Index) -> float:
         rest = null.remaining_information(information, included)
         return logs + count * float(np.log(rest[-1, -1]))
 
-    parts: list[FactoredEquations] = [null.factored, *null.frame_alternatives]
+    parts: list[FactoredEquations] = [null.factorization, *null.frame_alternatives]
     return min(cost(f.log_determinant, f.information) for f in parts) - min(
         cost(*integrate_columns(f, columns, 1 / size)) for f in parts for size in _TURN_SIZES)
 
@@ -275,7 +275,7 @@ def _alternatives(null: NullModel, effect: Effect | None) -> Iterator[Alternativ
 
 def _direction(null: NullModel, estimate: Array, included: Index, columns: Index) -> Array:
     """Return the combination (X + 1,) of the border along an estimate, what is included out."""
-    info = null.factored.information
+    info = null.factorization.information
     inverse, _ = pseudo_inverse(info[np.ix_(included, included)])
     combination = np.zeros(len(info))
     combination[columns] = estimate
@@ -293,7 +293,7 @@ def _cluster_p_value(
     Source: Liang and Zeger, Longitudinal data analysis using generalized linear models,
     Biometrika 73 (1986).
     """
-    info, both = null.factored.information, np.concatenate([included, columns])
+    info, both = null.factorization.information, np.concatenate([included, columns])
     residual = null.residual_combination(included)
     inverse, _ = pseudo_inverse(info[np.ix_(both, both)])
     residual[both] -= inverse @ (info[both] @ residual)
@@ -312,11 +312,11 @@ def _border_rows(null: NullModel, combination: Array, residual: Array) -> Array:
 
     Of the second all but what landmarks have of their own.
     """
-    f, eq = null.factored, null.equations
+    f, eq = null.factorization, null.equations
     parts = [eq.split(*f.coefficients(one)) for one in (combination, residual)]
     frame, landmark, shared = (np.stack(both, axis=-1) for both in zip(*parts, strict=True))
     landmark[..., 1] = 0.0
     pose = null.linear.frame_columns / eq.group_scale[:, None]
-    random = predict_rows(null.called_for.columns, pose, frame, landmark, shared, eq.units)
+    random = predict_rows(null.active_effects.columns, pose, frame, landmark, shared, eq.units)
     rows = null.fixed.border @ np.stack([combination, residual], axis=-1)
     return np.moveaxis(rows - random, -1, 0)

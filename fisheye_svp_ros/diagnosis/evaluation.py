@@ -92,7 +92,7 @@ class HeldOutData:
     another_target: bool
 
     @classmethod
-    def of(cls, held_out: Observations, selection: Selection) -> HeldOutData:
+    def prepare(cls, held_out: Observations, selection: Selection) -> HeldOutData:
         """Pose other frames by the extended model, and set outliers aside.
 
         These are no measure of a model; the same points are left out for all.
@@ -138,7 +138,9 @@ class Evaluation:
     medium: Medium | None
 
     @classmethod
-    def of(cls, selection: Selection, fitted: FittedModel, medium: Medium | None) -> Evaluation:
+    def of_selection(
+        cls, selection: Selection, fitted: FittedModel, medium: Medium | None
+    ) -> Evaluation:
         """Evaluate a selection; fitted: of its null model."""
         views = similar_views(fitted.linear, fitted.residuals())
         offsets = fitted.predicted_offsets()._replace(views=views)
@@ -146,7 +148,7 @@ class Evaluation:
         if views is not None:
             noise *= float(np.sqrt(1 - views.share))
         held_out = selection.problem.inputs.held_out
-        test = None if held_out is None else HeldOutData.of(held_out, selection)
+        test = None if held_out is None else HeldOutData.prepare(held_out, selection)
         return cls(selection, fitted, offsets, noise, test, medium)
 
     @property
@@ -167,7 +169,7 @@ class Evaluation:
     @cached_property
     def model_errors(self) -> ModelErrors:
         """What is known of the errors of the extended model."""
-        return ModelErrors.of(self.null, self.fitted)
+        return ModelErrors.from_null_model(self.null, self.fitted)
 
     @cached_property
     def uncertainty(self) -> dict[str, dict[str, float]]:
@@ -189,7 +191,7 @@ class Evaluation:
         """Predict held-out frames without some causes, with or without random effects."""
         test, selection = self.held_out, self.selection
         if test is None:
-            return cross_validate(self.null, without, offsets).take(self.predicted)
+            return cross_validate(self.null, without, offsets).take(self.counted_frames)
         if set(without) >= set(self.names):
             state = selection.problem.base
         elif without:
@@ -203,11 +205,11 @@ class Evaluation:
             test.data, replace(state, pose=test.pose, rig=selection.state.rig), offsets)
 
     @cached_property
-    def predicted(self) -> Mask:
+    def counted_frames(self) -> Mask:
         """Which frames (F,) count where each is left out in turn: what any model predicts."""
         with_causes, without = (
             cross_validate(self.null, gone) for gone in ((), self.names))
-        return with_causes.predicted | without.predicted
+        return with_causes.is_predictable | without.is_predictable
 
     @cached_property
     def _base_prediction(self) -> HeldOut:
@@ -218,7 +220,7 @@ class Evaluation:
         if self.medium is None:
             return self._base_prediction
         if self.held_out is None:
-            return self.medium.cross_validate().take(self.predicted)
+            return self.medium.cross_validate().take(self.counted_frames)
         return predict_other_data(
             self.held_out.data, replace(self.medium.air.state, pose=self.held_out.pose))
 
@@ -248,25 +250,25 @@ class Evaluation:
         return 1.0 if stated else self.null.variances.sigma**2
 
     @property
-    def before(self) -> Linearization:
+    def simulation(self) -> Linearization:
         """The simulation as it was fitted."""
         return self.selection.problem.linear if self.medium is None else self.medium.air
 
     @cached_property
-    def base(self) -> FitQuality:
+    def base_quality(self) -> FitQuality:
         """The simulation as it was fitted."""
-        linear, full = self.before, self.null.full
+        linear, full = self.simulation, self.null.full
         freedom = full.rows - full.group_rank - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
         return FitQuality(rms_px(linear), self._given_prediction.rms, chi2)
 
     @cached_property
-    def named(self) -> FitQuality:
+    def named_quality(self) -> FitQuality:
         """All causes, without random effects."""
         return FitQuality(rms_px(self.null.linear), self._cause_predictions[-1].rms)
 
     @cached_property
-    def lens_only(self) -> FitQuality:
+    def lens_quality(self) -> FitQuality:
         """Only what moves with the lens, fitted without the rest."""
         linear = self.selection.problem.linear
         if set(self._not_of_lens) < set(self.names):
@@ -276,7 +278,7 @@ class Evaluation:
         return FitQuality(rms_px(linear), self._lens_prediction.rms)
 
     @cached_property
-    def extended(self) -> FitQuality:
+    def extended_quality(self) -> FitQuality:
         """Causes and predicted random effects."""
         residuals = self.fitted.residuals()
         chi2 = float((residuals**2).sum()) / self._noise_square / self.null.full.rows
@@ -325,7 +327,7 @@ class Evaluation:
         """Return the variance budget; noise_causes: p-values of causes in the noise."""
         null, tests = self.null, EffectTests(self.null)
         p_values = component_significance(null) | {
-            effect.name: tests.test_removal(null.included, columns, effect).p_value
+            effect.name: tests.test_removal(null.included_columns, columns, effect).p_value
             for effect, columns, _ in self.selection.causes} | dict(noise_causes)
         parts = variance_budget(null, self._squares, p_values, self.offsets.views)
         return parts if self.medium is None else self.medium.budget(parts)
@@ -358,4 +360,4 @@ class Evaluation:
 
 def _count_rig_columns(null: NullModel, free: Sequence[str]) -> int:
     """Return how many of what is shared come before what was free from the start."""
-    return null.own - len(free) - sum(len(values) for _, _, values in null.terms)
+    return null.column_count - len(free) - sum(len(values) for _, _, values in null.terms)

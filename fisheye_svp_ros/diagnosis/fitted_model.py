@@ -39,7 +39,7 @@ from fisheye_svp_ros.mixed_model import (
 from fisheye_svp_ros.solve.bundle_adjustment import gauss_newton
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
-_CONVERGED = 3e-3  # of the noise: what a step moves predictions by
+_STEP_TOLERANCE = 3e-3  # of the noise: what a step moves predictions by
 _MIN_MODE, _MAX_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _PROBES = 24
 _PAIR_REACH = 80  # of the image: how near to each other points have the same place
@@ -49,11 +49,12 @@ _MIN_PAIRS = 100
 class RepeatedErrors(Protocol):
     """What landmarks err by alike in similar views, see `checks.similar_views`.
 
-    own (S, N, 2): in each view, predicted from the others, px; share: of what noise seemed to be.
+    cross_predictions (S, N, 2): in each view, predicted from the others, px; share: of what noise
+    seemed to be.
     """
 
     @property
-    def own(self) -> Array: ...
+    def cross_predictions(self) -> Array: ...
 
     @property
     def share(self) -> float: ...
@@ -64,7 +65,7 @@ class RepeatedErrors(Protocol):
     @property
     def lasting(self) -> float: ...
 
-    def at(self, linear: Linearization) -> Array: ...
+    def predict(self, linear: Linearization) -> Array: ...
 
 
 class PredictedOffsets(NamedTuple):
@@ -112,11 +113,11 @@ class FittedModel:
     scale: Array
 
     @classmethod
-    def of(cls, null: NullModel) -> FittedModel:
+    def solve_null_model(cls, null: NullModel) -> FittedModel:
         """Solve the mixed-model equations of a null model for what is in the model."""
-        eq = null.equations.with_fixed(np.eye(len(null.scale), null.own))
+        eq = null.equations.combine_columns(np.eye(len(null.scale), null.column_count))
         return cls._solve(
-            null.linear, null.called_for, eq, null.variances, null.scale[: null.own])
+            null.linear, null.active_effects, eq, null.variances, null.scale[: null.column_count])
 
     @classmethod
     def of_state(cls, linear: Linearization, variances: Variances) -> FittedModel:
@@ -282,7 +283,7 @@ def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Varia
         e, r, values = (part[..., 0] for part in fitted.solve_rows(residual[..., None]))
         return eq.split(e, r)[0][:, :6] / eq.group_scale, values / fitted.scale
 
-    return gauss_newton(fitted.linear, solve, _CONVERGED * variances.sigma)
+    return gauss_newton(fitted.linear, solve, _STEP_TOLERANCE * variances.sigma)
 
 
 def rms_px(linear: Linearization, whitened: Array | None = None) -> float:

@@ -111,7 +111,7 @@ class LensErrors:
     model: ModelErrors
 
     @classmethod
-    def of(cls, lens: Lens) -> LensErrors:
+    def from_lens(cls, lens: Lens) -> LensErrors:
         """Return what a lens carries; raise LensError for one that carries nothing, or half."""
         entry = lens.uncertainty
         if entry is None:
@@ -143,25 +143,27 @@ class LensErrors:
             raise LensError(f'lens {lens.name!r}: uncertainty holds a number that cannot be')
         return found
 
-    def allowing(self, sigma: Array | float) -> Array | float:
+    def inflate_sigma(self, sigma: Array | float) -> Array | float:
         """Return sigma (...), px, of image points by this lens: noise and what remains."""
         return np.hypot(sigma, self.misfit)
 
     def of_poses(self, views: Views, pose: Pose) -> ErrorParts:
         """Return covariances (S, 6, 6), m and rad, of poses, for noise of 1 / weight."""
-        linear = self.linearised(views, pose)
-        return self.model.through(linear, pose_maps(linear.frame_columns))
+        linear = self.linearize(views, pose)
+        return self.model.propagate(linear, pose_maps(linear.frame_columns))
 
-    def of_solved(self, views: Views, solved: Localization, sigma: float | None) -> ErrorParts:
+    def of_solved_poses(
+        self, views: Views, solved: Localization, sigma: float | None
+    ) -> ErrorParts:
         """Return covariances (S, 6, 6), m and rad, of the change in `Pose.retract` of poses.
 
         sigma: noise that was estimated with weights of 1, px, in whose place that of the lens is
-        taken; None where weights are 1 / `allowing(sigma)`.  A pose whose misfit the solver found
-        to be more than it may be is so much more uncertain.
+        taken; None where weights are 1 / `inflate_sigma(sigma)`.  A pose whose misfit the solver
+        found to be more than it may be is so much more uncertain.
         """
-        linear = self.linearised(views, solved.pose)
+        linear = self.linearize(views, solved.pose)
         maps = pose_maps(linear.frame_columns)
-        parts = self.model.through(linear, maps)
+        parts = self.model.propagate(linear, maps)
         excess = np.trace(solved.covariance, axis1=1, axis2=2)
         excess = excess / np.trace(parts.noise, axis1=1, axis2=2) / (sigma or 1.0) ** 2
         if sigma is None:
@@ -172,7 +174,7 @@ class LensErrors:
         parts = parts._replace(noise=(maps * of_noise[:, None]) @ np.swapaxes(maps, -1, -2))
         return ErrorParts(*(part * excess[:, None, None] for part in parts))
 
-    def linearised(self, views: Views, pose: Pose) -> Linearization:
+    def linearize(self, views: Views, pose: Pose) -> Linearization:
         """Linearise views of this lens, with the numbers that are uncertain free."""
         model = ForwardModel(self.lens)
         views, terms = model.labelled(views), model.terms_for(views)
@@ -189,10 +191,10 @@ def localize_with_errors(
 
     Raises ObservationError and GeometryError as `localize_measured` does.
     """
-    allowed = replace(observations, sigma=np.asarray(errors.allowing(observations.sigma)))
+    allowed = replace(observations, sigma=np.asarray(errors.inflate_sigma(observations.sigma)))
     found = localize_measured(ForwardModel(errors.lens), allowed)
     kept = found.views._replace(weight=np.where(found.gross, 0.0, found.views.weight))
-    parts = errors.of_solved(kept, found.result, found.sigma)
+    parts = errors.of_solved_poses(kept, found.result, found.sigma)
     return found._replace(result=found.result._replace(covariance=parts.total)), parts
 
 
@@ -205,7 +207,7 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
     found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
     for rows in _split_rows(np.flatnonzero(np.isfinite(points).all(axis=1))):
         views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
-        pairs = [(errors, errors.linearised(views, pose)) for errors, pose in (
+        pairs = [(errors, errors.linearize(views, pose)) for errors, pose in (
             (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
         by = [linear.whiten(linear.linear.d_target) / errors.noise for errors, linear in pairs]
         seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
@@ -215,7 +217,7 @@ def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) 
         information[~seen] = np.eye(3)
         for (errors, linear), one in zip(pairs, by, strict=True):
             maps = np.linalg.solve(information * errors.noise, np.swapaxes(one, -1, -2))
-            parts = errors.model.through(linear, np.asarray(maps))
+            parts = errors.model.propagate(linear, np.asarray(maps))
             parts = parts._replace(noise=parts.noise * errors.noise**2)
             for whole, part in zip(found, parts, strict=True):
                 whole[rows] = np.nan_to_num(whole[rows]) + part

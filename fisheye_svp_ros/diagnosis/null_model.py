@@ -76,7 +76,7 @@ class FixedColumns:
     roughness: Array
 
     @classmethod
-    def of(cls, linear: Linearization, left_out: Sequence[str]) -> FixedColumns:
+    def gather(cls, linear: Linearization, left_out: Sequence[str]) -> FixedColumns:
         """Return the columns of a linearized state, without the effects left out."""
         forms = effect_forms(linear, left_out)
         fields, (walks, roughness) = smooth_fields(linear), intrinsic_walks(linear)
@@ -107,7 +107,7 @@ class NullModel:
     variances: Variances
 
     @classmethod
-    def fit(
+    def estimate(
         cls, data: RigViews, state: RigState, free: Sequence[str], before: Variances | None = None,
         left_out: Sequence[str] = (), finest: bool = False,
     ) -> NullModel:
@@ -140,7 +140,7 @@ class NullModel:
     ) -> NullModel:
         """Return the model before any variance is known; alive: its components, None for all."""
         linear = Linearization(data, state, free)
-        fixed, random = FixedColumns.of(linear, left_out), make_random_effects(linear, finest)
+        fixed, random = FixedColumns.gather(linear, left_out), make_random_effects(linear, finest)
         if alive is not None:
             random = random.select(alive)
         full = make_equations(random.columns, linear.frame_columns, fixed.border)
@@ -165,21 +165,21 @@ class NullModel:
     def _all_free(self) -> Equations:
         """Return the equations with what is in the model and the whole catalogue free."""
         generic = self.fixed.own + self.fixed.forms.generic
-        return self.equations_of(np.concatenate([self.included, generic]))
+        return self.equations_of(np.concatenate([self.included_columns, generic]))
 
     def equations_of(self, chosen: Index) -> Equations:
         """Return the equations of all components with chosen columns as their whole border."""
         columns = self.fixed.border[..., :-1]
-        return self.full.with_fixed(
+        return self.full.combine_columns(
             identifiable_basis(self.linear.frame_columns, columns, chosen))
 
     @property
-    def own(self) -> int:
+    def column_count(self) -> int:
         """How many of the fixed columns are in the model."""
         return self.fixed.own
 
     @property
-    def included(self) -> Index:
+    def included_columns(self) -> Index:
         """The fixed columns in the model."""
         return np.arange(self.fixed.own)
 
@@ -191,7 +191,7 @@ class NullModel:
     @property
     def freedom(self) -> int:
         """Numbers in the residual less all fixed coefficients."""
-        return self.full.rows - self.full.group_rank - self.own
+        return self.full.rows - self.full.group_rank - self.column_count
 
     @cached_property
     def equations(self) -> Equations:
@@ -199,25 +199,25 @@ class NullModel:
         return self.full.select(self.variances.alive)
 
     @cached_property
-    def called_for(self) -> RandomEffects:
+    def active_effects(self) -> RandomEffects:
         """The random effects that have a variance."""
         return self.random.select(self.variances.alive)
 
     @cached_property
-    def factored(self) -> FactoredEquations:
+    def factorization(self) -> FactoredEquations:
         """The equations of the components that have a variance, factored."""
         return factor_equations(self.equations, self.variances.lam, self.variances.weight)
 
     @cached_property
     def information(self) -> Array:
         """Information (X + 1, X + 1) of the border, its last row and column the score."""
-        return self.factored.information / self.variances.sigma**2
+        return self.factorization.information / self.variances.sigma**2
 
     @cached_property
     def leave_one_out(self) -> LeaveOneOut:
         """Each frame, seen from all the others."""
-        return leave_groups_out(self.factored, self.called_for.columns, self.linear.frame_columns,
-                                self.fixed.border)
+        return leave_groups_out(self.factorization, self.active_effects.columns,
+                                self.linear.frame_columns, self.fixed.border)
 
     def information_without_frames(self, at: Index) -> Array:
         """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
@@ -228,7 +228,7 @@ class NullModel:
     def terms(self) -> list[PlacedEffect]:
         """Each effect in the model, its columns among what is shared, and its values."""
         terms = [t for t in self.linear.state.terms if t[0].stage != 'noise']
-        start = self.own - sum(len(values) for _, values in terms)
+        start = self.column_count - sum(len(values) for _, values in terms)
         placed = []
         for effect, values in terms:
             placed.append((effect, np.arange(start, start + len(values)), values))
@@ -236,13 +236,13 @@ class NullModel:
         return placed
 
     @property
-    def kinds(self) -> set[str]:
+    def effect_kinds(self) -> set[str]:
         """Names of the effects in the model, for each camera of a rig that has one for itself."""
         return {kind for effect, _ in self.linear.state.terms for kind in effect.kinds}
 
     def form_columns(self, form: int) -> Index:
         """Return the border's columns of a form."""
-        return self.fixed.forms.at[form] + self.own
+        return self.fixed.forms.at[form] + self.column_count
 
     def prior_precision(self, columns: Index, effect: Effect) -> Array:
         """Return precisions (P,) of an effect's normalized columns: it is hardly beyond large."""
@@ -251,7 +251,7 @@ class NullModel:
 
     def columns_and_residual(self, columns: Index) -> Index:
         """Return what is in the model, further columns and, last, the residual of the border."""
-        return np.unique(np.concatenate([self.included, columns, [len(self.scale)]]))
+        return np.unique(np.concatenate([self.included_columns, columns, [len(self.scale)]]))
 
     def residual_combination(self, included: Index) -> Array:
         """Return the combination (X + 1,) of the border that is the residual with only these.
@@ -288,7 +288,7 @@ class NullModel:
     def field_alternatives(self) -> list[Alternative]:
         """This model, and the same with smooth image fields of several sizes."""
         kind = NAMES.index('image_broad')
-        alternatives = [(self.factored.log_determinant, self.factored.information)]
+        alternatives = [(self.factorization.log_determinant, self.factorization.information)]
         own = initial_variances(self.full, 1.0).lam[kind]
         if own >= LAMBDA_ABSENT:
             return alternatives
@@ -305,7 +305,8 @@ class NullModel:
     @cached_property
     def walk_alternatives(self) -> list[Alternative]:
         """The same with smooth walks of the intrinsics of several sizes."""
-        return [integrate_columns(self.factored, self.fixed.walks, self.fixed.roughness / size)
+        fixed = self.fixed
+        return [integrate_columns(self.factorization, fixed.walks, fixed.roughness / size)
                 for size in _WALK_SIZES]
 
     @cached_property
@@ -315,7 +316,7 @@ class NullModel:
         Beside the whole catalogue its effects that change with time take a part of them.
         """
         lam = np.where(_OF_FRAMES, LAMBDA_ABSENT, self.variances.lam)
-        eq = self.equations_of(self.included)
+        eq = self.equations_of(self.included_columns)
         start = np.where(_OF_FRAMES, initial_variances(eq).lam, self.variances.lam)
         anew, _ = estimate_variances(eq, replace(self.variances, lam=start), _FRAME_STEPS)
         without, estimated = (

@@ -22,8 +22,8 @@ _SWAP_SIGMAS = 6.0  # and within which it belongs to another one
 _SWAP_CHANCE = 0.01  # that so many do by chance
 _SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
 _REINSTATED_SIGMAS = 4.0  # and below this one is like all others
-SWAPPED = 'it lies where another landmark is predicted'
-FAR = 'far from its prediction'
+SWAPPED_POINT = 'it lies where another landmark is predicted'
+FAR_POINT = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
 FRAME = ('its cameras contradict each other: points in another order, another moment, or cameras '
          'exchanged')
@@ -32,7 +32,7 @@ _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
 _MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority
 _OUTLIER_PROBABILITY = 0.005  # probability of one such point among clean ones
 _CAUCHY_SCALE = 2.0
-_CONVERGED = 0.1  # of the scale: how little predictions may move
+_STEP_TOLERANCE = 0.1  # of the scale: how little predictions may move
 _UNSEEN_PX = 1e9  # px, for points out of the field of view: further off than any other
 _MIN_RESIDUAL_PX = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN_NORM = 1.1774  # of the norm of two standard normal coordinates
@@ -57,9 +57,9 @@ class Outliers(NamedTuple):
         return self.join(Outliers(rows, px, (why,) * len(rows)))
 
     @property
-    def swapped(self) -> int:
+    def swap_count(self) -> int:
         """How many lie where another landmark is predicted."""
-        return self.why.count(SWAPPED)
+        return self.why.count(SWAPPED_POINT)
 
 
 NO_OUTLIERS = Outliers(np.zeros(0, dtype=np.int64), np.zeros(0), ())
@@ -94,7 +94,7 @@ def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
     offset, outliers = offset * _relative_sigma(views), NO_OUTLIERS
-    for mask, px, why in ((swapped, offset, SWAPPED), (far & ~swapped, offset, FAR),
+    for mask, px, why in ((swapped, offset, SWAPPED_POINT), (far & ~swapped, offset, FAR_POINT),
                           (views.used & whole[:, None], offset, VIEW),
                           (views.used & torn[:, None], apart, FRAME)):
         outliers = outliers.append(views.row[mask], px[mask], why)
@@ -122,7 +122,7 @@ def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Arr
         scale, offset = _robust_scale(views, prediction_distances(model, pose, views) / sigma)
         with np.errstate(invalid='ignore'):  # what is out of sight stays so
             change = np.nanmax(np.abs(offset - before) / scale)
-        if change < _CONVERGED:
+        if change < _STEP_TOLERANCE:
             break
     return pose, pose, scale, offset
 
@@ -198,7 +198,7 @@ def reject_outliers(
     off = np.bincount(views.landmark[mask], minlength=len(every))
     mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
     px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
-    return without_points(data, mask), outliers.append(views.row[mask], px[mask], FAR)
+    return without_points(data, mask), outliers.append(views.row[mask], px[mask], FAR_POINT)
 
 
 def reinstate_outliers(

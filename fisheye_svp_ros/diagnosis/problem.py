@@ -41,7 +41,7 @@ MIN_SHARED_FRAMES = 5  # of two cameras: of fewer, others hardly predict one by 
 MAX_RIG_RATIO = 2.0  # times the rms that each camera has by itself: they do not stand still
 _OUTSIDE_SHARE = 0.02  # of the points of a camera: more than single outliers
 _COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
-_SAME_PLACE = 1e-3  # of a target's extent: more than places that are written less exactly
+_PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are written less exactly
 _MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
 _STEP_OVER_NOISE = 0.1  # a step this small beside the noise is how numbers are written
 _UNRELATED_SHARE = 0.05  # of the image, by which half of the views contradict a rig: none is there
@@ -65,7 +65,7 @@ class DiagnosisOptions:
     left_out: tuple[str, ...] = ()
     quick: bool = False
 
-    def without(self, *names: str) -> DiagnosisOptions:
+    def leave_out(self, *names: str) -> DiagnosisOptions:
         """Return the options with more effects left out."""
         return replace(self, left_out=(*self.left_out, *names))
 
@@ -105,7 +105,7 @@ class Inputs:
         observations, _ = remove_copies(observations)
         observations.landmarks()  # each is in one place
         if poses is not None:
-            observations = right_first(observations)
+            observations = put_right_camera_first(observations)
         check_cameras(observations)
         lenses = rig_lenses(observations, lens)
         free = free_parameters(lenses, free_intrinsics)
@@ -137,7 +137,7 @@ class Problem:
     step: float
 
     @classmethod
-    def of(cls, inputs: Inputs) -> Problem:
+    def prepare(cls, inputs: Inputs) -> Problem:
         """Localize, reject outliers, and fit the simulation.
 
         Cameras that no rig explains are posed each by itself.
@@ -157,7 +157,7 @@ class Problem:
         step, options = quantization_step(inputs.observations.uv), inputs.options
         rms = rms_px(Linearization(data, base, inputs.free))
         if step / np.sqrt(6) > _STEP_OVER_NOISE * rms:
-            options = options.without(*QuantisationEffect.hides)
+            options = options.leave_out(*QuantisationEffect.hides)
         else:
             step = 0.0
         return cls(inputs, table, data, outliers, base, inputs.free, options, step)
@@ -206,7 +206,7 @@ def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations
     return replace(table, cameras=cameras, camera=order[table.camera])
 
 
-def right_first(table: Observations) -> Observations:
+def put_right_camera_first(table: Observations) -> Observations:
     """Return observations of a rig with its right camera first: true poses are of that one."""
     names = rig_cameras(table.cameras)
     if names is None or len(np.unique(table.camera)) < 2:
@@ -228,7 +228,7 @@ def is_another_target(observations: Observations, other: Observations) -> bool:
     one, there = observations.landmarks(), other.landmarks()
     _, mine, theirs = np.intersect1d(one.ids, there.ids, return_indices=True)
     apart = np.abs(one.points[mine] - there.points[theirs])
-    return bool(apart.max(initial=0.0) > _SAME_PLACE * np.ptp(one.points, axis=0).max())
+    return bool(apart.max(initial=0.0) > _PLACE_TOLERANCE * np.ptp(one.points, axis=0).max())
 
 
 def dither(table: Observations) -> Observations:

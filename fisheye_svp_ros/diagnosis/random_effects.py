@@ -101,14 +101,14 @@ class ColumnGeometry(NamedTuple):
     alone: Array
 
     @classmethod
-    def of(
+    def measure(
         cls, linear: Linearization, finest: float, modes: Array, alone: Array
     ) -> ColumnGeometry:
         """Return that of a linearised state; modes, alone: see above."""
         views = linear.data.views
         used = views.used
         landmark, first = np.unique(views.landmark[used], return_index=True)
-        return cls(GatheredPoints.of(linear).extents, finest, landmark,
+        return cls(GatheredPoints.gather(linear).extents, finest, landmark,
                    views.board[used][first], views.points[used][first], modes, alone)
 
 
@@ -137,7 +137,9 @@ class GatheredPoints(NamedTuple):
     at: Array
 
     @classmethod
-    def of(cls, linear: Linearization, geometry: ColumnGeometry | None = None) -> GatheredPoints:
+    def gather(
+        cls, linear: Linearization, geometry: ColumnGeometry | None = None
+    ) -> GatheredPoints:
         """Gather the points of a linearised state; geometry: None for its own."""
         data, views = linear.data, linear.data.views
 
@@ -198,7 +200,7 @@ def make_random_effects(
     geometry: of the data that the variances are of, None for these; with it every component has
     its columns, and what stays with a target those views alone that show it.
     """
-    points = GatheredPoints.of(linear, geometry)
+    points = GatheredPoints.gather(linear, geometry)
     frame, label = _frame_columns(points, geometry is None)
     static = list(_image_grids(points, finest) if geometry is None else
                   _complete_grids(points, geometry.finest))

@@ -98,25 +98,25 @@ class _Search:
     trace: tuple[TraceStep, ...]
     refits_left: int
 
-    def fit(self, problem: Problem) -> NullModel:
-        return NullModel.fit(self.data, self.state, problem.free, self.variances,
+    def estimate_null_model(self, problem: Problem) -> NullModel:
+        return NullModel.estimate(self.data, self.state, problem.free, self.variances,
                              problem.options.left_out, self.finest)
 
     @property
-    def removed(self) -> set[str]:
+    def removed_effects(self) -> set[str]:
         """The effects that were given up: they are not asked for again."""
-        return {step.name for step in self.trace if step.removed}
+        return {step.name for step in self.trace if step.is_removal}
 
 
 def select_causes(problem: Problem, progress: Progress) -> Selection:
     """Add causes to a fitted state until none is left that is significant and predicts better."""
-    search = _Search(problem.data, _with_included(problem), None, None, False, (),
+    search = _Search(problem.data, _include_effects(problem), None, None, False, (),
                      1 if problem.options.quick else _MAX_ROUNDS)
     first: NullModel | None = None
     for turn in range(_MAX_ROUNDS):
         progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}',
                  0.8 - 0.75 * _PROGRESS_DECAY**turn)
-        null = search.fit(problem)
+        null = search.estimate_null_model(problem)
         first, before = first or null, replace(search, variances=null.variances)
         search = _change_effects(problem, before, null, _max_effects(null, turn))
         if search.state is before.state:
@@ -139,7 +139,7 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
     tests, options = EffectTests(null), problem.options
     included, steps = eliminate_effects(tests, _known_effects(problem), options.quick)
     search = replace(search, trace=(*search.trace, *steps))
-    choice = add_effects(tests, included, most, search.removed, options.quick)
+    choice = add_effects(tests, included, most, search.removed_effects, options.quick)
     search = replace(search, trace=(*search.trace, *choice.trace))
     gone = [step.name for step in steps]
     if gone or choice.forms:
@@ -161,7 +161,7 @@ def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
     """Revise outliers and noise once the causes are known, and ask for the finest image field."""
     if problem.options.quick or (search.revision and search.finest):
         return search
-    fitted = FittedModel.of(null)
+    fitted = FittedModel.solve_null_model(null)
     if search.revision is None:
         search = _revise_outliers(problem, search, fitted)
     if not search.finest and fitted.place_correlation() > _FIELD_TEST_SIGMAS:
@@ -209,7 +209,7 @@ def _finish(
     free, options = problem.free, problem.options
     changed = search.state is not null.linear.state
     if changed and not options.quick:
-        null = search.fit(problem)
+        null = search.estimate_null_model(problem)
     while True:
         # The last variances weigh the last fit.
         state = refit(search.data, search.state, free, null.variances)
@@ -224,7 +224,7 @@ def _finish(
         search = replace(
             search, state=_change_state(null, included, gone, ()), variances=null.variances,
             trace=(*search.trace, *steps))
-        null = search.fit(problem)
+        null = search.estimate_null_model(problem)
 
 
 def _known_effects(problem: Problem) -> tuple[str, ...]:
@@ -249,11 +249,11 @@ def _change_state(
     kept = null.linear.state.without_effects(gone)
     estimated = _estimate_forms(null, included, forms)
 
-    def after(fraction: float) -> RigState:
+    def take_step(fraction: float) -> RigState:
         return reduce(lambda state, one: with_effect(state, one[0], fraction * one[1]),
                       estimated, kept)
 
-    return shorten_step(null.linear.data, null.linear.free, after)[0]
+    return shorten_step(null.linear.data, null.linear.free, take_step)[0]
 
 
 def _estimate_forms(
@@ -272,7 +272,7 @@ def _estimate_forms(
     return estimated
 
 
-def _with_included(problem: Problem) -> RigState:
+def _include_effects(problem: Problem) -> RigState:
     """Return the fitted state with the causes that the user knows of, in their simplest forms.
 
     Raises ObservationError for one that the data cannot hold.

@@ -33,7 +33,7 @@ from fisheye_svp_ros.mixed_model import (
 
 # What is named is surer than significant: a local error now and then has the form of an effect.
 NAMED_P = 0.002
-REMOVED = 'removed:'
+REMOVAL_PREFIX = 'removed:'
 _RARITY_ODDS = 4.0  # twice the log odds of an effect to one that looks alike and is rarer
 # So many landmarks are no single ones any more: of those that are exact, and of those that err
 # from landmark to landmark anyway.
@@ -63,9 +63,9 @@ class TraceStep:
         return self.effect.partition('(')[0]
 
     @property
-    def removed(self) -> bool:
+    def is_removal(self) -> bool:
         """Whether an effect was given up that had been taken in."""
-        return self.why.startswith(REMOVED)
+        return self.why.startswith(REMOVAL_PREFIX)
 
 
 @dataclass
@@ -143,7 +143,7 @@ def eliminate_effects(
     The weakest goes first: what is no longer significant, then what held-out frames no longer
     support.  known: effects that stay whatever the tests say.
     """
-    included = tests.null.included
+    included = tests.null.included_columns
     gone: list[TraceStep] = []
     while True:
         weakest: tuple[float, Index, TraceStep] | None = None
@@ -165,14 +165,14 @@ def _test_removal(
     """Return why an effect is not needed beside everything else that is included, if so."""
     score = tests.test_removal(included, columns, effect)
     corrected = min(1.0, score.p_value * tests.effect_count)
-    gain, why = HeldOutGain(np.nan, np.nan), f'{REMOVED} the other causes explain it'
+    gain, why = HeldOutGain(np.nan, np.nan), f'{REMOVAL_PREFIX} the other causes explain it'
     if corrected < SIGNIFICANCE:
         if quick or effect.per_frame:
             return None
         gain = tests.held_out_gain(np.setdiff1d(included, columns), columns, effect)
         if gain.sufficient:
             return None
-        why = f'{REMOVED} it does not predict better any more'
+        why = f'{REMOVAL_PREFIX} it does not predict better any more'
     return TraceStep(effect.key, score.statistic, score.rank, score.p_value, corrected,
                      gain.value, gain.stderr, False, why)
 
@@ -245,7 +245,7 @@ def test_landmarks(tests: EffectTests) -> tuple[Array, Array, Array]:
     lam = null.variances.lam.copy()
     tiny = initial_variances(null.full, 1e-7).lam
     lam[landmarks] = np.where(lam < LAMBDA_ABSENT, lam, tiny)[landmarks]
-    eq = null.equations_of(null.included).select(lam < LAMBDA_ABSENT)
+    eq = null.equations_of(null.included_columns).select(lam < LAMBDA_ABSENT)
     f = factor_equations(eq, lam, null.variances.weight)
     solution = solve_equations(f)
     _, landmark, _ = eq.split(solution.e, solution.r)
@@ -298,9 +298,9 @@ def _test_against_bulk(
     mine = rank > 0
     typical = special.chdtri(rank[mine], 0.5)
 
-    def off(log_scale: float) -> float:
+    def excess(log_scale: float) -> float:
         return float(np.median(statistic(np.exp(log_scale))[mine] / typical) - 1)
 
-    low, high = off(0.0), off(7.0)
-    scale = 0.0 if low <= 0 else 7.0 if high >= 0 else optimize.brentq(off, 0.0, 7.0, xtol=0.05)
+    low, high = excess(0.0), excess(7.0)
+    scale = 0.0 if low <= 0 else 7.0 if high >= 0 else optimize.brentq(excess, 0.0, 7.0, xtol=0.05)
     return statistic(np.exp(scale)), rank, offset

@@ -54,17 +54,17 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
     much depends may change much).
     NaN where the data leave a parameter open.
     """
-    own, reported = null.included, _reporting_matrix(null)
+    own, reported = null.included_columns, _reporting_matrix(null)
     estimate, variance, open_ = _estimate(null.information, own, reported)
     if jackknife and null.linear.data.frames > 2:
-        changed, allowed = np.zeros(null.own), np.zeros(null.own)
+        changed, allowed = np.zeros(null.column_count), np.zeros(null.column_count)
         for part in null.information_without_frames(np.append(own, len(null.scale))):
             other, wider, lost = _estimate(part, own, reported)
             changed += np.where(lost, 0.0, (other - estimate) ** 2)
             allowed += np.where(lost, 0.0, wider - variance)
         least = np.maximum(1e-9 * variance, 1e-300)  # nothing is known of what the data leave open
         variance = variance * np.maximum(changed / np.maximum(allowed, least), 1.0)
-    errors = np.sqrt(variance) / null.scale[: null.own]
+    errors = np.sqrt(variance) / null.scale[: null.column_count]
     return np.where(open_, np.nan, errors)
 
 
@@ -99,7 +99,7 @@ def field_uncertainty(null: NullModel) -> Array:
     too small then, or nothing.  Each size, none among them, is as probable as its restricted
     likelihood says, and adds what it brings and the square of the change.
     """
-    own, reported = null.included, _reporting_matrix(null)
+    own, reported = null.included_columns, _reporting_matrix(null)
     freedom = null.freedom
     estimate, variance, _ = _estimate(null.information, own, reported)
     likelihoods, more = [], []
@@ -111,7 +111,7 @@ def field_uncertainty(null: NullModel) -> Array:
         other, wider, _ = _estimate(information / noise, own, reported)
         more.append(wider - variance + (other - estimate) ** 2)
     added = np.maximum(special.softmax(likelihoods) @ np.array(more), 0.0)
-    return np.asarray(np.sqrt(added) / null.scale[: null.own])
+    return np.asarray(np.sqrt(added) / null.scale[: null.column_count])
 
 
 def model_uncertainty(null: NullModel) -> Array:
@@ -123,7 +123,7 @@ def model_uncertainty(null: NullModel) -> Array:
     the same, or without it, its parameters mean something else: for them that model does not
     count.  What is added is hardly larger than large, however little the data say of it.
     """
-    own, information, reported = null.own, null.information, _reporting_matrix(null)
+    own, information, reported = null.column_count, null.information, _reporting_matrix(null)
     prior = np.zeros(len(information))
     for form, effect in enumerate(null.fixed.forms.effects):
         prior[null.form_columns(form)] = null.prior_precision(null.form_columns(form), effect)
@@ -139,7 +139,7 @@ def model_uncertainty(null: NullModel) -> Array:
         change = other[there] - estimate[at]
         more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
         for effect, columns, _ in null.terms:
-            if one.kinds & _alike_kinds(effect):
+            if one.kinds & _effect_family(effect):
                 more[columns] = 0.0
         added += weight * more
     return np.asarray(np.sqrt(added) / null.scale[:own])
@@ -170,13 +170,13 @@ def _likely_models(null: NullModel) -> list[_Model]:
     The likeliest of those at hand is extended first, and so many are enough.
     """
     tests, found = EffectTests(null), dict[frozenset[int], _Model]()
-    waiting = {frozenset[int](): _Model(0.0, null.included, frozenset())}
+    waiting = {frozenset[int](): _Model(0.0, null.included_columns, frozenset())}
     waiting |= dict(_exchange_effects(null))
     while waiting and len(found) < _MAX_MODELS:
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
         for one in tests.candidates(model.included, per_frame=False):
-            kinds, gain = _alike_kinds(one.effect), _log_odds(null, one.score)
+            kinds, gain = _effect_family(one.effect), _log_odds(null, one.score)
             if gain <= 0 or model.kinds & kinds:
                 continue
             if (larger := forms | {one.form}) not in found:
@@ -194,19 +194,19 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], _Model]
     for i, (effect, columns, _) in enumerate(null.terms):
         if not _is_lasting(effect):
             continue
-        rest = np.setdiff1d(null.included, columns)
+        rest = np.setdiff1d(null.included_columns, columns)
         score = tests.score_beside(rest, columns)
         lost = _log_odds(null, score)
         for one in tests.candidates(rest, per_frame=False):
             kinds = frozenset(one.effect.kinds)
             gain = _log_odds(null, one.score) - lost
-            if gain > -_ODDS_WINDOW and _is_lasting(one.effect) and not null.kinds & kinds:
+            if gain > -_ODDS_WINDOW and _is_lasting(one.effect) and not null.effect_kinds & kinds:
                 included = np.concatenate([rest, null.form_columns(one.form)])
                 yield frozenset({~i, one.form}), _Model(
                     gain, included, kinds | set(effect.kinds))
 
 
-def _alike_kinds(effect: Effect) -> set[str]:
+def _effect_family(effect: Effect) -> set[str]:
     """Return the kinds of an effect, and of a more common one that does nearly the same."""
     alike = effect.rarer_than or effect.name
     return {*effect.kinds, *(kind.replace(effect.name, alike) for kind in effect.kinds)}
@@ -243,7 +243,7 @@ class ModelErrors:
     geometry: ColumnGeometry
 
     @classmethod
-    def of(cls, null: NullModel, fitted: FittedModel) -> ModelErrors:
+    def from_null_model(cls, null: NullModel, fitted: FittedModel) -> ModelErrors:
         """Return the errors of what was fitted under a null model.
 
         Parameters take up part of an image field that has no name: what it does to them is not
@@ -252,12 +252,12 @@ class ModelErrors:
         lam = np.where(np.isin(np.arange(len(NAMES)), _image_components()), LAMBDA_ABSENT,
                        null.variances.lam)
         bare = replace(null, variances=replace(null.variances, lam=lam))
-        own = null.included
+        own = null.included_columns
         inverse, _ = pseudo_inverse(bare.information[np.ix_(own, own)], 1e-13)
         scale = null.scale[own]
         finest = [grid.pitch for grid in null.random.grids if grid.name == FINEST_FIELD]
         modes, alone = fitted.target_modes(null.variances.sigma)
-        geometry = ColumnGeometry.of(null.linear, max(finest, default=np.nan), modes, alone)
+        geometry = ColumnGeometry.measure(null.linear, max(finest, default=np.nan), modes, alone)
         return cls(shared_names(null.linear), inverse / np.outer(scale, scale), null.variances,
                    geometry)
 
@@ -267,9 +267,9 @@ class ModelErrors:
         linear: frames that were posed with the lens of the diagnosis, those it was made of or
         others.
         """
-        return self.through(linear, pose_maps(linear.frame_columns))
+        return self.propagate(linear, pose_maps(linear.frame_columns))
 
-    def through(self, linear: Linearization, maps: Array) -> ErrorParts:
+    def propagate(self, linear: Linearization, maps: Array) -> ErrorParts:
         """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
         turned = np.swapaxes(maps, -1, -2)
         shared = maps @ linear.shared_columns

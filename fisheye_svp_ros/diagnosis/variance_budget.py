@@ -30,7 +30,7 @@ from fisheye_svp_ros.mixed_model import (
     pseudo_inverse,
 )
 
-REPEATED = 'frame_similar'
+REPEATED_COMPONENT = 'frame_similar'
 STAGES = ('lens', 'target', 'frame', 'noise')
 _VARIABLE_OF = {'image': 'image', 'landmark': 'landmark', 'board': 'landmark', 'frame': 'frame'}
 _SIGMA_TOLERANCE = 1.2  # a stated sigma is an estimate, too: of a detector, or of a person
@@ -65,12 +65,12 @@ def cause_squares(null: NullModel, causes: Sequence[PlacedEffect]) -> dict[str, 
     nothing = no_variances(len(NAMES), len(null.variances.weight))
     f = factor_equations(
         null.full.select(nothing.alive), nothing.lam, null.variances.weight)
-    every = np.zeros(null.own)
+    every = np.zeros(null.column_count)
     named = [columns for _, columns, _ in causes]
     for _, columns, values in causes:
         every[columns] = values * null.scale[columns]
-    rest = np.setdiff1d(null.included, _join_columns(named))
-    remaining = eliminate(f.information, rest)[: null.own, : null.own]
+    rest = np.setdiff1d(null.included_columns, _join_columns(named))
+    remaining = eliminate(f.information, rest)[: null.column_count, : null.column_count]
     signal = remaining @ every
 
     @cache
@@ -123,7 +123,8 @@ def variance_budget(
             parts.append((name, STAGE_OF[name], size, False, p_values.get(name, 1.0)))
     noise = variances.sigma**2 * null.freedom * px2
     if repeated is not None:
-        parts.append((REPEATED, 'frame', repeated.share * noise, False, repeated.p_value))
+        size = repeated.share * noise
+        parts.append((REPEATED_COMPONENT, 'frame', size, False, repeated.p_value))
         noise *= 1 - repeated.share
     parts.append(('noise', 'noise', noise, False, 0.0))
     total = sum(size for _, _, size, _, _ in parts)
@@ -135,14 +136,14 @@ def variance_budget(
 
 def component_significance(null: NullModel) -> dict[str, float]:
     """Return the p-values of the random components that have a variance, by name."""
-    p_values = component_p_values(null.equations_of(null.included), null.variances)
+    p_values = component_p_values(null.equations_of(null.included_columns), null.variances)
     return {name: float(p) for name, p, alive in
             zip(NAMES, p_values, null.variances.alive, strict=True) if alive}
 
 
 def significant_components(components: list[Component]) -> list[Component]:
     """Return the random components that are there beyond chance."""
-    held = [c for c in components if c.name in (*NAMES, REPEATED)]
+    held = [c for c in components if c.name in (*NAMES, REPEATED_COMPONENT)]
     return [c for c in held if c.p_value * len(NAMES) < SIGNIFICANCE]
 
 
@@ -201,10 +202,11 @@ def remaining_structure(
 
 def _field_tests(tests: EffectTests) -> Iterator[tuple[str, float, float]]:
     null = tests.null
-    remaining = eliminate(null.information, null.included)
+    remaining = eliminate(null.information, null.included_columns)
     total = float((null.linear.residual**2).sum())
     for name, columns in null.fixed.fields.items():
-        score = tests.adjust_p_value(tests.score(remaining, columns), null.included, columns)
+        score = tests.adjust_p_value(
+            tests.score(remaining, columns), null.included_columns, columns)
         explained = (score.statistic - score.rank) * null.variances.sigma**2
         yield name, score.p_value, max(explained, 0.0) / total
 
@@ -253,7 +255,7 @@ def add_outliers(
     left: list[Structure], outliers: Outliers, observations: int
 ) -> list[Structure]:
     """Return what remains, with outliers that are no mere wrong ids."""
-    far = len(outliers.rows) - outliers.swapped
+    far = len(outliers.rows) - outliers.swap_count
     if not far:
         return left
     rest = [s for s in left if s.variable != 'outliers']

@@ -113,7 +113,7 @@ def _boundary_p_value(ratio: float) -> float:
     return float(special.chdtrc(1, max(ratio, 0.0))) / 2
 
 
-class _Whole(NamedTuple):
+class _FullModel(NamedTuple):
     """The equations of all components, solved."""
 
     factored: FactoredEquations
@@ -121,19 +121,19 @@ class _Whole(NamedTuple):
     posterior: Posterior
 
 
-def _solve_whole(eq: Equations, now: Variances) -> _Whole:
+def _solve_whole(eq: Equations, now: Variances) -> _FullModel:
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     posterior = posterior_covariance(f)
-    return _Whole(f, solve_equations(f, posterior), posterior)
+    return _FullModel(f, solve_equations(f, posterior), posterior)
 
 
-def _deviance_ratios(whole: _Whole, kinds: Iterable[int]) -> dict[int, float]:
+def _deviance_ratios(whole: _FullModel, kinds: Iterable[int]) -> dict[int, float]:
     """Return by how much the deviance rises without each of some components."""
     return {int(kind): deviance_without(*whole, int(kind)) for kind in kinds}
 
 
 def _follow_variances(
-    eq: Equations, now: Variances, whole: _Whole, ratios: dict[int, float]
+    eq: Equations, now: Variances, whole: _FullModel, ratios: dict[int, float]
 ) -> dict[int, float]:
     """Return likelihood ratios once the other variances have taken up what they can.
 
@@ -148,7 +148,7 @@ def _follow_variances(
     return found
 
 
-def _step_without(eq: Equations, now: Variances, whole: _Whole, kind: int) -> Variances:
+def _step_without(eq: Equations, now: Variances, whole: _FullModel, kind: int) -> Variances:
     f, others = whole.factored, now.without_component(kind)
     if (f.equations.blocks.r_label == kind).any():
         return update_variances(f, solution_without(*whole, kind), others)
@@ -272,7 +272,7 @@ def _remaining_information(
     present, (groups, width, _) = c.at >= 0, c.own.shape
     first = f.inverse[c.at[present]] @ c.e[present]
 
-    def common(part: Array) -> Array:
+    def multiply_blocks(part: Array) -> Array:
         """Return the products (C, g, w) of coefficients (b, k, C) with the columns."""
         if groups == 1:
             flat = first.reshape(first.size // width, width)
@@ -285,12 +285,12 @@ def _remaining_information(
     if groups > 1:
         block[present] -= np.swapaxes(first, -1, -2) @ first
     else:
-        block -= common(first)[:, 0]
+        block -= multiply_blocks(first)[:, 0]
     at = c.at[present]
-    r = c.r - common(f.coupled[at])
+    r = c.r - multiply_blocks(f.coupled[at])
     u = solve_lower(f.factor, r.reshape(len(r), groups * width))
     if fixed:
-        x = c.x[:-1] - common(f.block_border[at, :, :-1])
+        x = c.x[:-1] - multiply_blocks(f.block_border[at, :, :-1])
         flat = x.reshape(len(x), groups * width) - f.border[:, :-1].T @ u
         u = np.concatenate([u, solve_lower(f.root, flat)])
     return _Information(block, u.reshape(len(u), groups, width))

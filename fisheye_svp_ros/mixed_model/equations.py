@@ -78,7 +78,7 @@ class Equations:
         """Components (E k + R,) of all coefficients, blocks first."""
         return self.blocks.label
 
-    def with_fixed(self, basis: Array) -> Equations:
+    def combine_columns(self, basis: Array) -> Equations:
         """Return the equations with combinations (X - 1, m) of the shared fixed columns."""
         full = linalg.block_diag(basis, np.eye(1))
         b = self.blocks

@@ -68,7 +68,7 @@ class Localizer(SolverNode):
         views, model = self.views(stamp, landmarks, seen), self.model(stamp, items)
         errors = self._lens_errors(stamp, items) if self.settings.model_error else None
         if errors is not None:
-            sigma = errors.allowing(self.settings.sigma_px)
+            sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
         found = self._localized(model, views, true).require()
@@ -77,7 +77,7 @@ class Localizer(SolverNode):
         camera = self.settings.camera_frame or seen.frame
         covariance = solution.covariance
         if errors is not None:
-            covariance = errors.of_solved(views, solution, None).total
+            covariance = errors.of_solved_poses(views, solution, None).total
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
@@ -125,7 +125,7 @@ def _errors_of(lens: Lens) -> LensErrors:
     # Nothing else here needs what that imports, and a node is to start at once.
     from fisheye_svp_ros.diagnosis import LensErrors
 
-    return LensErrors.of(lens)
+    return LensErrors.from_lens(lens)
 
 
 def _rms_px(found: SetSolutions[Localization]) -> float:

@@ -214,12 +214,12 @@ def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
 
 def figures(found: Diagnosis) -> dict[str, float]:
     """Return METRICS, and the parameters of the causes with their standard errors."""
+    base, extended, gain = found.figures.base, found.figures.extended, found.figures.gain
     numbers = {
         'frames': found.frames, 'points': found.observations, 'noise_px': found.noise_px,
-        'base_rms_px': found.base.rms_px, 'base_heldout_rms_px': found.base.heldout_rms_px,
-        'extended_rms_px': found.extended.rms_px,
-        'extended_heldout_rms_px': found.extended.heldout_rms_px,
-        'gain': found.gain.value, 'gain_low': found.gain.low, 'gain_high': found.gain.high,
+        'base_rms_px': base.rms_px, 'base_heldout_rms_px': base.heldout_rms_px,
+        'extended_rms_px': extended.rms_px, 'extended_heldout_rms_px': extended.heldout_rms_px,
+        'gain': gain.value, 'gain_low': gain.low, 'gain_high': gain.high,
     }
     for cause in found.causes:
         if len(cause.parameters) > _MOST:

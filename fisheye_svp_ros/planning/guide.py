@@ -128,9 +128,9 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
         names = cause.effect, *cause.indistinguishable_from
         if len(names) == 1 or _EFFECT.name not in names:
             continue
-        wanted = next_photographs(found.after, (cause,), found.noise_px, _VIEWS_AHEAD, room=room)
+        wanted = next_photographs(found.model, (cause,), found.noise_px, _VIEWS_AHEAD, room=room)
         if wanted.answers[-1] > MIN_PROBABILITY and len(session.taken) < _MAX_UNDECIDED:
-            return _session_state(session, _model(found.after), wanted, named=(cause.effect,),
+            return _session_state(session, _model(found.model), wanted, named=(cause.effect,),
                           alike=names[1:])
         # No photograph will tell: what is it, if it is what is asked for?
         alike = tuple(name for name in names if name != _EFFECT.name)
@@ -138,13 +138,13 @@ def _diagnose_session(session: Session, table: Observations, lens: Lens) -> Sess
             table, lens, free_intrinsics=True, options=DiagnosisOptions(left_out=alike))
         break
     wanted = next_photographs(
-        found.after, found.causes, found.noise_px, _VIEWS_AHEAD, number, room)
-    value, stderr = _value(found.after, number), wanted.answers[0]
+        found.model, found.causes, found.noise_px, _VIEWS_AHEAD, number, room)
+    value, stderr = _value(found.model, number), wanted.answers[0]
     for cause in found.causes:
         if number in cause.parameters:
             value = cause.parameters[number]['value']
             stderr = max(stderr, cause.parameters[number]['stderr'])
-    return _session_state(session, _model(found.after), wanted, value, stderr,
+    return _session_state(session, _model(found.model), wanted, value, stderr,
                   tuple(cause.effect for cause in found.causes), alike, stderr <= session.goal)
 
 

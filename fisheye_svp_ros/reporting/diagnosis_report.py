@@ -84,7 +84,7 @@ def write_report(
     draw_uncertainty(pictures[-1], diagnosis)
     if wanted is not None:
         pictures.append(inputs.folder / 'next.png')
-        state = diagnosis.after.state
+        state = diagnosis.model.state
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
     write_text(report, page(
@@ -197,7 +197,7 @@ def _step(step: TraceStep) -> dict[str, Any]:
 def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the bars of the budget: stage, percent without and with a name."""
     shares = stage_shares(diagnosis.components)
-    total = diagnosis.base.rms_px**2
+    total = diagnosis.figures.base.rms_px**2
     return {
         'bars': [
             (stage, text.STAGE_WORDS[stage], 100 * (share - named), 100 * named)

@@ -153,7 +153,7 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         return (f'{count} points lie far off, furthest {which}' if count > 1 else
                 f'a point lies far off, {which}')
     if variable == 'size':
-        ratio = math.sqrt(diagnosis.extended.chi2_per_dof or math.nan)
+        ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
         return f'the residuals are {ratio:.2g} times as large as sigma says'
     depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
     return _OTHERWISE.get(variable, depends)
@@ -178,8 +178,9 @@ def _wrong(d: Diagnosis) -> str:
         return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
-        return (f'The simulation leaves residuals of {d.base.rms_px:.3g} px rms, and no effect of '
-                f'the catalogue accounts for what is odd about them: {remains(d, 7)}{_almost(d)}.')
+        return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
+                'effect of the catalogue accounts for what is odd about them: '
+                f'{remains(d, 7)}{_almost(d)}.')
     causes = '; because '.join(
         f'{what(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_NAMED]
@@ -205,7 +206,8 @@ def _name(cause: Cause) -> str:
 
 
 def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
-    before, named, best = (f.heldout_rms_px for f in (d.base, d.named, d.extended))
+    before, named, best = (quality.heldout_rms_px for quality in (
+        d.figures.base, d.figures.named, d.figures.extended))
     moving = [c for c in d.causes if c.kind.stage != 'noise']
     local = ''
     if best < 0.99 * named:
@@ -229,10 +231,11 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
                 f'the causes are no correction{local}.')
     text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
             f'{before:.3g}{local}')
-    if d.gain.value > 0:
-        text += (f', which takes away {percent(d.gain.value)} (95 % interval '
-                 f'{percent(d.gain.low)} to {percent(d.gain.high)}) of the error above the noise')
-    lens = d.lens_only.heldout_rms_px
+    if d.figures.gain.value > 0:
+        value, low, high = map(percent, d.figures.gain.interval.values())
+        text += (f', which takes away {value} (95 % interval {low} to {high}) of the error above '
+                 'the noise')
+    lens = d.figures.lens_only.heldout_rms_px
     if 'target' in {c.kind.budget_stage() for c in moving}:
         better = lens < before
         text += (f'; the lens alone, on the target as it is said to be, '
@@ -287,7 +290,7 @@ def _next(d: Diagnosis) -> str:
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
             if c.kind.budget_stage() == 'frame' and c.effect in d.lens.corrections]
-    refuted = d.named.heldout_rms_px >= d.base.heldout_rms_px
+    refuted = d.figures.named.heldout_rms_px >= d.figures.base.heldout_rms_px
     if held and not refuted and f'solve with {EXTENDED}' not in steps:
         steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes

@@ -49,8 +49,8 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
 def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
     causes = [c for c in diagnosis.causes if math.isfinite(c.heldout_rms_px)]
     names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes), '+ local offsets']
-    rms = [diagnosis.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes),
-           diagnosis.extended.heldout_rms_px]
+    rms = [diagnosis.figures.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes),
+           diagnosis.figures.extended.heldout_rms_px]
     axis.barh(names, rms, color=[BEFORE, *[AFTER] * (len(causes) + 1)], height=0.6)
     for place, value in enumerate(rms):
         axis.annotate(f' {value:.3f}', (value, place), va='center', fontsize=8.5)
@@ -98,7 +98,7 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
 
 def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
     """Draw the standard deviation of a coordinate by noise, parameters and remaining misfit."""
-    linear = diagnosis.after
+    linear = diagnosis.model
     data, state = linear.data, linear.state
     parts = diagnosis.errors.of_points(linear)._asdict()
     uv = data.blocks(data.views.uv).reshape(-1, 2)

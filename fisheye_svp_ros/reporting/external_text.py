@@ -105,7 +105,7 @@ def _of_sets(against: TwoDatasets) -> Section:
     rows = [
         (name, quantity({'value': one.value, 'stderr': one.stderr, 'unit': one.unit}),
          quantity({'value': one.other_value, 'stderr': one.other_stderr, 'unit': one.unit}),
-         f'{one.apart:.1f} standard errors apart')
+         f'{one.standardized_difference:.1f} standard errors apart')
         for name, one in against.parameters.items()
     ]
     return Section(SETS_TITLE, f'{_lens_holds(against)}{_apart(against)}{_follows(against)}.',
@@ -138,8 +138,9 @@ def _apart(against: TwoDatasets) -> str:
         (True, 'sizes of causes do not agree within their errors ({}): they are less certain than '
                'one set says'),
     ):
-        far = sorted(((abs(one.apart), name) for name, one in against.parameters.items()
-                      if ('.' in name) == of_causes and abs(one.apart) > _APART), reverse=True)
+        sizes = [(abs(one.standardized_difference), name)
+                 for name, one in against.parameters.items() if ('.' in name) == of_causes]
+        far = sorted((one for one in sizes if one[0] > _APART), reverse=True)
         each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MOST]]
         said += f'; {meaning.format(listed(each))}' if each else ''
     return said or '; its parameters agree within their errors'
@@ -149,7 +150,7 @@ def _follows(against: TwoDatasets) -> str:
     there = [one.target for one in against.tried if one is not None and one.target is not None]
     if not there:
         return ''
-    if any(one.better for one in there):
+    if any(one.improves for one in there):
         return ('; the correction of the target holds in the other set too: it is the same one, '
                 'or an error of the lens')
     return '; the correction of the target does not follow to the other one, as it should'

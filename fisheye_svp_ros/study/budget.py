@@ -226,7 +226,7 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
         return {}
     from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
 
-    errors, lens = LensErrors.of(setup.lens), ForwardModel(setup.lens)
+    errors, lens = LensErrors.from_lens(setup.lens), ForwardModel(setup.lens)
     some = points[:, ::_STEREO_CAPS]
     left = lens.predict(setup.rig.broadcast_to(len(some)), views_of(some)).uv
     both: Mask = np.asarray(np.isfinite(left).all(axis=-1))

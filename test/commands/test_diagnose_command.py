@@ -315,8 +315,9 @@ class TestWords:
         assert following.startswith('Solve with extended_lens.yaml')
 
     def test_local_offsets_that_held_out_data_refute_gain_nothing(self, found):
-        worse = replace(found.extended, heldout_rms_px=2 * found.base.heldout_rms_px)
-        gain = found.gain._replace(value=-1.0, low=-1.0)
+        base = found.figures.base
+        worse = replace(found.figures.extended, heldout_rms_px=2 * base.heldout_rms_px)
+        gain = found.figures.gain._replace(value=-1.0, low=-1.0)
         refuted = with_changes(found, extended=worse, gain=gain)
         _, gained, _ = verdict_sentences(refuted)
         assert 'takes away' not in gained and '-100 %' not in gained
@@ -345,7 +346,7 @@ class TestWords:
 
     def test_frames_that_do_not_predict_each_other_leave_more_than_noise(self, found):
         for times, said in ((1.1, 'that is the noise'), (3.0, 'that is 3.0 times the noise')):
-            error = replace(found.base, heldout_rms_px=times * 2**0.5 * found.noise_px)
+            error = replace(found.figures.base, heldout_rms_px=times * 2**0.5 * found.noise_px)
             _, gained, _ = verdict_sentences(with_changes(
                 found, causes=[], base=error, named=error, extended=error))
             assert said in gained
@@ -361,7 +362,7 @@ class TestWords:
     def test_what_remains_is_told_in_numbers(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
         left = [Structure('outliers', 0.0, 0.5), Structure('size', 0.0, 0.0)]
-        extended = replace(found.extended, chi2_per_dof=9.0)
+        extended = replace(found.figures.extended, chi2_per_dof=9.0)
         wrong, _, _ = verdict_sentences(with_changes(
             found, causes=[], advice=[], remaining=left, gross=gross,
             extended=extended))
@@ -396,7 +397,7 @@ class TestWords:
         following = verdict_sentences(with_changes(
             found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
         assert following.count('olve with extended_lens.yaml') == 1
-        worse = replace(found.named, heldout_rms_px=2 * found.base.heldout_rms_px)
+        worse = replace(found.figures.named, heldout_rms_px=2 * found.figures.base.heldout_rms_px)
         refuted = verdict_sentences(with_changes(
             found, causes=[cause], advice=[], lenses={'': shutter}, named=worse))
         assert 'no correction' in refuted[1] and 'olve with' not in refuted[2]
@@ -461,7 +462,7 @@ def test_intrinsics_are_told_with_their_unit():
 def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
-    points = point_residuals(found.before, found.after)
+    points = point_residuals(found.simulation, found.model)
     for name, draw, arguments in residual_pictures(Shown.of(found, points)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
@@ -485,7 +486,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
     larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
     found = diagnose(replace(table, cameras=('left', 'right'), **both),
                      {'left': LENS, 'right': larger}, options=DiagnosisOptions(quick=True))
-    shown = Shown.of(found, point_residuals(found.before, found.after))
+    shown = Shown.of(found, point_residuals(found.simulation, found.model))
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
     draw(tmp_path / 'field.png', *arguments)
@@ -511,10 +512,10 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     board = plane()
     poses = poses_around(board, 6, rng, widest=0.5)
     found = diagnose(simulate(ForwardModel(LENS), board, poses, 0.1, rng), LENS)
-    effect = TargetShapeEffect.candidates(found.after.scene)[0]
+    effect = TargetShapeEffect.candidates(found.model.scene)[0]
     bow = np.array([0.002, 0.0, 0.0])
-    state = replace(found.after.state, terms=((effect, bow),))
-    one, = board_maps(found.after.data.views, state.terms, state.lens)
+    state = replace(found.model.state, terms=((effect, bow),))
+    one, = board_maps(found.model.data.views, state.terms, state.lens)
     assert len(one.height) == len(board.ids)
     x = one.place[:, 0] / np.abs(one.place[:, 0]).max()
     expected = 0.002 * x**2
@@ -534,11 +535,11 @@ def test_the_depth_of_a_rig_gains_too():
     table = simulate_stereo(model, model, landmarks(), rig, poses, 0.05, rng)
     found = diagnose(table, LENS)
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
-    known = known_errors(found.before, found.after, ())
+    known = known_errors(found.simulation, found.model, ())
     assert set(known) == {'depth_error_m'}
     depth = known['depth_error_m']
     assert 0 < depth.after < depth.before
     assert depth.low <= depth.value <= depth.high
     # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
-    late = with_effect(found.after.state, StereoTimeOffsetEffect(), np.array([0.01]))
-    assert known_errors(found.before, Linearization(found.after.data, late, ()), ()) == {}
+    late = with_effect(found.model.state, StereoTimeOffsetEffect(), np.array([0.01]))
+    assert known_errors(found.simulation, Linearization(found.model.data, late, ()), ()) == {}

@@ -107,7 +107,7 @@ def test_hidden_effect_is_named_and_measured(name, values):
     assert found.verdict == 'explained'
     assert [cause.effect for cause in found.causes] == [name]
     assert found.causes[0].gain > 0.85
-    assert found.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+    assert found.figures.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
     for parameter, true in zip(found.causes[0].parameters.values(), values, strict=True):
         assert abs(parameter['value'] - true) < 5 * parameter['stderr']
 
@@ -140,8 +140,8 @@ def test_a_finely_warped_board_of_many_landmarks_has_a_name():
     found = diagnose(replace(seen, xyz=said[seen.landmark]), lens())
     assert (found.verdict, *(cause.effect for cause in found.causes)) == (
         'explained', 'target_shape')
-    assert found.base.heldout_rms_px > 1.15 * found.named.heldout_rms_px
-    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
+    assert found.figures.base.heldout_rms_px > 1.15 * found.figures.named.heldout_rms_px
+    assert found.figures.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
 
 def test_true_poses_reveal_what_free_poses_hide():
@@ -169,7 +169,7 @@ def test_swapped_ids_are_found_and_left_out():
     assert [cause.effect for cause in found.causes] == ['wrong_ids']
     value = found.causes[0].parameters['fraction']['value']
     assert value == pytest.approx(6 / len(table))
-    assert found.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+    assert found.figures.extended.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
 @pytest.mark.parametrize('seed', [0, 1])
@@ -224,7 +224,7 @@ def test_near_points_that_a_cause_explains_are_no_gross_errors():
     assert abs(error['value'] - 0.004) < 3 * error['stderr'] < 0.0004
     left = [(g['frame'], g['landmark']) for g in found.gross]
     assert left == [(11, int(table.landmark[wrong]))]
-    assert found.after.data.views.used.sum() == len(table) - 1
+    assert found.model.data.views.used.sum() == len(table) - 1
 
 
 def test_points_that_say_themselves_how_unsure_they_are_are_no_gross_errors():
@@ -347,8 +347,8 @@ def test_what_the_user_knows_is_a_cause_that_the_simulation_lacked():
         diagnose(table, lens(), held_out=held_out, options=DiagnosisOptions(names, quick=True))
         for names in ((), ('skew',)))
     assert [cause.effect for cause in (*found.causes, *known.causes)] == ['skew', 'skew']
-    assert known.base.rms_px == pytest.approx(found.base.rms_px)
-    assert known.base.heldout_rms_px == pytest.approx(found.base.heldout_rms_px)
+    assert known.figures.base.rms_px == pytest.approx(found.figures.base.rms_px)
+    assert known.figures.base.heldout_rms_px == pytest.approx(found.figures.base.heldout_rms_px)
     assert known.causes[0].gain == pytest.approx(found.causes[0].gain, rel=1e-3)
     assert known.causes[0].gain > 0.5
 
@@ -364,7 +364,7 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
     assert diagnose(bare, extended, options=DiagnosisOptions(quick=True)).verdict == 'adequate'
     found = diagnose(table, lens(), held_out=bare, options=DiagnosisOptions(quick=True))
     assert [cause.effect for cause in found.causes] == ['target_shape']
-    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+    assert found.figures.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
 @pytest.mark.parametrize('cameras', [('left', 'right'), ('right', 'left')])
@@ -376,7 +376,7 @@ def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
     poses = {int(views.frame[i]): pose.take(i) for i in right}
     found = diagnose(table, lens(), poses=poses, options=DiagnosisOptions(quick=True))
     assert found.verdict == 'adequate'
-    assert found.base.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
+    assert found.figures.base.rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.05)
 
 
 @pytest.mark.parametrize(('cameras', 'names', 'x'), [
@@ -409,7 +409,7 @@ def test_what_happened_to_a_recording_is_no_part_of_the_lens():
     assert [cause.effect for cause in found.causes] == ['session_step']
     assert not found.lens.corrections
     # The frames of a table of its own are not those that the step is between.
-    assert found.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
+    assert found.figures.named.heldout_rms_px == pytest.approx(SIGMA * np.sqrt(2), rel=0.1)
 
 
 def test_a_lens_that_is_fitted_is_that_of_the_mean_session():
@@ -435,7 +435,7 @@ def test_rigs_and_frames_that_see_little(kept):
     table = table_of(24, 12, 2)
     found = diagnose(table.take(kept(table)), lens(), free_intrinsics=True)
     assert not found.causes
-    assert np.isfinite(found.extended.rms_px)
+    assert np.isfinite(found.figures.extended.rms_px)
     found.to_dict()
 
 
@@ -447,8 +447,8 @@ def test_the_last_fit_is_the_best_under_the_last_variances():
     table = observe(lens(), terms, pose, views._replace(points=views.points + moves), SIGMA, rng)
     table = replace(table, xyz=views.points[0][table.landmark])
     inputs = Inputs.check(table, lens(), DiagnosisOptions())
-    found = select_causes(Problem.of(inputs), lambda *_: None)
-    own, information = found.null.included, found.null.information
+    found = select_causes(Problem.prepare(inputs), lambda *_: None)
+    own, information = found.null.included_columns, found.null.information
     step = np.linalg.solve(information[np.ix_(own, own)], information[own, -1])
     errors = standard_errors(found.null) * found.null.scale[own]
     assert [effect.name for effect, _, _ in found.causes] == ['viewpoint_shift']
@@ -502,7 +502,7 @@ def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
     table, lenses = rig_table(26, [(skew, np.array([0.002]))])
     found = diagnose(table, lenses, free_intrinsics=True)
-    models = [found.after.state.model.camera(camera) for camera in (0, 1)]
+    models = [found.model.state.model.camera(camera) for camera in (0, 1)]
     assert [model.lens.name for model in models] == ['fish214', 'right']
     assert [cause.effect for cause in found.causes] == ['skew']
     assert list(found.causes[0].parameters) == ['right.shear']

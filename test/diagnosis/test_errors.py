@@ -40,7 +40,7 @@ def test_standard_errors_hold_with_local_errors_in_the_background():
         data = group_by_frame(replace(table, xyz=views.points[0][table.landmark]))
         begin = initial_state(data, lens())
         state = adjust(data, replace(begin, terms=((ViewpointShiftEffect(1), np.zeros(1)),)), ())
-        null = NullModel.fit(data, state, ())
+        null = NullModel.estimate(data, state, ())
         fitted = refit(data, state, (), null.variances)
         error, = standard_errors(null)
         off.append((float(fitted.terms[0][1][0]) - SHIFT) / error)
@@ -61,7 +61,7 @@ def test_a_broad_field_of_the_image_widens_the_errors_of_the_intrinsics_it_resem
         bumps = np.exp(-(apart**2).sum(axis=-1) / 2 / (0.25 * size.max()) ** 2)
         table = replace(table, uv=table.uv + bumps @ rng.normal(size=(6, 2)) * 3 * SIGMA)
         data = group_by_frame(table)
-        null = NullModel.fit(data, adjust(data, initial_state(data, lens()), free), free)
+        null = NullModel.estimate(data, adjust(data, initial_state(data, lens()), free), free)
         fitted = refit(data, null.linear.state, free, null.variances)
         found = np.array([getattr(fitted.lens, name) for name in free])
         off.append((found - true) / total_errors(null))
@@ -77,7 +77,7 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
     terms = [(CATALOGUE['decentering'](), np.array([size, 0.0]))]
     data = group_by_frame(observe(lens(), terms, pose, views, SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
-    null = NullModel.fit(data, state, ('cx', 'cy'))
+    null = NullModel.estimate(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     if size:
@@ -96,7 +96,7 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
                            12 * SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     others = {*CATALOGUE} - {tilt.name}
-    null = NullModel.fit(data, state, ('cx', 'cy'), left_out=[*others])
+    null = NullModel.estimate(data, state, ('cx', 'cy'), left_out=[*others])
     more = model_uncertainty(null)[1]
     small = tuple(p._replace(large=p.large / 10) for p in tilt.parameters)
     monkeypatch.setattr(tilt, 'parameters', small)
@@ -113,7 +113,8 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
     data = group_by_frame(observe(near, terms, pose, views, 0.1 * SIGMA, rng))
     begin = replace(initial_state(data, near), terms=((shift, np.zeros(1)),))
     others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
-    null = NullModel.fit(data, adjust(data, begin, ('cx', 'fx')), ('cx', 'fx'), left_out=others)
+    state = adjust(data, begin, ('cx', 'fx'))
+    null = NullModel.estimate(data, state, ('cx', 'fx'), left_out=others)
     more = model_uncertainty(null)
     assert more[1] > 0 and more[2] == 0.0
 
@@ -127,7 +128,7 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
         lens(), [(decentering, np.array([8e-4, 0.0]))], pose, views, 3 * SIGMA, rng))
     begin = replace(initial_state(data, lens()), terms=((tilt, np.zeros(2)),))
     state = adjust(data, begin, ('cx', 'cy'))
-    null = NullModel.fit(data, state, ('cx', 'cy'))
+    null = NullModel.estimate(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     assert off > 4 * errors[1]
@@ -152,7 +153,7 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
              (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
     data = group_by_frame(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
-    null = NullModel.fit(data, state, ('cx', 'cy'))
+    null = NullModel.estimate(data, state, ('cx', 'cy'))
     errors, more = standard_errors(null), model_uncertainty(null)
     off = abs(state.lens.cy - lens().cy)
     assert off > 20 * errors[1]
@@ -163,7 +164,7 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     rng = np.random.default_rng(5)
     pose, views = scene(rng, frames=16)
     data = group_by_frame(observe(lens(), (), pose, views, SIGMA, rng))
-    model_scene = NullModel.fit(data, initial_state(data, lens()), ()).linear.scene
+    model_scene = NullModel.estimate(data, initial_state(data, lens()), ()).linear.scene
     shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
     bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
     table = observe(lens(), bent, pose, views, SIGMA, rng)
@@ -183,7 +184,7 @@ def test_a_calibration_says_how_far_off_an_effect_that_it_leaves_out_may_bring_i
     data, names = group_by_frame(table), ('fx', 'fy')
     state = adjust(data, initial_state(data, lens()), names)
     off = abs(state.lens.fx - lens().fx)
-    assert off > 5 * standard_errors(NullModel.fit(data, state, names))[0]
+    assert off > 5 * standard_errors(NullModel.estimate(data, state, names))[0]
     assert off < 2 * assess_lens(table, state.lens, names).stderr['fx'] < 4 * off
 
 

@@ -140,7 +140,7 @@ def test_a_rig_that_bends_anew_in_every_frame_is_no_image_that_moves(alone):
     off = (value - turns + turns.mean(axis=0)) / error
     assert 0.7 < np.sqrt((off**2).mean()) < 1.3
     # Where the rig stood in a frame that was left out is not known.
-    assert 'depth_error_m' not in known_errors(found.before, found.after, ())
+    assert 'depth_error_m' not in known_errors(found.simulation, found.model, ())
 
 
 def test_one_frame_that_gains_most_is_no_reason_for_doubt_nor_for_trust():
@@ -157,7 +157,7 @@ def test_a_refit_beside_a_lens_that_is_far_off_leads_nowhere_worse():
     true = lens().with_parameters(('fx', 'fy'), [1.33 * lens().fx, 1.33 * lens().fy])
     data = group_by_frame(observe(true, (), pose, views, SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ())
-    variances = NullModel.fit(data, state, ()).variances
+    variances = NullModel.estimate(data, state, ()).variances
     shifted = with_effect(state, CATALOGUE['viewpoint_shift'](), np.array([0.03]))
 
     def misfit(state):
@@ -178,7 +178,7 @@ def test_what_was_taken_in_stays_for_as_long_as_it_gains_more_than_its_error(
     whole = EffectTests.held_out_gain
 
     def held_out_gain(tests, included, columns, effect):
-        if np.isin(columns, tests.null.included).all():  # it has been taken in
+        if np.isin(columns, tests.null.included_columns).all():  # it has been taken in
             return HeldOutGain(gain, 1.0)
         return whole(tests, included, columns, effect)
 

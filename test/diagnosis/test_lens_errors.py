@@ -80,12 +80,12 @@ def test_poses_scatter_as_the_lens_file_says(board):
     for _ in range(SAMPLES):
         true = points + (1e-3 * OFFSET * rng.normal(size=points.shape) if board else 0.0)
         uv.append(seen_by(lens, pose, true, rng))
-    errors = LensErrors.of(lens)
-    weight = np.full((SAMPLES, len(points)), 1 / errors.allowing(NOISE))
+    errors = LensErrors.from_lens(lens)
+    weight = np.full((SAMPLES, len(points)), 1 / errors.inflate_sigma(NOISE))
     views = views_of(points, np.array(uv), weight)
     start = Pose(*(np.repeat(part[None], SAMPLES, axis=0) for part in pose))
     solved = localize(ForwardModel(lens), views, start)
-    parts = errors.of_solved(views.take([0]), solved.take([0]), None)
+    parts = errors.of_solved_poses(views.take([0]), solved.take([0]), None)
     off = solved.pose.difference(start)
     pull = np.einsum('si,ij,sj->s', off, np.linalg.inv(parts.total[0]), off) / 6
     assert np.mean(pull) == pytest.approx(1, abs=0.15)
@@ -101,12 +101,12 @@ def test_stereo_points_scatter_as_the_lens_files_say():
                       for _ in range(SAMPLES)])
     found = triangulate_optimally(
         ForwardModel(lens), ForwardModel(lens), rig, pairs[:, 0], pairs[:, 1], NOISE)
-    parts = depth_errors(LensErrors.of(lens), LensErrors.of(lens), rig, points)
+    parts = depth_errors(LensErrors.from_lens(lens), LensErrors.from_lens(lens), rig, points)
     off = found.points - points
     pull = np.einsum('sni,nij,snj->sn', off, np.linalg.inv(parts.total), off) / 3
     assert pull.mean(axis=0) == pytest.approx(np.ones(3), abs=0.25)
     nowhere = np.array([[np.nan] * 3, [0.0, 0.0, -5.0], points[0]])
-    holes = depth_errors(LensErrors.of(lens), LensErrors.of(lens), rig, nowhere)
+    holes = depth_errors(LensErrors.from_lens(lens), LensErrors.from_lens(lens), rig, nowhere)
     assert np.isnan(holes.total[:2]).all()
     np.testing.assert_allclose(holes.total[2], parts.total[0], rtol=0.01)
 
@@ -116,9 +116,9 @@ def test_a_diagnosis_and_its_lens_file_say_the_same(tmp_path):
     table = board_table(lens, np.random.default_rng(3), 8)
     found = diagnose(table, lens, free_intrinsics=True, options=DiagnosisOptions(quick=True))
     save_lens(found.lens, tmp_path / 'lens.yaml')
-    errors = LensErrors.of(load_lens(tmp_path / 'lens.yaml'))
-    views, pose = found.after.data.views, found.after.state.pose
-    said, carried = found.errors.of_poses(found.after), errors.of_poses(views, pose)
+    errors = LensErrors.from_lens(load_lens(tmp_path / 'lens.yaml'))
+    views, pose = found.model.data.views, found.model.state.pose
+    said, carried = found.errors.of_poses(found.model), errors.of_poses(views, pose)
     np.testing.assert_allclose(carried.parameters, said.parameters, rtol=1e-6, atol=1e-15)
     np.testing.assert_allclose(carried.misfit, said.misfit, rtol=1e-4, atol=1e-12)
     assert errors.noise == pytest.approx(found.noise_px) and said.misfit.any()
@@ -148,7 +148,7 @@ def test_library_and_core_say_the_same_and_misfit_is_no_doubt():
     table = make_observations(np.zeros(len(BOARD), int), np.arange(len(BOARD)), uv, BOARD,
                               sigma=np.full(len(BOARD), NOISE))
     plain, known = fsvp.localize(table, lens), fsvp.localize(table, lens, model_error=True)
-    poses, parts = localize_with_errors(LensErrors.of(lens), table)
+    poses, parts = localize_with_errors(LensErrors.from_lens(lens), table)
     np.testing.assert_array_equal(known.covariance, parts.total)
     assert plain.reasons[0] and not known.reasons[0] and not poses.reasons[0]
     bare = localize(ForwardModel(lens), poses.views._replace(
@@ -178,14 +178,14 @@ def test_a_budget_of_a_lens_that_knows_its_errors():
 def test_a_lens_without_errors_or_with_half_of_them_is_refused():
     lens = uncertain()
     with pytest.raises(LensError, match='no uncertainty'):
-        LensErrors.of(replace(lens, uncertainty=None))
+        LensErrors.from_lens(replace(lens, uncertainty=None))
     for name, value in (('noise_px', -1.0), ('covariance', [[1.0]]), ('extent_px', None),
                         ('landmarks', []), ('landmarks', [[float('nan'), 0, 0, 0, 0]]),
                         ('extent_px', [[5.0, 5.0], [5.0, 9.0]]), ('noise_px', 10**400),
                         ('covariance', (-np.eye(6)).tolist()),
                         ('components', {'image_coarse': float('nan')})):
         with pytest.raises(LensError, match='uncertainty'):
-            LensErrors.of(replace(lens, uncertainty={**lens.uncertainty, name: value}))
+            LensErrors.from_lens(replace(lens, uncertainty={**lens.uncertainty, name: value}))
 
 
 def test_what_the_target_is_uncertain_by_needs_no_boards_to_be_told():
@@ -200,7 +200,8 @@ def test_what_the_target_is_uncertain_by_needs_no_boards_to_be_told():
         'components': {}})
     pose = Pose(rotation_from_vector(np.array([[0.3, -0.2, 0.1]])), np.array([[0.05, 0.0, -0.3]]))
     views = views_of(points, np.zeros((1, 35, 2)))
-    told, untold = (LensErrors.of(lens).of_poses(views._replace(board=board), pose).parameters
+    errors = LensErrors.from_lens(lens)
+    told, untold = (errors.of_poses(views._replace(board=board), pose).parameters
                     for board in (np.full_like(views.board, 4), views.board))
     assert np.sqrt(told[0, 2, 2]) > 1e-5
     np.testing.assert_allclose(untold, told, rtol=1e-12)

@@ -45,10 +45,10 @@ def test_water_is_named_and_measured(lens, others):
         entry = cause.parameters[name]
         assert abs(entry['value'] - getattr(PORT, name)) < 4 * entry['stderr']
     assert cause.parameters['medium_index']['value'] == pytest.approx(1.34, rel=0.01)
-    assert found.extended.heldout_rms_px < 0.2 < found.base.heldout_rms_px
+    assert found.figures.extended.heldout_rms_px < 0.2 < found.figures.base.heldout_rms_px
     assert sum(c.share for c in found.components) == pytest.approx(1.0)
     assert found.lens.port.medium_index == cause.parameters['medium_index']['value']
-    assert found.lens.fx == AIR.fx and found.gain.value > 0.9
+    assert found.lens.fx == AIR.fx and found.figures.gain.value > 0.9
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
     assert 'in air, too' not in verdict_sentences(found)[2]
 
@@ -79,7 +79,7 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     theta = np.radians([20.0, 40.0, 60.0])
     heights = [one.fx * one.image_height.value_and_slope(theta)[0] for one in (found.lens, AIR)]
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
-    assert found.extended.heldout_rms_px < 0.2
+    assert found.figures.extended.heldout_rms_px < 0.2
     assert any('leaves open' in advice.what for advice in found.advice)
     assert 'diagnose the photographs in air, too' in verdict_sentences(found)[2]
 
@@ -90,12 +90,13 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
 ])
 def test_a_covariance_that_cannot_be_is_refused(block):
     with pytest.raises(LensError, match="'air': calibration: covariance"):
-        InAir.of(replace(AIR, calibration=block))
+        InAir.from_lens(replace(AIR, calibration=block))
 
 
 def test_what_a_lens_file_tells_of_its_focal_length():
-    assert InAir.of(replace(AIR, calibration={'stderr': {'fx': 1.0}})) is None
-    known = InAir.of(replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]}))
+    assert InAir.from_lens(replace(AIR, calibration={'stderr': {'fx': 1.0}})) is None
+    known = InAir.from_lens(
+        replace(AIR, calibration={'stderr': {'f': 2.1}, 'covariance': [[4.41]]}))
     assert known.focal == pytest.approx(0.005) and known.reach == np.inf
     off = replace(AIR, fx=AIR.fx + 4.2, fy=AIR.fx + 4.2)
     assert known.squared_distance(off) == pytest.approx(4.0)
@@ -103,7 +104,7 @@ def test_what_a_lens_file_tells_of_its_focal_length():
 
 def test_what_a_diagnosis_in_air_found_takes_the_place_of_the_calibration():
     given = replace(uncertain(), calibration={'stderr': {'fx': 9.0}, 'covariance': [[81.0]]})
-    known = InAir.of(given)
+    known = InAir.from_lens(given)
     assert known.names == ('fx', 'fy', 'cx', 'cy', 'k1')
     assert known.focal == pytest.approx(STDERR[0] / given.fx)
 
@@ -134,7 +135,7 @@ def test_what_is_no_medium_is_not_called_one(true):
 def test_a_lens_moves_as_far_as_photographs_in_air_allow(true, near):
     stderr = {'fx': 0.02 * AIR.fx, 'fy': 0.02 * AIR.fy, 'cx': 2.0, 'cy': 2.0, 'k1': 0.1}
     covariance = np.diag(np.square([*stderr.values()])).tolist()
-    known = InAir.of(replace(AIR, calibration={'stderr': stderr, 'covariance': covariance}))
+    known = InAir.from_lens(replace(AIR, calibration={'stderr': stderr, 'covariance': covariance}))
     data = group_by_frame(photographs(true, true.port, seed=20))
     wet = known.fit_behind_port(data, replace(known.lens, port=PORT), PORT_PLACE, MEDIUM_INDEX)
     assert (wet is not None) == near

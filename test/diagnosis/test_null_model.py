@@ -271,12 +271,12 @@ def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
 
 def test_variances_that_were_put_in_come_out():
     linear = linearised(seed=5, offsets=2e-4)
-    null = NullModel.fit(linear.data, linear.state, ())
+    null = NullModel.estimate(linear.data, linear.state, ())
     tau = dict(zip(NAMES, null.variances.tau, strict=True))
     # Of a t distribution, so the scale is below the standard deviation of the bulk, 0.2 mm.
     assert 0.1 < tau['landmark_in_plane'] < 0.25
     assert null.variances.sigma == pytest.approx(SIGMA, rel=0.08)
-    p = component_p_values(null.equations_of(null.included), null.variances)
+    p = component_p_values(null.equations_of(null.included_columns), null.variances)
     assert p[NAMES.index('landmark_in_plane')] < 1e-9
 
 
@@ -296,7 +296,7 @@ def test_a_variance_of_zero_is_rarely_called_for():
 
 def test_without_variances_there_is_nothing_but_noise():
     linear = linearised(seed=6)
-    null = NullModel.fit(linear.data, linear.state, ())
+    null = NullModel.estimate(linear.data, linear.state, ())
     assert null.variances.sigma == pytest.approx(SIGMA, rel=0.08)
     fitted = FittedModel.of_state(null.linear, null.variances)
     left = fitted.residuals()[linear.row_mask]
@@ -329,7 +329,7 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
     assert not np.isfinite(Linearization(linear.data, after(1.0), ()).residual).all()
     state, residual = shorten_step(linear.data, (), after)
     assert np.isfinite(residual).all() and state.terms[0][1] < 10.0
-    refitted = refit(linear.data, after(0.0), (), NullModel.fit(
+    refitted = refit(linear.data, after(0.0), (), NullModel.estimate(
         linear.data, linear.state, ()).variances)
     assert np.isfinite(Linearization(linear.data, refitted, ()).residual).all()
 
@@ -337,10 +337,10 @@ def test_a_step_that_takes_points_out_of_sight_is_cut_short():
 def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
     free = intrinsic_names(lens())
     linear = linearised(seed=8, free=free)
-    null = NullModel.fit(linear.data, linear.state, free)
+    null = NullModel.estimate(linear.data, linear.state, free)
     nothing = Variances(1.0, np.full(len(NAMES), LAMBDA_ABSENT), null.variances.weight)
     bare = replace(null, variances=nothing)
-    own = null.included
+    own = null.included_columns
     form = next(i for i, e in enumerate(null.fixed.forms.effects) if e.name == 'decentering')
     columns = null.form_columns(form)
     found = EffectTests(bare).score(eliminate(bare.information, own), columns)
@@ -359,8 +359,8 @@ def test_score_is_the_f_test_of_nested_models_where_nothing_is_random():
 
 def test_doubt_about_variances_has_its_degrees_of_freedom():
     linear = linearised(seed=31, offsets=3e-4)
-    null = NullModel.fit(linear.data, linear.state, ())
-    own = null.included
+    null = NullModel.estimate(linear.data, linear.state, ())
+    own = null.included_columns
     form = next(i for i, e in enumerate(null.fixed.forms.effects) if e.name == 'target_shape')
     columns = null.form_columns(form)
     tests = EffectTests(null)
@@ -390,14 +390,14 @@ def test_p_values_are_uniform_without_an_effect():
     p_values = []
     for seed in range(10):
         linear = linearised(seed=100 + seed, offsets=2e-4 * (seed % 2))
-        null = NullModel.fit(linear.data, linear.state, ())
-        left, tests = eliminate(null.information, null.included), EffectTests(null)
+        null = NullModel.estimate(linear.data, linear.state, ())
+        left, tests = eliminate(null.information, null.included_columns), EffectTests(null)
         for form, effect in enumerate(null.fixed.forms.effects):
             simplest = effect == next(e for e in null.fixed.forms.effects if e.name == effect.name)
             if simplest and effect.name in TESTED:
                 columns = null.form_columns(form)
                 score = tests.score(left, columns)
-                sure = tests.adjust_p_value(score, null.included, columns)
+                sure = tests.adjust_p_value(score, null.included_columns, columns)
                 p_values.append(sure.p_value)
     # 40 values; a sound build fails this less than once in ten thousand runs.
     assert stats.kstest(p_values, 'uniform').pvalue > 1e-4
@@ -411,7 +411,7 @@ def test_predicted_offsets_are_near_the_true_ones():
     table = replace(table, xyz=views.points[0][table.landmark])
     data = group_by_frame(table)
     state = adjust(data, initial_state(data, lens()), ())
-    null = NullModel.fit(data, state, ())
+    null = NullModel.estimate(data, state, ())
     found = FittedModel.of_state(null.linear, null.variances).predicted_offsets()
     true = moves[found.landmark]
     # Poses and the catalogue take up part of what all landmarks do together.
@@ -425,8 +425,8 @@ def test_every_component_has_words():
 @pytest.mark.parametrize('seed', [9, 28])
 def test_a_scale_for_each_landmark_does_not_make_more_of_chance(seed):
     linear = linearised(seed)
-    null = NullModel.fit(linear.data, linear.state, ())
-    fitted, eq = null.variances, null.equations_of(null.included)
+    null = NullModel.estimate(linear.data, linear.state, ())
+    fitted, eq = null.variances, null.equations_of(null.included_columns)
     assert fitted.weight.min() < 0.8
     p, without = (component_p_values(eq, now)[NAMES.index('landmark_in_plane')]
                   for now in (fitted, fitted.with_equal_weights(OF_LANDMARKS)))

@@ -8,7 +8,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
-from fisheye_svp_ros.diagnosis.variance_budget import REPEATED
+from fisheye_svp_ros.diagnosis.variance_budget import REPEATED_COMPONENT
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -43,21 +43,21 @@ def test_what_repeats_is_found_predicted_and_told_of():
     """Of .1 px beside noise of .05 px most is predicted in frames that nothing was fitted to."""
     train, test = halves(photographed(0.1))
     found = diagnose(train, lens(), held_out=test)
-    part = next(c for c in found.components if c.name == REPEATED)
+    part = next(c for c in found.components if c.name == REPEATED_COMPONENT)
     noise = next(c for c in found.components if c.name == 'noise')
     assert part.p_value < 1e-12
     assert part.sd_px == pytest.approx(0.1, rel=0.3)
     assert noise.sd_px == pytest.approx(NOISE, rel=0.3)
     assert found.noise_px == pytest.approx(NOISE, rel=0.3)
     assert found.scatter_px == pytest.approx(np.hypot(part.sd_px, noise.sd_px))
-    assert found.extended.heldout_rms_px < 0.75 * found.base.heldout_rms_px
+    assert found.figures.extended.heldout_rms_px < 0.75 * found.figures.base.heldout_rms_px
     assert found.verdict == 'unexplained'
     assert any('differ from each other' in advice.what for advice in found.advice)
 
 
 def test_frames_in_turn_gain_by_it_too():
     found = diagnose(photographed(0.1), lens())
-    assert found.extended.heldout_rms_px < 0.75 * found.base.heldout_rms_px
+    assert found.figures.extended.heldout_rms_px < 0.75 * found.figures.base.heldout_rms_px
 
 
 def test_clean_data_have_nothing_of_it():
@@ -67,7 +67,7 @@ def test_clean_data_have_nothing_of_it():
     for _ in range(30):
         white = linear.row_mask * rng.normal(size=linear.row_mask.shape)
         assert similar_views(linear, white) is None
-    assert all(c.name != REPEATED for c in diagnose(photographed(), lens()).components)
+    assert all(c.name != REPEATED_COMPONENT for c in diagnose(photographed(), lens()).components)
 
 
 def test_data_without_noise_have_nothing_of_it():

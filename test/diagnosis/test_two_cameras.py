@@ -169,7 +169,7 @@ def test_cameras_that_were_not_photographed_together(late):
     assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
     assert 'each view was posed by itself' in sections(found)[0].sentence
     assert 'find out why no rig holds' in verdict_sentences(found)[2].lower()
-    assert found.extended.heldout_rms_px < 0.15
+    assert found.figures.extended.heldout_rms_px < 0.15
 
 
 def test_cameras_without_a_common_frame():
@@ -182,7 +182,7 @@ def test_cameras_without_a_common_frame():
     assert 'too few frames were seen by both' in sections(found)[0].sentence
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        assert known_errors(found.before, found.after, ()) == {}
+        assert known_errors(found.simulation, found.model, ()) == {}
 
 
 def test_a_wrong_lens_is_no_rig_that_moves():
@@ -207,7 +207,7 @@ def test_one_of_three_shared_frames_is_reversed(seed, which):
                      options=DiagnosisOptions(quick=True))
     assert torn_frames(found) == [shared[which]]
     # Two frames say too little of the rig for one to predict the other.
-    assert found.named.heldout_rms_px < 0.13 < found.base.heldout_rms_px < 0.21
+    assert found.figures.named.heldout_rms_px < 0.13 < found.figures.base.heldout_rms_px < 0.21
     (said,) = found.cameras
     assert said.verdict == 'agree' and not said.rig
     assert f'(frame {shared[which]})' in verdict_sentences(found)[2]
@@ -230,7 +230,7 @@ def test_reversed_frames_among_those_held_out_are_named(longer):
     found = diagnose(train, longer.lenses, held_out=reversed_in(test, shared),
                      options=DiagnosisOptions(quick=True))
     assert torn_frames(found, 'held out: ') == shared
-    assert found.named.heldout_rms_px < 0.16
+    assert found.figures.named.heldout_rms_px < 0.16
     assert f'(frames {shared[0]} and {shared[1]})' in verdict_sentences(found)[2]
 
 
@@ -238,7 +238,7 @@ def test_held_out_frames_in_which_the_rig_stands_elsewhere_are_posed_view_by_vie
     train, test = halves(longer)
     late = replace(test, frame=test.frame + test.camera)
     found = diagnose(train, longer.lenses, held_out=late, options=DiagnosisOptions(quick=True))
-    assert found.named.heldout_rms_px < 0.16
+    assert found.figures.named.heldout_rms_px < 0.16
     assert 'do not stand as in the others' in verdict_sentences(found)[2]
 
 
@@ -249,7 +249,7 @@ def test_a_rig_that_was_not_seen_predicts_nothing_in_held_out_frames(longer):
     test = test.take(np.argsort(-test.camera, kind='stable'))
     test = replace(test, cameras=('right', 'left'), camera=1 - test.camera)
     found = diagnose(apart, longer.lenses, held_out=test, options=DiagnosisOptions(quick=True))
-    assert found.named.heldout_rms_px < 0.16
+    assert found.figures.named.heldout_rms_px < 0.16
     assert not any('held-out' in advice.what for advice in found.advice)
     with pytest.raises(ObservationError, match='cam0, right'):
         diagnose(train, longer.lenses, held_out=replace(test, cameras=('cam0', 'right')))
@@ -262,7 +262,7 @@ def test_a_frame_that_alone_shows_a_part_of_the_image_spoils_no_figure():
     # Frame 19 is at the edge of the right camera's image; without it 2.8 px remain there.
     alone = [one for one in found.advice if 'the others do not predict them' in one.what]
     assert [one.frames for one in alone] == [[19]]
-    assert found.named.heldout_rms_px < 0.14 < found.base.heldout_rms_px < 0.17
+    assert found.figures.named.heldout_rms_px < 0.14 < found.figures.base.heldout_rms_px < 0.17
     (said,) = found.cameras
     assert said.verdict == 'agree'
 

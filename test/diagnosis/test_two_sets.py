@@ -52,7 +52,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     assert said.tried[0].causes['viewpoint_shift'].better
     assert said.tried[0].target is None
     e0 = said.parameters['viewpoint_shift.e0']
-    assert abs(e0.apart) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
+    assert abs(e0.standardized_difference) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
     assert 'holds in both sets' in sections(found)[0].sentence
     assert found.to_dict()['external']['sets']['against'] == 'set 32'
 
@@ -62,8 +62,8 @@ def test_nothing_of_the_target_is_predicted_of_another_one():
                   for k, seed in ((1, 31), (0, 32)))
     found = diagnose(one, lens(), free_intrinsics=True, held_out=other)
     assert {'viewpoint_shift', 'target_shape'} <= {cause.effect for cause in found.causes}
-    assert found.extended.heldout_rms_px < found.named.heldout_rms_px < 0.18
-    assert found.base.heldout_rms_px > 0.2
+    assert found.figures.extended.heldout_rms_px < found.figures.named.heldout_rms_px < 0.18
+    assert found.figures.base.heldout_rms_px > 0.2
     assert 'the same target' in ' '.join(advice.what for advice in found.advice)
 
 
@@ -77,7 +77,8 @@ def test_what_the_other_set_refutes_is_withdrawn():
     assert 'skew' not in [cause.effect for cause in found.causes]
     shear, = (said for name, said in found.against.parameters.items() if 'skew' in name)
     assert shear.value == pytest.approx(0.003, abs=4 * shear.stderr)
-    assert shear.other_value == pytest.approx(0.0, abs=4 * shear.other_stderr) and shear.apart > 5
+    assert shear.other_value == pytest.approx(0.0, abs=4 * shear.other_stderr)
+    assert shear.standardized_difference > 5
     assert 'withdrawn' in sections(found)[0].sentence
 
 
@@ -85,7 +86,7 @@ def test_parameters_that_do_not_agree_are_named():
     shift = SharedParameter(2.8e-3, 8e-5, 3.5e-3, 9e-5, 'm')
     said = TwoDatasets('b.csv', (None, None), {'e0': shift})
     assert said.verdict == 'nothing'
-    assert said.parameters['e0'].apart == pytest.approx(-5.8, abs=0.1)
+    assert said.parameters['e0'].standardized_difference == pytest.approx(-5.8, abs=0.1)
 
 
 @pytest.mark.parametrize(('low', 'high', 'better', 'worse'), [
@@ -93,7 +94,7 @@ def test_parameters_that_do_not_agree_are_named():
 ])
 def test_better_and_worse_are_beyond_chance(low, high, better, worse):
     tried = Transfer('a', 'b', 0.2, 0.18, Comparison(0.2, 0.18, (low + high) / 2, low, high))
-    assert (tried.better, tried.worse) == (better, worse)
+    assert (tried.improves, tried.worsens) == (better, worse)
 
 
 def test_the_intervals_of_predictions_hold_95_percent():

@@ -24,8 +24,8 @@ from fisheye_svp_ros.solve.rig_state import group_by_frame
 
 def errors_of(observations, free):
     data = group_by_frame(observations)
-    null = NullModel.fit(data, adjust(data, initial_state(data, AIR), free), free)
-    return ModelErrors.of(null, FittedModel.of(null)), null.linear
+    null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), free), free)
+    return ModelErrors.from_null_model(null, FittedModel.solve_null_model(null)), null.linear
 
 
 def displaced(frames, seed, size=5e-4):
@@ -80,8 +80,8 @@ def test_a_diagnosis_tells_how_far_off_poses_may_be():
 def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
     """Its landmarks are off by what was predicted, not by as much as any target's might be."""
     data = group_by_frame(displaced(8, 3))
-    null = NullModel.fit(data, adjust(data, initial_state(data, AIR), ()), ())
-    fitted, sigma = FittedModel.of(null), null.variances.sigma
+    null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
+    fitted, sigma = FittedModel.solve_null_model(null), null.variances.sigma
     modes, alone = fitted.target_modes(sigma)
     square = (modes**2).sum(axis=-1) + alone**2
     off = np.einsum('lab,lb->la', fitted.random.axes, fitted.predicted_offsets().offset)

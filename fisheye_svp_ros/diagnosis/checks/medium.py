@@ -161,7 +161,7 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     if not (_is_magnified(air, lens, curve)
             or rms_px(Linearization(data, curve, ())) > _SUSPICIOUS_PX):
         return None
-    known = InAir.of(lens)
+    known = InAir.from_lens(lens)
     media = [_assess_port(table, lens, _start_port(data, lens), free, 0.0)]
     if known is not None:
         progress('asking what photographs in air left open of the lens', 0.03)
@@ -179,7 +179,7 @@ def behind_port(problem: Problem, medium: Medium) -> Problem:
     """
     options, step = problem.options, SessionStepEffect.name
     if step not in options.included and step not in options.left_out:
-        options = options.without(step)
+        options = options.leave_out(step)
     return replace(problem, data=medium.air.data, outliers=medium.outliers, base=medium.state,
                    free=medium.names, options=options)
 
@@ -231,7 +231,7 @@ def _assess_port(
 
 def _focal_error(lens: Lens) -> float:
     """Return the relative standard error of a focal length, 0 where a lens says nothing of it."""
-    if known := InAir.of(lens):
+    if known := InAir.from_lens(lens):
         return known.focal
     match (lens.calibration or {}).get('stderr'):
         case {'fx': float(error)} | {'f': float(error)} if error > 0:

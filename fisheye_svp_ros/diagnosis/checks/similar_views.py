@@ -25,13 +25,13 @@ from fisheye_svp_ros.solve.rig_state import Linearization
 _RATIOS = (0.3, 3.0)  # of the noise's variance: where the search starts
 _REACHES = (0.1, 0.4)  # the same, of what separates views
 _LASTING = (0.02, 1.0)  # the same, of the time that the data span
-_BOUND = 30.0  # times a start: as far as the search goes
-_PRECISE = 1e-7  # of the log likelihood
+_SEARCH_RANGE = 30.0  # times a start: as far as the search goes
+_LIKELIHOOD_TOLERANCE = 1e-7  # of the log likelihood
 _MOST_VIEWS, _MOST_CUBES = 150, 3e8  # of a landmark, and of all: what the parameters are read from
-_ROOM = 4e6  # numbers in one kernel
+_MAX_KERNEL_SIZE = 4e6  # numbers in one kernel
 
 
-class Grouped(NamedTuple):
+class LandmarkViews(NamedTuple):
     """The views of each landmark by each camera, padded.
 
     key (L, 2): camera and landmark; row (L, V): of the points (S N), -1 where there is none;
@@ -45,17 +45,17 @@ class Grouped(NamedTuple):
     t: Array
 
     @property
-    def there(self) -> Mask:
+    def mask(self) -> Mask:
         """Which places (L, V) hold a view."""
         return self.row >= 0
 
-    def take(self, landmarks: Index | slice, views: slice = slice(None)) -> Grouped:
+    def take(self, landmarks: Index | slice, views: slice = slice(None)) -> LandmarkViews:
         """Return some of the landmarks, and so many views of each."""
         at = landmarks, views
-        return Grouped(self.key[landmarks], self.row[at], self.seen[at], self.t[at])
+        return LandmarkViews(self.key[landmarks], self.row[at], self.seen[at], self.t[at])
 
     @classmethod
-    def of(cls, linear: Linearization) -> Grouped:
+    def gather(cls, linear: Linearization) -> LandmarkViews:
         """Gather the views of a linearisation."""
         views = linear.data.views
         used = np.flatnonzero(views.used)
@@ -76,43 +76,43 @@ class SimilarViews(NamedTuple):
     """A fitted process of known views.
 
     variance, px^2 on the axis: it grows with the angle as the noise does; reach, in units of
-    `Grouped.seen`; lasting, s, infinite where times are not known; weights (L, V, 2): of known
-    views in predictions; own (S, N, 2): what the others of its landmark predict of each view, px;
-    share: of what noise seemed to be; p_value.
+    `LandmarkViews.seen`; lasting, s, infinite where times are not known; weights (L, V, 2): of
+    known views in predictions; cross_predictions (S, N, 2): what the others of its landmark
+    predict of each view, px; share: of what noise seemed to be; p_value.
     """
 
-    known: Grouped
+    known: LandmarkViews
     variance: float
     reach: float
     lasting: float
     weights: Array
-    own: Array
+    cross_predictions: Array
     share: float
     p_value: float
 
-    def at(self, linear: Linearization) -> Array:
+    def predict(self, linear: Linearization) -> Array:
         """Return what is predicted of other views (S, N, 2), px, zero where none is like them."""
-        other, known = Grouped.of(linear), self.known
+        other, known = LandmarkViews.gather(linear), self.known
         _, label = np.unique(
             np.concatenate([other.key, known.key]), axis=0, return_inverse=True)
         mine, theirs = np.split(label.ravel(), [len(other.key)])
         _, here, there = np.intersect1d(mine, theirs, return_indices=True)
         predicted = np.zeros((*other.row[here].shape, 2))
         for some in _batches(len(here), predicted.shape[1] * known.row.shape[1]):
-            between = _Between.of(other.take(here[some]), known.take(there[some]))
+            between = _ViewDistances.measure(other.take(here[some]), known.take(there[some]))
             predicted[some] = self.variance * between.kernel(
                 self.reach, self.lasting) @ self.weights[there[some]]
         return _in_px(linear, other.row[here], predicted)
 
 
-class _Between(NamedTuple):
+class _ViewDistances(NamedTuple):
     """What separates views: squares (L, V, W) of how they are seen, and times (L, V, W), s."""
 
     squares: Array
     times: Array
 
     @classmethod
-    def of(cls, some: Grouped, other: Grouped) -> _Between:
+    def measure(cls, some: LandmarkViews, other: LandmarkViews) -> _ViewDistances:
         squares = (some.seen**2).sum(axis=-1)[..., None] + (other.seen**2).sum(axis=-1)[:, None]
         squares -= 2 * some.seen @ np.swapaxes(other.seen, -1, -2)
         return cls(np.maximum(squares, 0.0), np.abs(some.t[..., None] - other.t[:, None]))
@@ -133,14 +133,14 @@ class _Process:
     The noise is its variance, 1 for padding; both px on the axis.
     """
 
-    between: _Between
+    between: _ViewDistances
     there: Mask
     residual: Array
     noise: Array
 
     @classmethod
-    def of(cls, known: Grouped, residual: Array, noise: Array) -> _Process:
-        return cls(_Between.of(known, known), known.there, residual, noise)
+    def from_views(cls, known: LandmarkViews, residual: Array, noise: Array) -> _Process:
+        return cls(_ViewDistances.measure(known, known), known.mask, residual, noise)
 
     def covariance(self, variance: float, reach: float, lasting: float) -> Array:
         """Return the covariance (L, V, V)."""
@@ -156,16 +156,19 @@ class _Process:
         squares = float((self.residual * np.linalg.solve(covariance, self.residual)).sum())
         return float(-log_det - self.there.sum() * np.log(max(squares, 1e-300)))
 
-    def best(self, starts: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
+    def maximize_likelihood(
+        self, starts: Sequence[tuple[float, ...]]
+    ) -> tuple[float, float, float]:
         """Return variance, reach and lasting of the highest likelihood."""
 
-        def lost(logarithms: Array) -> float:
-            return -self.log_likelihood(*_three(logarithms))
+        def loss(logarithms: Array) -> float:
+            return -self.log_likelihood(*_unpack_parameters(logarithms))
 
-        start = min(np.log(starts), key=lost)
-        around = [(x - np.log(_BOUND), x + np.log(_BOUND)) for x in start]
-        return _three(optimize.minimize(
-            lost, start, method='L-BFGS-B', bounds=around, options={'ftol': _PRECISE}).x)
+        start = min(np.log(starts), key=loss)
+        around = [(x - np.log(_SEARCH_RANGE), x + np.log(_SEARCH_RANGE)) for x in start]
+        return _unpack_parameters(optimize.minimize(
+            loss, start, method='L-BFGS-B', bounds=around,
+            options={'ftol': _LIKELIHOOD_TOLERANCE}).x)
 
 
 def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None:
@@ -174,33 +177,33 @@ def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None
     None where no landmark is seen twice, or nothing repeats beyond chance.  Of many landmarks and
     views some say what the parameters are; what is predicted rests on all.
     """
-    data, known = linear.data, Grouped.of(linear)
+    data, known = linear.data, LandmarkViews.gather(linear)
     count, views = known.row.shape
     if views < 2:
         return None
     # A detector's sigma is of its noise, and not of what comes again.
     sigma = 1 / np.where(data.views.used, data.views.weight, 1.0)
     residual = np.where(
-        known.there[..., None],
+        known.mask[..., None],
         (data.by_view(whitened) * sigma[..., None]).reshape(-1, 2)[known.row], 0.0)
-    noise = np.where(known.there, (sigma**2).ravel()[known.row], 1.0)
-    typical = float(noise[known.there].mean())
+    noise = np.where(known.mask, (sigma**2).ravel()[known.row], 1.0)
+    typical = float(noise[known.mask].mean())
     few = slice(min(views, _MOST_VIEWS))
     every = int(np.ceil(count * float(few.stop) ** 3 / _MOST_CUBES))
-    process = _Process.of(
+    process = _Process.from_views(
         known.take(slice(None, None, every), few), residual[::every, few], noise[::every, few])
-    span = float(np.ptp(known.t[known.there]))
+    span = float(np.ptp(known.t[known.mask]))
     lasting = [(span * part,) for part in _LASTING] if span > 0 else [()]
     starts = [(ratio * typical, reach, *lasts)
               for ratio, reach, lasts in product(_RATIOS, _REACHES, lasting)]
-    found = process.best(starts)
+    found = process.maximize_likelihood(starts)
     gain = process.log_likelihood(*found) - process.log_likelihood(0.0, *found[1:])
     p = float(special.chdtrc(len(starts[0]), max(2 * gain, 0.0)))
     if p * len(NAMES) > SIGNIFICANCE:
         return None
     weights, own = np.zeros((2, *residual.shape))
     for some in _batches(count, views**2):
-        one = _Process.of(known.take(some), residual[some], noise[some])
+        one = _Process.from_views(known.take(some), residual[some], noise[some])
         inverse = np.linalg.inv(one.covariance(*found))
         weights[some] = inverse @ one.residual
         own[some] = one.residual - weights[some] / np.einsum('lvv->lv', inverse)[..., None]
@@ -210,11 +213,11 @@ def similar_views(linear: Linearization, whitened: Array) -> SimilarViews | None
 
 def _batches(landmarks: int, size: int) -> Iterator[slice]:
     """Yield landmarks in parts whose kernels, of such a size each, there is room for."""
-    step = max(int(_ROOM // max(size, 1)), 1)
+    step = max(int(_MAX_KERNEL_SIZE // max(size, 1)), 1)
     return (slice(start, start + step) for start in range(0, landmarks, step))
 
 
-def _three(logarithms: Array) -> tuple[float, float, float]:
+def _unpack_parameters(logarithms: Array) -> tuple[float, float, float]:
     """Return variance, reach and lasting; without times, a process that lasts."""
     variance, reach, lasting = [*np.exp(logarithms), np.inf][:3]
     return float(variance), float(reach), float(lasting)

@@ -34,6 +34,7 @@ from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
+_MIN_DISPLACEMENT = 1e-9  # m
 _MIN_COMMON_LANDMARKS = 6  # landmarks, the fewest that two maps are compared by
 
 
@@ -52,9 +53,9 @@ class Transfer:
     less_px: Comparison
 
     @classmethod
-    def of(cls, source: str, to: str, without: HeldOut, carried: HeldOut) -> Transfer:
+    def compare(cls, source: str, to: str, without: HeldOut, carried: HeldOut) -> Transfer:
         """Compare two predictions of the same frames, those that the others can predict."""
-        rows = without.predicted | carried.predicted
+        rows = without.is_predictable | carried.is_predictable
         without, carried = without.take(rows), carried.take(rows)
         return cls(source, to, without.rms, carried.rms, rms_reduction(without, carried))
 
@@ -63,12 +64,12 @@ class Transfer:
         return asdict(self) | {'less_px': self.less_px.interval}
 
     @property
-    def better(self) -> bool:
+    def improves(self) -> bool:
         """Whether it predicts better beyond chance."""
         return self.less_px.low > 0
 
     @property
-    def worse(self) -> bool:
+    def worsens(self) -> bool:
         """Whether it predicts worse beyond chance."""
         return self.less_px.high < 0
 
@@ -162,9 +163,9 @@ class TwoCameras:
             return 'nothing'
         apart = bool(self.rig) and not self.posed_alone and all(
             moved.high < 0 for moved in self.rig.values())
-        if apart or any(one.worse for one in self.target):
+        if apart or any(one.worsens for one in self.target):
             return 'contradict'
-        return 'agree' if all(one.better for one in self.target) else 'undecided'
+        return 'agree' if all(one.improves for one in self.target) else 'undecided'
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
@@ -201,7 +202,7 @@ def agree_on_target(
     if not gone or all(pair.verdict != 'contradict' for pair in pairs):
         return selection, pairs
     selection = select_causes(
-        replace(problem, options=problem.options.without(*gone)),
+        replace(problem, options=problem.options.leave_out(*gone)),
         lambda stage, _: progress(stage, 0.79))
     return selection, [replace(pair, withdrawn=gone if pair.verdict == 'contradict' else ())
                        for pair in pairs]
@@ -260,7 +261,7 @@ def _compare(one: _Camera, other: _Camera, known: KnownTarget) -> TwoCameras:
             _, without = fit_and_predict(data, state, mine.free)
             data = displace_target(data, known, less_similarity(known.points, source.target))
             after, there = fit_and_predict(data, state, mine.free)
-            carried.append(Transfer.of(source.name, mine.name, without, there))
+            carried.append(Transfer.compare(source.name, mine.name, without, there))
         poses.append((adjust(mine.data, mine.before, mine.free).pose, after.pose))
     return TwoCameras((one.name, other.name), tuple(carried), _maps(one, other, known),
                       _scatter((one.data, other.data), poses))
@@ -285,8 +286,9 @@ def _maps(one: _Camera, other: _Camera, known: KnownTarget) -> TargetMaps | None
 
 
 def _correlation(one: Array, other: Array) -> float:
+    """Return how alike two displacements are, m; those of rounding are no displacements."""
     size = np.sqrt((one**2).sum() * (other**2).sum())
-    return float((one * other).sum() / size) if size > 0 else 0.0
+    return float((one * other).sum() / size) if size > _MIN_DISPLACEMENT**2 else 0.0
 
 
 def _scatter(

@@ -30,7 +30,7 @@ from fisheye_svp_ros.effects.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.optics.lens import INTRINSICS
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
-_SAME_PLACE = 1e-6  # m: no two targets are told apart by less
+_PLACE_TOLERANCE = 1e-6  # m: no two targets are told apart by less
 
 
 class SharedParameter(NamedTuple):
@@ -43,7 +43,7 @@ class SharedParameter(NamedTuple):
     unit: str
 
     @property
-    def apart(self) -> float:
+    def standardized_difference(self) -> float:
         """The difference over its standard error."""
         return (self.value - self.other_value) / float(np.hypot(self.stderr, self.other_stderr))
 
@@ -51,7 +51,7 @@ class SharedParameter(NamedTuple):
 class DatasetModel(NamedTuple):
     """What was found of one data set: the simulation as it was fitted, and the extended model."""
 
-    before: Linearization
+    simulation: Linearization
     null: NullModel
 
 
@@ -84,10 +84,10 @@ class TwoDatasets:
     withdrawn: tuple[str, ...] = ()
 
     @property
-    def refuted(self) -> list[str]:
+    def refuted_causes(self) -> list[str]:
         """The causes of this set without which the other is predicted better beyond chance."""
         return [] if self.tried[0] is None else [
-            name for name, one in self.tried[0].causes.items() if one.worse]
+            name for name, one in self.tried[0].causes.items() if one.worsens]
 
     @property
     def verdict(self) -> str:
@@ -95,22 +95,22 @@ class TwoDatasets:
         both = [one.lens for one in self.tried if one is not None]
         if not both:
             return 'nothing'
-        if self.withdrawn or any(one.worse for one in both):
+        if self.withdrawn or any(one.worsens for one in both):
             return 'contradict'
-        return 'agree' if all(one.better for one in both) else 'undecided'
+        return 'agree' if all(one.improves for one in both) else 'undecided'
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
-        def plain(one: Transfer | None) -> dict[str, Any] | None:
+        def entry(one: Transfer | None) -> dict[str, Any] | None:
             return None if one is None else one.to_dict()
 
         return {
             'against': self.source, 'verdict': self.verdict, 'withdrawn': list(self.withdrawn),
             'tried': [{
-                'lens': plain(one.lens), 'whole': plain(one.whole), 'target': plain(one.target),
-                'causes': {name: plain(cause) for name, cause in one.causes.items()},
+                'lens': entry(one.lens), 'whole': entry(one.whole), 'target': entry(one.target),
+                'causes': {name: entry(cause) for name, cause in one.causes.items()},
             } for one in self.tried if one is not None],
-            'parameters': {name: one._asdict() | {'apart': one.apart}
+            'parameters': {name: one._asdict() | {'apart': one.standardized_difference}
                            for name, one in self.parameters.items()},
         }
 
@@ -139,15 +139,15 @@ def _transfer_causes(
         return fit_and_predict(data, there, free, effect_names(terms))[1]
 
     without, there = predict(()), predict(carried)
-    whole = (predict((), replace(bare, lens=one.before.state.lens), ()),
+    whole = (predict((), replace(bare, lens=one.simulation.state.lens), ()),
              predict(carried, replace(bare, lens=one.null.linear.state.lens), ()))
     causes = {
-        effect.name: Transfer.of(source, to, predict(
+        effect.name: Transfer.compare(source, to, predict(
             [term for term in carried if term[0].name != effect.name]), there)
         for effect, _ in carried
     }
     return TransferredCauses(
-        Transfer.of(source, to, without, there), Transfer.of(source, to, *whole), causes,
+        Transfer.compare(source, to, without, there), Transfer.compare(source, to, *whole), causes,
         _transfer_target(one, other, source, to))
 
 
@@ -158,7 +158,7 @@ def _transfer_target(
     known, there = (KnownTarget.of(d.null.linear.data.views) for d in (one, other))
     if not any(map(displaces_landmarks, one.null.linear.state.terms)) or not (
         np.array_equal(known.landmark, there.landmark)
-        and np.abs(known.points - there.points).max() < _SAME_PLACE
+        and np.abs(known.points - there.points).max() < _PLACE_TOLERANCE
     ):
         return None
     fitted = FittedModel.of_state(one.null.linear, one.null.variances)
@@ -167,7 +167,7 @@ def _transfer_target(
     shift = less_similarity(known.points, fitted_target(fitted, known))
     _, without = fit_and_predict(linear.data, state, linear.free)
     _, carried = fit_and_predict(displace_target(linear.data, known, shift), state, linear.free)
-    return Transfer.of(source, to, without, carried)
+    return Transfer.compare(source, to, without, carried)
 
 
 def _parameters(one: DatasetModel, other: DatasetModel) -> dict[str, SharedParameter]:
@@ -198,7 +198,7 @@ def _estimates(one: DatasetModel, state: RigState) -> dict[str, tuple[float, flo
     state = refit(data, state, free, variances)
     null = NullModel.with_variances(data, state, free, variances)
     errors = standard_errors(null)
-    rig = null.own - len(free) - sum(len(values) for _, _, values in null.terms)
+    rig = null.column_count - len(free) - sum(len(values) for _, _, values in null.terms)
     found = {name: (state.parameters[name], float(errors[rig + i]),
                     'px' if name in INTRINSICS else '') for i, name in enumerate(free)}
     for effect, columns, values in null.terms:
