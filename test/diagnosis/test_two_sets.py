@@ -49,7 +49,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     said = found.against
     assert said.verdict == 'agree' and not said.withdrawn
     assert set(said.tried[0].causes) == {'viewpoint_shift'}
-    assert said.tried[0].causes['viewpoint_shift'].better
+    assert said.tried[0].causes['viewpoint_shift'].improves
     assert said.tried[0].target is None
     e0 = said.parameters['viewpoint_shift.e0']
     assert abs(e0.standardized_difference) < 3 and e0.value == pytest.approx(0.02, abs=0.003)

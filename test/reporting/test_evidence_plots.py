@@ -56,7 +56,7 @@ def test_no_tick_label_of_the_evidence_covers_another(
 ) -> None:
     fit = SimpleNamespace(heldout_rms_px=0.5)
     evidence_plots.draw_evidence(Path(), SimpleNamespace(  # type: ignore[arg-type]
-        causes=[], base=fit, extended=fit, noise_px=0.1,
+        causes=[], figures=SimpleNamespace(base=fit, extended=fit), noise_px=0.1,
         trace=[SimpleNamespace(effect=f'effect {n}', statistic=value, accepted=True)
                for n, value in enumerate(statistics)]))
     canvas = FigureCanvasAgg(figures[0])
