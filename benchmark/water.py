@@ -23,18 +23,18 @@ import numpy as np
 
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.diagnosis import (
-    assess_lens,
-    calibrate_without_outliers,
-    diagnose,
-    with_covariance,
-)
+from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.study.lens_trust import (
+    assess_lens,
+    calibrate_without_outliers,
+    with_covariance,
+)
 
 KINDS = ('water', 'water', 'water', 'plate', 'focal', 'curve', 'air')
 _HALVINGS = 60

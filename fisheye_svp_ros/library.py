@@ -284,7 +284,7 @@ def calibrate(
     Gross errors are set aside, and standard errors are honest, as those of the command.
     progress: called with each stage and the share that is done.
     """
-    from fisheye_svp_ros.diagnosis import (
+    from fisheye_svp_ros.study.lens_trust import (
         assess_lens,
         calibrate_without_outliers,
         with_covariance,
@@ -388,7 +388,7 @@ def diagnose(
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
-    from fisheye_svp_ros.diagnosis import posable_observations
+    from fisheye_svp_ros.solve.measured_poses import posable_observations
 
     known = load_lens(lens)
     table, _ = posable_observations(_table(observations), known)

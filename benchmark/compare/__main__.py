@@ -36,7 +36,6 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     Diagnosis,
     PredictedOffsets,
     diagnose,
-    posable_observations,
     predict_other_data,
 )
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
@@ -44,6 +43,9 @@ from fisheye_svp_ros.library import Localized  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
+from fisheye_svp_ros.solve.measured_poses import (  # noqa: E402
+    posable_observations,
+)
 from fisheye_svp_ros.solve.rig_state import group_by_frame  # noqa: E402
 
 _DOC = Path(__file__).parents[2] / 'docs' / 'results' / 'compare.md'

@@ -120,7 +120,11 @@ def _calibrate_camera(
     table: Observations, args: argparse.Namespace, size: tuple[int, int], name: str
 ) -> CalibratedCamera:
     """Return the lens, the rows that it is of, without outliers, and what may be trusted."""
-    from fisheye_svp_ros.diagnosis import assess_lens, calibrate_without_outliers, with_covariance
+    from fisheye_svp_ros.study.lens_trust import (
+        assess_lens,
+        calibrate_without_outliers,
+        with_covariance,
+    )
 
     port = port_of(args)
     note_huge(table)
@@ -154,7 +158,7 @@ def _rig(
     folder: Path | None,
 ) -> None:
     """Calibrate, print and write the rig between two calibrated cameras."""
-    from fisheye_svp_ros.diagnosis import MAX_RIG_RATIO, MIN_SHARED_FRAMES
+    from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
 
     left, right = (ForwardModel(lenses[name]) for name in names)
     try:
@@ -187,8 +191,10 @@ def _common_frames(observations: Observations, lenses: dict[str, Lens]) -> Obser
 
     Raises ObservationError where there is no such frame, or no rig explains most of them.
     """
-    from fisheye_svp_ros.diagnosis import FRAME, find_outliers, is_unrelated, posable_observations
     from fisheye_svp_ros.solve.initial_rig import initial_state
+    from fisheye_svp_ros.solve.measured_poses import posable_observations
+    from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
+    from fisheye_svp_ros.solve.rig_checks import is_unrelated
     from fisheye_svp_ros.solve.rig_state import group_by_frame
 
     def shared(table: Observations) -> Observations:

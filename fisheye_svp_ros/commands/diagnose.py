@@ -29,8 +29,9 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, PointResiduals
+    from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
     from fisheye_svp_ros.planning.plan import NextViews
+    from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,16 +71,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
-    from fisheye_svp_ros.diagnosis import (
-        DiagnosisOptions,
-        diagnose,
-        diagnose_against,
-        free_parameters,
-        known_errors,
-        poses_by_frame,
-        rig_lenses,
-    )
+    from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
     from fisheye_svp_ros.reporting.progress import stages
+    from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
+    from fisheye_svp_ros.solve.rig_state import free_parameters
+    from fisheye_svp_ros.study.known_errors import known_errors
 
     if (args.number or args.room) and not args.count:
         raise ParameterError('--for and --room go with --next N')
@@ -143,7 +139,8 @@ def _read(
     path: str, args: argparse.Namespace, given: Lenses
 ) -> tuple[Observations, Lens | dict[str, Lens]]:
     """Return the views that can be posed, and the lens of all cameras or that of each."""
-    from fisheye_svp_ros.diagnosis import posable_observations, remove_copies
+    from fisheye_svp_ros.scene.table_checks import remove_copies
+    from fisheye_svp_ros.solve.measured_poses import posable_observations
 
     table, sizes = read_input(path, args)
     note_huge(table)
@@ -200,9 +197,9 @@ def _write(
     args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Comparison], free: bool,
     wanted: NextViews | None,
 ) -> None:
-    from fisheye_svp_ros.diagnosis import point_residuals
     from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs, write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
+    from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
     folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.model)
     truth = {name: compared.to_dict() for name, compared in known.items()}

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.scene.photograph_names import frame_name, list_frames
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis import Outliers
     from fisheye_svp_ros.scene.observations import Observations
+    from fisheye_svp_ros.solve.outliers import Outliers
 
 _MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
 _DIGITS = re.compile(r'\d')

@@ -12,22 +12,13 @@ Other rooms import what stands here, and nothing else.
 """
 
 from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, Advice
-from fisheye_svp_ros.diagnosis.calibration import (
-    InAir,
-    LensTrust,
-    assess_lens,
-    calibrate_without_outliers,
-    with_covariance,
-)
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
-    PointResiduals,
-    known_errors,
-    point_residuals,
+    compare_errors,
     predict_other_data,
 )
 from fisheye_svp_ros.diagnosis.diagnosis import (
@@ -37,26 +28,18 @@ from fisheye_svp_ros.diagnosis.diagnosis import (
     diagnose,
     diagnose_against,
 )
-from fisheye_svp_ros.diagnosis.effect_forms import simplest_form, with_effect
+from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit, rms_px
-from fisheye_svp_ros.diagnosis.lens_errors import LensErrors, depth_errors, localize_with_errors
-from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.outliers import FRAME, Outliers, find_outliers
-from fisheye_svp_ros.diagnosis.problem import (
-    MAX_RIG_RATIO,
-    MIN_SHARED_FRAMES,
-    DiagnosisOptions,
-    Problem,
-    can_be_included,
-    free_parameters,
-    is_unrelated,
-    posable_observations,
-    poses_by_frame,
-    remove_copies,
-    rig_lenses,
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
+from fisheye_svp_ros.diagnosis.lens_errors import (
+    InAir,
+    LensErrors,
+    depth_errors,
+    localize_with_errors,
 )
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P, TraceStep
@@ -66,19 +49,13 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
     pose_maps,
     pose_summary,
     standard_errors,
+    total_errors,
 )
-from fisheye_svp_ros.diagnosis.variance_budget import (
-    Component,
-    Structure,
-    stage_shares,
-)
+from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure, stage_shares
 
 __all__ = [
     'CONFOUNDED_P',
     'DIAGNOSE_AIR',
-    'FRAME',
-    'MAX_RIG_RATIO',
-    'MIN_SHARED_FRAMES',
     'NAMED_P',
     'NAMES',
     'SIGNIFICANCE',
@@ -99,11 +76,8 @@ __all__ = [
     'InAir',
     'Intrinsic',
     'LensErrors',
-    'LensTrust',
     'ModelErrors',
     'NullModel',
-    'Outliers',
-    'PointResiduals',
     'PredictedOffsets',
     'Problem',
     'Record',
@@ -114,31 +88,19 @@ __all__ = [
     'Transfer',
     'TwoCameras',
     'TwoDatasets',
-    'assess_lens',
-    'calibrate_without_outliers',
     'can_be_included',
+    'compare_errors',
     'depth_errors',
     'deviations',
     'diagnose',
     'diagnose_against',
-    'find_outliers',
-    'free_parameters',
-    'is_unrelated',
-    'known_errors',
     'localize_with_errors',
-    'point_residuals',
-    'posable_observations',
     'pose_maps',
     'pose_summary',
-    'poses_by_frame',
     'predict_other_data',
     'refit',
-    'remove_copies',
-    'rig_lenses',
-    'rms_px',
     'simplest_form',
     'stage_shares',
     'standard_errors',
-    'with_covariance',
-    'with_effect',
+    'total_errors',
 ]

@@ -12,10 +12,10 @@ from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
-from fisheye_svp_ros.diagnosis.outliers import FRAME, VIEW, Outliers
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_names
+from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 
 DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
                 'that: the lens was off in air')

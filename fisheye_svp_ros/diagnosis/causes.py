@@ -11,11 +11,12 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
-from fisheye_svp_ros.diagnosis.outliers import NoiseGrowth, Outliers
+from fisheye_svp_ros.diagnosis.selection import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_entry
+from fisheye_svp_ros.solve.outliers import Outliers
 
 # An effect is confounded with another unless, with it in the model, the other is still needed.
 CONFOUNDED_P = 0.002

@@ -5,7 +5,7 @@ Poses are fitted to the frames, all else is predicted from the others or from ot
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,16 +15,12 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.mixed_model import pseudo_inverse
-from fisheye_svp_ros.pose import Pose, axis_angle_between
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
-from fisheye_svp_ros.solve.initial_rig import localize_cameras
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
-from fisheye_svp_ros.solve.stereo_depth import triangulate
 
 _RESAMPLES = 2000
 _PREDICTED_RATIO = 5.0  # times the median frame
 _LINEAR_PX = 3.0  # rms: how far a step that is taken to be linear may move image points
-_FOLDS = 3
 
 
 class HeldOut(NamedTuple):
@@ -223,127 +219,3 @@ def _sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
     weight = linear.row_weight
     px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
     return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)
-
-
-def known_errors(
-    before: Linearization, after: Linearization, free: Sequence[str]
-) -> dict[str, Comparison]:
-    """Compare the errors of two states of the same data, each fitted without the judged frames.
-
-    position_error_m and axis_error_rad of the first camera where true poses are known;
-    depth_error_m of two cameras (Error3 of Kita, section 5), unless the landmarks themselves are
-    in doubt, or where the cameras stood at each moment: mean distance of triangulated landmarks
-    from where poses and rig say they are.
-    """
-    measured: dict[str, Callable[[RigViews, RigState], Array]] = {}
-    if after.data.poses is not None:
-        measured |= {'position_error_m': _position_errors, 'axis_error_rad': _axis_errors}
-    doubtful = any(effect.stage in ('target', 'pose') for effect, _ in after.state.terms)
-    if after.data.cameras == 2 and not doubtful:
-        measured['depth_error_m'] = _depth_errors
-    pairs = [list(_train_folds(linear, free)) for linear in (before, after)] if measured else []
-    found = {
-        name: [np.concatenate([errors(held_out, state) for held_out, state in folds])
-               for folds in pairs]
-        for name, errors in measured.items()
-    }
-    return {name: compare_errors(*both) for name, both in found.items()
-            if np.isfinite(both[0] + both[1]).any()}
-
-
-def _train_folds(
-    linear: Linearization, free: Sequence[str]
-) -> Iterator[tuple[RigViews, RigState]]:
-    """Yield held-out data and a state with the poses of the first camera's views in it."""
-    data = linear.data
-    folds = np.arange(data.frames) % min(_FOLDS, data.frames)
-    for fold in np.unique(folds):
-        kept = folds != fold
-        part = replace(linear.state, pose=linear.state.pose.take(np.flatnonzero(kept)))
-        trained = adjust(data.select(kept[data.frame_of]), part, free)
-        held_out = data.select(~kept[data.frame_of])
-        solved = localize_cameras(trained.model, held_out.views.take(_first_camera(held_out)))
-        yield held_out, replace(trained, pose=solved)
-
-
-def _first_camera(data: RigViews) -> Index:
-    """Return the views of the first camera."""
-    return np.flatnonzero(data.camera_of == 0)
-
-
-def _true_poses(data: RigViews) -> Pose:
-    assert data.poses is not None
-    return data.poses.take(data.frame_of[_first_camera(data)])
-
-
-def _position_errors(held_out: RigViews, state: RigState) -> Array:
-    off = state.pose.position - _true_poses(held_out).position
-    return np.asarray(np.linalg.norm(off, axis=-1))
-
-
-def _axis_errors(held_out: RigViews, state: RigState) -> Array:
-    return axis_angle_between(state.pose, _true_poses(held_out))
-
-
-def _depth_errors(held_out: RigViews, state: RigState) -> Array:
-    """Return the mean error of each frame, m; NaN where the cameras share no landmark."""
-    first, second = (state.model.camera(camera) for camera in (0, 1))
-    place = state.pose if held_out.poses is None else _true_poses(held_out)
-    right_pose = place.compose(state.rig.take(1))
-    rig = state.rig.take(1).inverse()
-    errors = []
-    for i, view in enumerate(_first_camera(held_out)):
-        points, left, right = _shared_points(held_out, int(view))
-        found = triangulate(first, second, rig, left, right).points
-        off = np.linalg.norm(found - right_pose.take(i).into_body(points), axis=-1)
-        errors.append(float(off[np.isfinite(off)].mean()) if np.isfinite(off).any() else np.nan)
-    return np.array(errors)
-
-
-def _shared_points(data: RigViews, view: int) -> tuple[Array, Array, Array]:
-    """Return what a view of the first camera shares with the second: points (N, 3), uv (N, 2)."""
-    other = np.flatnonzero((data.frame_of == data.frame_of[view]) & (data.camera_of == 1))
-    ids = np.where(data.views.used, data.views.landmark, -1 - data.camera_of[:, None])
-    _, i, j = np.intersect1d(ids[view], ids[other], return_indices=True)
-    uv = data.views.uv
-    return data.views.points[view, i], uv[view, i], uv[other].reshape(-1, 2)[j]
-
-
-class PointResiduals(NamedTuple):
-    """K observations by frame and camera.
-
-    frame, camera, landmark (K,); t (K,), s, NaN where unknown; uv (K, 2), px; before and after
-    (K, 2), px: measured minus predicted by the fitted base and the fitted extended model; theta
-    (K,), rad, and range (K,), m, under the latter; outlier (K,): a gross error, left out of fits.
-    """
-
-    frame: Index
-    camera: Index
-    landmark: Index
-    t: Array
-    uv: Array
-    before: Array
-    after: Array
-    theta: Array
-    range: Array
-    outlier: Mask
-
-
-def point_residuals(before: Linearization, after: Linearization) -> PointResiduals:
-    """Return the residuals of two states of the same data."""
-    views = after.data.views
-    seen = views.landmark >= 0
-    per_point = np.ones_like(seen, dtype=np.int64)
-    distance = np.linalg.norm(after.scene.pose.into_body(views.points), axis=-1)
-    return PointResiduals(
-        frame=(views.frame[:, None] * per_point)[seen],
-        camera=(views.camera[:, None] * per_point)[seen],
-        landmark=views.landmark[seen],
-        t=views.t[seen],
-        uv=views.uv[seen],
-        before=(views.uv - before.linear.uv)[seen],
-        after=(views.uv - after.linear.uv)[seen],
-        theta=after.scene.theta[seen],
-        range=distance[seen],
-        outlier=~views.used[seen],
-    )

@@ -25,16 +25,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
-from fisheye_svp_ros.diagnosis.problem import (
-    ROUNDING,
-    DiagnosisOptions,
-    Inputs,
-    Problem,
-    Progress,
-    check_distinct,
-    dither,
-    has_no_rig,
-)
+from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Inputs, Problem, Progress
 from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.diagnosis.stepwise import TraceStep
 from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors
@@ -53,6 +44,8 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
+from fisheye_svp_ros.solve.rig_checks import has_no_rig
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
 

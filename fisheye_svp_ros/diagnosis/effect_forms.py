@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState
+from fisheye_svp_ros.solve.rig_state import Linearization
 
 _LONGEST_PAUSES = 4
 _CURVE_DEGREE = 5  # degree of smooth curves over an angle
@@ -227,20 +227,3 @@ def _on_both_axes(scalars: list[Array]) -> list[Array]:
     zero = np.zeros_like(scalars[0])
     pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
     return [np.stack(pair, axis=-1) for pair in pairs]
-
-
-def with_effect(state: RigState, effect: Effect, values: Array | None = None) -> RigState:
-    """Return the state with one more effect, joined with an earlier form of the same."""
-    start = np.zeros(len(effect.parameters)) if values is None else values
-    for i, (old, known) in enumerate(state.terms):
-        if old.name == effect.name:
-            joined = old.joined(effect)
-            both = transfer_values(old, known, joined) + transfer_values(effect, start, joined)
-            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
-    return replace(state, terms=(*state.terms, (effect, start)))
-
-
-def transfer_values(old: Effect, values: Array, new: Effect) -> Array:
-    """Return start values of a form of an effect from another form's, by parameter name."""
-    known = dict(zip((p.name for p in old.parameters), values, strict=True))
-    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])

@@ -13,7 +13,6 @@ from itertools import pairwise
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis.calibration import stated_parameters
 from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
@@ -26,15 +25,9 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     predict_other_data,
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, rms_px
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
+from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
-from fisheye_svp_ros.diagnosis.problem import (
-    has_no_rig,
-    is_another_target,
-    rig_differs,
-    unpair_cameras,
-)
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors, standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import (
@@ -47,9 +40,18 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.table_checks import is_another_target
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import localize_frames
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
+from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.rig_checks import has_no_rig, rig_differs, unpair_cameras
+from fisheye_svp_ros.solve.rig_state import (
+    Linearization,
+    RigState,
+    RigViews,
+    group_by_frame,
+    rms_px,
+)
 
 
 @dataclass(frozen=True)

@@ -284,13 +284,3 @@ def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Varia
         return eq.split(e, r)[0][:, :6] / eq.group_scale, values / fitted.scale
 
     return gauss_newton(fitted.linear, solve, _STEP_TOLERANCE * variances.sigma)
-
-
-def rms_px(linear: Linearization, whitened: Array | None = None) -> float:
-    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
-
-    Without any: of those of the fit itself.
-    """
-    weight, used = linear.row_weight, linear.row_mask
-    rows = linear.residual if whitened is None else whitened
-    return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))

@@ -13,23 +13,16 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
+from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis.effect_forms import simplest_form, with_effect
+from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import (
     NullModel,
     PlacedEffect,
     with_ordinary_landmarks,
-)
-from fisheye_svp_ros.diagnosis.outliers import (
-    NoiseGrowth,
-    Outliers,
-    noise_growth,
-    reinstate_outliers,
-    reject_outliers,
-    with_noise_growth,
 )
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.stepwise import (
@@ -41,10 +34,18 @@ from fisheye_svp_ros.diagnosis.stepwise import (
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step
-from fisheye_svp_ros.solve.rig_state import RigState, RigViews
+from fisheye_svp_ros.solve.outliers import (
+    FAR_POINT,
+    Outliers,
+    relative_sigma,
+    robust_scale,
+    without_points,
+)
+from fisheye_svp_ros.solve.rig_state import RigState, RigViews, with_effect
 
 _MAX_ROUNDS = 6
 _REFITS_AFTER_REVISION = 2
@@ -53,6 +54,18 @@ _FIELD_TEST_SIGMAS = 4.0  # standard errors
 _LINEAR_LIMIT = 25.0  # a misfit so many times the noise's is not linear: one cause a round
 _LEAST_SQUARES_LIMIT = 400.0  # and so many: its columns lead nowhere, least squares find the way
 _MAX_EFFECTS = 20  # in one round
+_REINSTATED_SIGMAS = 4.0  # below these a rejected point is like all others
+_OUTLIER_PROBABILITY = 0.005  # probability of one such point among clean ones
+_WITHIN_SIGMAS = 2.6  # standard errors
+
+
+class NoiseGrowth(NamedTuple):
+    """Noise that changes: value, standard error, p-value; variance (F, M): over the mean one."""
+
+    value: float
+    stderr: float
+    p_value: float
+    variance: Array
 
 
 class Revision(NamedTuple):
@@ -286,3 +299,95 @@ def _include_effects(problem: Problem) -> RigState:
         except Untestable as why:
             raise ObservationError(f'{problem.observations.source}: {name}: {why}') from why
     return adjust(problem.data, state, problem.free)
+
+
+def reject_outliers(
+    data: RigViews, fitted: FittedModel, outliers: Outliers, squares: Array
+) -> tuple[RigViews, Outliers]:
+    """Reject points that are too far off once every random part is predicted.
+
+    squares: of the standardised residuals (F, M).
+    """
+    views = data.views
+    pairs = data.by_view(squares).sum(axis=-1)
+    limit = -2 * np.log(_OUTLIER_PROBABILITY / max(int(views.used.sum()), 1))
+    mask = views.used & (pairs > limit)
+    mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]
+    # A landmark that is off in most of its views is not where it is said to be.
+    every = np.bincount(views.landmark[views.used])
+    off = np.bincount(views.landmark[mask], minlength=len(every))
+    mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
+    px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
+    return without_points(data, mask), outliers.append(views.row[mask], px[mask], FAR_POINT)
+
+
+def reinstate_outliers(
+    data: RigViews, fitted: FittedModel, outliers: Outliers
+) -> tuple[RigViews, Outliers]:
+    """Reinstate points that were rejected, where the causes predict them as well as others.
+
+    Beside a simulation that is wrong the nearest landmarks look like outliers.
+    """
+    views, again = data.views, np.zeros(len(outliers.rows), dtype=bool)
+    off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / relative_sigma(views)
+    scale, _ = robust_scale(views, np.where(views.used, off, np.nan))
+    near = ~views.used & (views.landmark >= 0) & (off < _REINSTATED_SIGMAS * scale)
+    weight, row, table = views.weight.copy(), views.row.copy(), data.observations
+    for view, point in np.argwhere(near):
+        known = ((table.frame[outliers.rows] == views.frame[view])
+                 & (table.camera[outliers.rows] == views.camera[view])
+                 & (table.landmark[outliers.rows] == views.landmark[view, point])
+                 & (table.uv[outliers.rows] == views.uv[view, point]).all(axis=1))
+        for i in np.flatnonzero(known & ~again)[:1]:
+            again[i], row[view, point] = True, outliers.rows[i]
+            weight[view, point] = 1 / np.nan_to_num(table.sigma[outliers.rows[i]], nan=1.0)
+    why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
+    return (replace(data, views=views._replace(weight=weight, row=row)),
+            Outliers(outliers.rows[~again], outliers.px[~again], why))
+
+
+def noise_growth(fitted: FittedModel, squares: Array) -> NoiseGrowth:
+    """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
+
+    Those of outlying points count as little as the limit allows.  It is none where the same
+    landmarks do not scatter more at larger angles: some landmarks scatter more than others.
+    """
+    linear = fitted.linear
+    used = linear.row_mask
+    e2 = np.minimum(squares[used], 20.0)
+    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
+    every = theta**2 - (theta[used] ** 2).mean()
+    z = every[used]
+
+    def deviance(growth: float) -> float:
+        # With z centred the mean of log sigma does not change: only the scale is profiled out.
+        return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
+
+    best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
+    # Heavier tails than the normal distribution's scatter the squares more.
+    tails = max(float(e2.var()) / 2, 1.0)
+    gain = (deviance(0.0) - float(best.fun)) / tails
+    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
+    landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
+    rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
+    within = np.sign(best.x) * _growth_within_landmarks(e2, z, rows, np.nonzero(used)[0])
+    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN_SIGMAS else 1.0
+    level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
+    return NoiseGrowth(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
+
+
+def _growth_within_landmarks(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
+    """Return how squares e2 (M,) grow with z for the same landmarks (M,), in standard errors.
+
+    What one frame (M,) says counts as one observation: its points may err together.
+    """
+    count = np.maximum(np.bincount(landmark), 1)
+    mean, middle = ((np.bincount(landmark, weights=of) / count)[landmark] for of in (e2, z))
+    products = np.bincount(frame, weights=(e2 / np.maximum(mean, 1e-300) - 1) * (z - middle))
+    return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
+
+
+def with_noise_growth(state: RigState, growth: float) -> RigState:
+    """Return the state with weights for noise that grows with the angle."""
+    term = (NoiseVsAngleEffect(), np.array([growth]))
+    return replace(state, terms=(*state.terms, term))

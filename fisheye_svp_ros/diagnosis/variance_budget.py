@@ -18,7 +18,6 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, RepeatedErrors
 from fisheye_svp_ros.diagnosis.null_model import NullModel, PlacedEffect
-from fisheye_svp_ros.diagnosis.outliers import Outliers
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
@@ -29,6 +28,7 @@ from fisheye_svp_ros.mixed_model import (
     no_variances,
     pseudo_inverse,
 )
+from fisheye_svp_ros.solve.outliers import Outliers
 
 REPEATED_COMPONENT = 'frame_similar'
 STAGES = ('lens', 'target', 'frame', 'noise')

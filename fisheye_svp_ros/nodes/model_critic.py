@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 
-from fisheye_svp_ros.diagnosis import Diagnosis, diagnose, posable_observations
+from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -29,6 +29,7 @@ from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import STEREO, Observations
+from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.study.settings import RigSettings
 
 T = TypeVar('T')

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, posable_observations
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
@@ -27,6 +27,7 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 MAX_PHOTOGRAPHS = 40  # photographs; with so many what is still open stays open

@@ -14,8 +14,8 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import list_frames
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.diagnosis import LensTrust
     from fisheye_svp_ros.solve.lens_calibration import Calibration
+    from fisheye_svp_ros.study.lens_trust import LensTrust
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _ABOVE = 2.0  # times the noise, from which residuals show a model error

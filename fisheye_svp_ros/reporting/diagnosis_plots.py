@@ -13,9 +13,10 @@ from matplotlib.patches import Rectangle
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.diagnosis import Diagnosis, PointResiduals
+from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.plots import picture, round_number
+from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name
 from fisheye_svp_ros.solve.measured_poses import rms_px

@@ -8,14 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fisheye_svp_ros.diagnosis import (
-    NAMED_P,
-    Comparison,
-    Diagnosis,
-    PointResiduals,
-    TraceStep,
-    stage_shares,
-)
+from fisheye_svp_ros.diagnosis import NAMED_P, Comparison, Diagnosis, TraceStep, stage_shares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
@@ -28,6 +21,7 @@ from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.headline import headline
 from fisheye_svp_ros.reporting.outlier_rows import outlier_rows
+from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 _CAPTIONS = {
     'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 from fisheye_svp_ros.solve.localization import MIN_POINTS, Localization, localize
 from fisheye_svp_ros.solve.reliability import examine
 
+_OUTSIDE_SHARE = 0.02  # of the points of a camera: more than single outliers
 _LINE = 1e-6  # width of a point set relative to its length, below which it is a line
 
 
@@ -97,3 +101,63 @@ def rms_px(residual: Array) -> float:
     """Return the root mean square of the 2-D norm of residuals (..., 2), px, NaN left out."""
     norm2 = (residual**2).sum(axis=-1)
     return float(np.sqrt(norm2[np.isfinite(norm2)].mean()))
+
+
+def rig_lenses(observations: Observations, lens: Lens | Mapping[str, Lens]) -> dict[str, Lens]:
+    """Return the lens of each camera by name, or the one of all under ''.
+
+    Raises ObservationError for a camera of the observations without a lens.
+    """
+    if isinstance(lens, Lens):
+        return {'': lens}
+    missing = [name for name in observations.cameras if name not in lens]
+    if missing:
+        raise ObservationError(f'{observations.source}: camera {missing[0]!r} has no lens')
+    return {name: lens[name] for name in observations.cameras}
+
+
+def posable_observations(
+    observations: Observations, lens: Lens | Mapping[str, Lens]
+) -> tuple[Observations, tuple[int, ...]]:
+    """Return the views that fix a pose, and the frames that have others.
+
+    Raises GeometryError where a camera has no view left, ObservationError where image points lie
+    outside the images that its lens is of.
+    """
+    lenses = list(rig_lenses(observations, lens).values())
+    models = [ForwardModel(one) for one in lenses]
+    kept = np.ones(len(observations), dtype=bool)
+    left_out: set[int] = set()
+    for camera in np.unique(observations.camera):
+        mine = observations.camera == camera
+        which = int(camera) if len(models) > 1 else 0
+        _check_inside(observations.take(mine), lenses[which])
+        _, frames = posable_views(observations.take(mine), models[which])
+        kept[mine & np.isin(observations.frame, frames)] = False
+        left_out.update(frames)
+    return observations.take(kept), tuple(sorted(left_out))
+
+
+def _check_inside(observations: Observations, lens: Lens) -> None:
+    outside = (observations.uv < 0) | (observations.uv > (lens.width, lens.height))
+    if outside.any(axis=1).mean() > _OUTSIDE_SHARE:
+        raise ObservationError(
+            f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '
+            f'of lens {lens.name!r}; is it the lens of this camera?')
+
+
+def poses_by_frame(
+    observations: Observations, frame: Index, pose: Pose, source: str
+) -> dict[int, Pose]:
+    """Return the true pose of each frame of a table, of poses (P,) of the frames (P,).
+
+    Raises ObservationError, naming the source, for a frame without one.
+    """
+    known = {number: pose.take(i) for i, number in enumerate(frame.tolist())}
+    for number in observations.frames.tolist():
+        if number not in known:
+            raise ObservationError(
+                f'{source}: frame {number} of {observations.source} has no pose in it; add it, or '
+                'leave the poses out'
+            )
+    return known

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, noise_weight
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, parameter_values
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, cross_matrix
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 
@@ -256,3 +256,42 @@ class Linearization:
 def is_shared(effect: Effect) -> bool:
     """Whether an effect's parameters stand among the shared ones of a fit: not those of noise."""
     return effect.stage != 'noise'
+
+
+def free_parameters(lenses: Mapping[str, Lens], free: bool | None = None) -> tuple[str, ...]:
+    """Return the intrinsics that are fitted, those of a rig with the camera's name before them.
+
+    free: of all lenses or of none; None asks each lens whether a calibration made it.
+    """
+    return tuple(
+        f'{camera}.{name}' if camera else name for camera, lens in lenses.items()
+        if (lens.calibration is not None if free is None else free)
+        for name in intrinsic_names(lens)
+    )
+
+
+def with_effect(state: RigState, effect: Effect, values: Array | None = None) -> RigState:
+    """Return the state with one more effect, joined with an earlier form of the same."""
+    start = np.zeros(len(effect.parameters)) if values is None else values
+    for i, (old, known) in enumerate(state.terms):
+        if old.name == effect.name:
+            joined = old.joined(effect)
+            both = transfer_values(old, known, joined) + transfer_values(effect, start, joined)
+            return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
+    return replace(state, terms=(*state.terms, (effect, start)))
+
+
+def transfer_values(old: Effect, values: Array, new: Effect) -> Array:
+    """Return start values of a form of an effect from another form's, by parameter name."""
+    known = dict(zip((p.name for p in old.parameters), values, strict=True))
+    return np.array([known.get(parameter.name, 0.0) for parameter in new.parameters])
+
+
+def rms_px(linear: Linearization, whitened: Array | None = None) -> float:
+    """Return the root mean square of the 2-D norm, px, of whitened residuals (F, M).
+
+    Without any: of those of the fit itself.
+    """
+    weight, used = linear.row_weight, linear.row_mask
+    rows = linear.residual if whitened is None else whitened
+    return float(np.sqrt(2 * np.mean((rows[used] / weight[used]) ** 2)))

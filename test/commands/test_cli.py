@@ -18,7 +18,6 @@ from helpers.targets import plane, poses_around
 
 from fisheye_svp_ros import cli, commands
 from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors
-from fisheye_svp_ros.diagnosis import Outliers
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -28,6 +27,7 @@ from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.simulate.simulation import simulate
+from fisheye_svp_ros.solve.outliers import Outliers
 
 ROOT = Path(__file__).resolve().parents[2]
 OV_PLANE = ROOT.parent / 'shared' / 'data' / 'ov_plane'

@@ -14,16 +14,7 @@ from helpers.targets import plane, poses_around
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.diagnosis import (
-    Advice,
-    Comparison,
-    DiagnosisOptions,
-    Structure,
-    diagnose,
-    known_errors,
-    point_residuals,
-    with_effect,
-)
+from fisheye_svp_ros.diagnosis import Advice, Comparison, DiagnosisOptions, Structure, diagnose
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -47,10 +38,12 @@ from fisheye_svp_ros.reporting.diagnosis_text import (
     verdict_sentences,
 )
 from fisheye_svp_ros.reporting.headline import VERDICTS, headline
+from fisheye_svp_ros.reporting.point_residuals import point_residuals
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.simulate.scenario import true_lens
 from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
-from fisheye_svp_ros.solve.rig_state import Linearization
+from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
+from fisheye_svp_ros.study.known_errors import known_errors
 
 # Rays beyond 90 degrees: no plane window can be mistaken for a viewpoint shift.
 LENS = Lens('made', 1280, 960, 300.0, 300.0, 650.0, 470.0, KannalaBrandt(-0.03), 2.0)

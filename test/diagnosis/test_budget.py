@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import NullModel, with_effect
+from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.variance_budget import cause_squares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import group_by_frame
+from fisheye_svp_ros.solve.rig_state import group_by_frame, with_effect
 
 
 @pytest.fixture

@@ -7,16 +7,8 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import (
-    FRAME,
-    DiagnosisOptions,
-    Problem,
-    diagnose,
-    find_outliers,
-    standard_errors,
-)
-from fisheye_svp_ros.diagnosis.outliers import VIEW, quantization_step
-from fisheye_svp_ros.diagnosis.problem import Inputs, thin_out
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, Problem, diagnose, standard_errors
+from fisheye_svp_ros.diagnosis.problem import Inputs
 from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
@@ -26,8 +18,10 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.scene.observations import Observations, views_of
+from fisheye_svp_ros.scene.table_checks import quantization_step, thin_out
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.outliers import FRAME, VIEW, find_outliers
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 SIGMA = 0.2

@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import (
-    NullModel,
-    assess_lens,
-    calibrate_without_outliers,
-    refit,
-    standard_errors,
-)
+from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
 from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
@@ -22,6 +16,7 @@ from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import group_by_frame
+from fisheye_svp_ros.study.lens_trust import assess_lens, calibrate_without_outliers
 
 SIGMA, SHIFT = 0.1, 0.004
 DRAWS = 14

@@ -7,14 +7,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy import stats
 
-from fisheye_svp_ros.diagnosis import (
-    EffectTests,
-    NullModel,
-    diagnose,
-    known_errors,
-    refit,
-    with_effect,
-)
+from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose, refit
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
 from fisheye_svp_ros.effects.base import Scene
@@ -23,7 +16,8 @@ from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, with_effect
+from fisheye_svp_ros.study.known_errors import known_errors
 
 SIGMA = 0.2
 

@@ -7,14 +7,7 @@ import pytest
 from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
-from fisheye_svp_ros.diagnosis import (
-    DiagnosisOptions,
-    InAir,
-    assess_lens,
-    diagnose,
-    find_outliers,
-    with_covariance,
-)
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, InAir, diagnose
 from fisheye_svp_ros.diagnosis.checks.medium import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
@@ -23,7 +16,9 @@ from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.initial_rig import initial_state, prediction_distances
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.outliers import find_outliers
 from fisheye_svp_ros.solve.rig_state import group_by_frame
+from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
 
 PORT = FlatGlass(0.035, 1.34, 0.02, -0.01)
 CALIBRATED = replace(AIR, calibration={'rms_px': 0.1})

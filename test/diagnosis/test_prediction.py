@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import NullModel, rms_px, with_effect
+from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame, rms_px, with_effect
 
 FREE = ('fx', 'fy', 'cx', 'cy')
 

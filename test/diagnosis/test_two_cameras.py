@@ -8,17 +8,7 @@ import pytest
 
 from benchmark.two_cameras import Hidden, pair
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.diagnosis import (
-    FRAME,
-    DiagnosisOptions,
-    diagnose,
-    diagnose_against,
-    find_outliers,
-    known_errors,
-    posable_observations,
-    simplest_form,
-)
-from fisheye_svp_ros.diagnosis.problem import rig_is_inconsistent
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against, simplest_form
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -28,7 +18,11 @@ from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.measured_poses import posable_observations
+from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
+from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+from fisheye_svp_ros.study.known_errors import known_errors
 
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
 

@@ -14,12 +14,10 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, flat_rows
-from fisheye_svp_ros.diagnosis.calibration import InAir
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison, HeldOut, predict_other_data
-from fisheye_svp_ros.diagnosis.fitted_model import rms_px
+from fisheye_svp_ros.diagnosis.lens_errors import InAir
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.outliers import Outliers, find_outliers
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.diagnosis.variance_budget import Component
@@ -32,7 +30,8 @@ from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
+from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, rms_px
 
 PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
 MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'

@@ -23,7 +23,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
-from fisheye_svp_ros.diagnosis.problem import MIN_SHARED_FRAMES, Progress, is_unpaired
+from fisheye_svp_ros.diagnosis.problem import Progress
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection, select_causes
 from fisheye_svp_ros.effects.forward import Term
@@ -32,6 +32,7 @@ from fisheye_svp_ros.effects.target_map import KnownTarget, at_landmarks, less_s
 from fisheye_svp_ros.mixed_model import Variances
 from fisheye_svp_ros.pose import Pose, identity, vector_from_rotation
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.rig_checks import MIN_SHARED_FRAMES, is_unpaired
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 _MIN_DISPLACEMENT = 1e-9  # m

@@ -21,14 +21,13 @@ from fisheye_svp_ros.diagnosis.checks.two_cameras import (
     fitted_target,
     moves_with_lens,
 )
-from fisheye_svp_ros.diagnosis.effect_forms import with_effect
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.forward import Term
 from fisheye_svp_ros.effects.target_map import KnownTarget, less_similarity
 from fisheye_svp_ros.optics.lens import INTRINSICS
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _PLACE_TOLERANCE = 1e-6  # m: no two targets are told apart by less
 

@@ -1,4 +1,4 @@
-"""Outliers, and what lies in the noise: wrong ids, rounding, noise that grows with the angle."""
+"""Outliers of a table: points and views that belong elsewhere, found without a noise model."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.initial_rig import localize_cameras, prediction_distances
@@ -21,7 +19,6 @@ _OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not 
 _SWAP_SIGMAS = 6.0  # and within which it belongs to another one
 _SWAP_CHANCE = 0.01  # that so many do by chance
 _SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
-_REINSTATED_SIGMAS = 4.0  # and below this one is like all others
 SWAPPED_POINT = 'it lies where another landmark is predicted'
 FAR_POINT = 'far from its prediction'
 VIEW = 'the whole view is off: its points may be in another order'
@@ -30,18 +27,16 @@ FRAME = ('its cameras contradict each other: points in another order, another mo
 _VIEW_RATIO, _MIN_VIEW_PX = 15.0, 3.0  # times the median view, px: it belongs elsewhere
 _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
 _MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority
-_OUTLIER_PROBABILITY = 0.005  # probability of one such point among clean ones
 _CAUCHY_SCALE = 2.0
 _STEP_TOLERANCE = 0.1  # of the scale: how little predictions may move
 _UNSEEN_PX = 1e9  # px, for points out of the field of view: further off than any other
 _MIN_RESIDUAL_PX = 1e-6  # px: no residual of computed points is smaller
 _MEDIAN_NORM = 1.1774  # of the norm of two standard normal coordinates
 _MAX_ITERATIONS = 8
-_WITHIN_SIGMAS = 2.6  # standard errors
 
 
 class Outliers(NamedTuple):
-    """Outliers errors of a table: outlying rows of it, how far (px), and why."""
+    """Outliers of a table: which rows of it, how far (px), and why."""
 
     rows: Index
     px: Array
@@ -65,15 +60,6 @@ class Outliers(NamedTuple):
 NO_OUTLIERS = Outliers(np.zeros(0, dtype=np.int64), np.zeros(0), ())
 
 
-class NoiseGrowth(NamedTuple):
-    """Noise that changes: value, standard error, p-value; variance (F, M): over the mean one."""
-
-    value: float
-    stderr: float
-    p_value: float
-    variance: Array
-
-
 def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     """Return the data without outliers, and what these were.
 
@@ -93,7 +79,7 @@ def find_outliers(data: RigViews, state: RigState) -> tuple[RigViews, Outliers]:
     torn, apart = _inconsistent_frames(data, state, alone, typical)
     whole = whole & ~torn
     far, swapped = far & ~torn[:, None], swapped & ~torn[:, None]
-    offset, outliers = offset * _relative_sigma(views), NO_OUTLIERS
+    offset, outliers = offset * relative_sigma(views), NO_OUTLIERS
     for mask, px, why in ((swapped, offset, SWAPPED_POINT), (far & ~swapped, offset, FAR_POINT),
                           (views.used & whole[:, None], offset, VIEW),
                           (views.used & torn[:, None], apart, FRAME)):
@@ -110,8 +96,8 @@ def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Arr
     """
     model, views, pose = state.model, data.views, state.view_poses(data)
     alone = localize_cameras(model, views) if data.cameras > 1 else pose
-    sigma = _relative_sigma(views)
-    scale, offset = _robust_scale(views, prediction_distances(model, pose, views) / sigma)
+    sigma = relative_sigma(views)
+    scale, offset = robust_scale(views, prediction_distances(model, pose, views) / sigma)
     if not np.nanmax(offset / scale) > _SUSPICIOUS_SIGMAS:
         return pose, alone, scale, offset
     for _ in range(_MAX_ITERATIONS):
@@ -119,7 +105,7 @@ def _localize_robustly(data: RigViews, state: RigState) -> tuple[Pose, Pose, Arr
         fading = 1 / np.sqrt(1 + (offset / (_CAUCHY_SCALE * scale)) ** 2)
         weight = np.where(views.used, views.weight * fading, 0.0)
         pose = localize_cameras(model, views._replace(weight=weight), pose)
-        scale, offset = _robust_scale(views, prediction_distances(model, pose, views) / sigma)
+        scale, offset = robust_scale(views, prediction_distances(model, pose, views) / sigma)
         with np.errstate(invalid='ignore'):  # what is out of sight stays so
             change = np.nanmax(np.abs(offset - before) / scale)
         if change < _STEP_TOLERANCE:
@@ -181,131 +167,6 @@ def without_points(data: RigViews, mask: Mask) -> RigViews:
     return replace(data, views=views).select(np.asarray(views.used.any(axis=1)))
 
 
-def reject_outliers(
-    data: RigViews, fitted: FittedModel, outliers: Outliers, squares: Array
-) -> tuple[RigViews, Outliers]:
-    """Reject points that are too far off once every random part is predicted.
-
-    squares: of the standardised residuals (F, M).
-    """
-    views = data.views
-    pairs = data.by_view(squares).sum(axis=-1)
-    limit = -2 * np.log(_OUTLIER_PROBABILITY / max(int(views.used.sum()), 1))
-    mask = views.used & (pairs > limit)
-    mask &= (mask.sum(axis=1) < 0.5 * views.used.sum(axis=1))[:, None]
-    # A landmark that is off in most of its views is not where it is said to be.
-    every = np.bincount(views.landmark[views.used])
-    off = np.bincount(views.landmark[mask], minlength=len(every))
-    mask &= (off <= 0.3 * every)[np.where(views.used, views.landmark, 0)]
-    px = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1)
-    return without_points(data, mask), outliers.append(views.row[mask], px[mask], FAR_POINT)
-
-
-def reinstate_outliers(
-    data: RigViews, fitted: FittedModel, outliers: Outliers
-) -> tuple[RigViews, Outliers]:
-    """Reinstate points that were rejected, where the causes predict them as well as others.
-
-    Beside a simulation that is wrong the nearest landmarks look like outliers.
-    """
-    views, again = data.views, np.zeros(len(outliers.rows), dtype=bool)
-    off = np.linalg.norm(views.uv - fitted.linear.linear.uv, axis=-1) / _relative_sigma(views)
-    scale, _ = _robust_scale(views, np.where(views.used, off, np.nan))
-    near = ~views.used & (views.landmark >= 0) & (off < _REINSTATED_SIGMAS * scale)
-    weight, row, table = views.weight.copy(), views.row.copy(), data.observations
-    for view, point in np.argwhere(near):
-        known = ((table.frame[outliers.rows] == views.frame[view])
-                 & (table.camera[outliers.rows] == views.camera[view])
-                 & (table.landmark[outliers.rows] == views.landmark[view, point])
-                 & (table.uv[outliers.rows] == views.uv[view, point]).all(axis=1))
-        for i in np.flatnonzero(known & ~again)[:1]:
-            again[i], row[view, point] = True, outliers.rows[i]
-            weight[view, point] = 1 / np.nan_to_num(table.sigma[outliers.rows[i]], nan=1.0)
-    why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
-    return (replace(data, views=views._replace(weight=weight, row=row)),
-            Outliers(outliers.rows[~again], outliers.px[~again], why))
-
-
-def _relative_sigma(views: Views) -> Array:
-    """Return the sigma of each point (S, N) over the median one, 1 at least."""
-    sigma = 1 / np.where(views.used, views.weight, np.nan)
-    return np.nan_to_num(np.maximum(sigma / np.nanmedian(sigma), 1.0), nan=1.0)
-
-
-def _robust_scale(views: Views, offset: Array) -> tuple[Array, Array]:
-    """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
-    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
-                       for axis in (1, None))
-    return np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM, offset
-
-
-def _landmark_scale(views: Views, offset: Array) -> Array:
-    """Robust standard deviations (S, N) of a coordinate, one a landmark."""
-    scale = np.zeros_like(offset)
-    for landmark in np.unique(views.landmark[views.used]):
-        mine = views.used & (views.landmark == landmark)
-        scale[mine] = np.median(offset[mine]) / _MEDIAN_NORM
-    return scale
-
-
-def quantization_step(uv: Array) -> float:
-    """Return the largest step of which all coordinates (M, 2) are multiples, px; 0 for none."""
-    values = np.unique(uv.ravel())
-    gaps = np.diff(values)
-    if len(values) < 8 or not len(gaps):
-        return 0.0
-    step = float(gaps[gaps > 1e-9].min(initial=np.inf))
-    offsets = (values - values[0]) / step
-    return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
-
-
-def noise_growth(fitted: FittedModel, squares: Array) -> NoiseGrowth:
-    """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
-
-    Those of outlying points count as little as the limit allows.  It is none where the same
-    landmarks do not scatter more at larger angles: some landmarks scatter more than others.
-    """
-    linear = fitted.linear
-    used = linear.row_mask
-    e2 = np.minimum(squares[used], 20.0)
-    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
-    every = theta**2 - (theta[used] ** 2).mean()
-    z = every[used]
-
-    def deviance(growth: float) -> float:
-        # With z centred the mean of log sigma does not change: only the scale is profiled out.
-        return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
-
-    best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
-    # Heavier tails than the normal distribution's scatter the squares more.
-    tails = max(float(e2.var()) / 2, 1.0)
-    gain = (deviance(0.0) - float(best.fun)) / tails
-    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
-    rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
-    within = np.sign(best.x) * _growth_within_landmarks(e2, z, rows, np.nonzero(used)[0])
-    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN_SIGMAS else 1.0
-    level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
-    return NoiseGrowth(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
-
-
-def _growth_within_landmarks(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
-    """Return how squares e2 (M,) grow with z for the same landmarks (M,), in standard errors.
-
-    What one frame (M,) says counts as one observation: its points may err together.
-    """
-    count = np.maximum(np.bincount(landmark), 1)
-    mean, middle = ((np.bincount(landmark, weights=of) / count)[landmark] for of in (e2, z))
-    products = np.bincount(frame, weights=(e2 / np.maximum(mean, 1e-300) - 1) * (z - middle))
-    return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
-
-
-def with_noise_growth(state: RigState, growth: float) -> RigState:
-    """Return the state with weights for noise that grows with the angle."""
-    term = (NoiseVsAngleEffect(), np.array([growth]))
-    return replace(state, terms=(*state.terms, term))
-
-
 def _find_swaps(
     model: ForwardModel, pose: Pose, views: Views, far: Mask, gate: float
 ) -> Mask:
@@ -332,3 +193,25 @@ def _find_swaps(
             around = other & (np.linalg.norm(seen - seen[~other], axis=-1) < reach)
             by_chance += float(np.nan_to_num(around.sum() * (gate / reach) ** 2).sum())
     return np.asarray(swapped & (special.pdtrc(swapped.sum() - 1, by_chance) < _SWAP_CHANCE))
+
+
+def relative_sigma(views: Views) -> Array:
+    """Return the sigma of each point (S, N) over the median one, 1 at least."""
+    sigma = 1 / np.where(views.used, views.weight, np.nan)
+    return np.nan_to_num(np.maximum(sigma / np.nanmedian(sigma), 1.0), nan=1.0)
+
+
+def robust_scale(views: Views, offset: Array) -> tuple[Array, Array]:
+    """Robust standard deviation of a coordinate, one a view (S, 1), and the offsets."""
+    median, typical = (np.nanmedian(np.minimum(offset, _UNSEEN_PX), axis=axis, keepdims=True)
+                       for axis in (1, None))
+    return np.maximum(median, np.maximum(typical, _MIN_RESIDUAL_PX)) / _MEDIAN_NORM, offset
+
+
+def _landmark_scale(views: Views, offset: Array) -> Array:
+    """Robust standard deviations (S, N) of a coordinate, one a landmark."""
+    scale = np.zeros_like(offset)
+    for landmark in np.unique(views.landmark[views.used]):
+        mine = views.used & (views.landmark == landmark)
+        scale[mine] = np.median(offset[mine]) / _MEDIAN_NORM
+    return scale

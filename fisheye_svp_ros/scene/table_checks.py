@@ -1,0 +1,118 @@
+"""Tables of observations beside each other: copies, cameras of a rig, targets, rounding."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+
+ROUNDING = 1e-7  # px: what is simulated without noise scatters by less, nothing measured does
+_COPIED_SHARE = 0.5  # of the image points: no two photographs have so many alike
+_PLACE_TOLERANCE = 1e-3  # of a target's extent: more than places that are written less exactly
+_MANY_POINTS, _MIN_POINTS = 1500, 24  # of a thinned table, and of a view that stays whole
+
+
+def order_cameras(table: Observations, cameras: tuple[str, ...]) -> Observations:
+    """Return other observations of a rig with its cameras in the order of these.
+
+    Raises ObservationError where they are of other cameras.
+    """
+    if len(cameras) == 1:
+        return table
+    if set(table.cameras) != set(cameras):
+        held = ', '.join(filter(None, table.cameras)) or 'one without a name'
+        raise ObservationError(f'{table.source}: its cameras ({held}) are not those of the rig, '
+                               + ', '.join(cameras))
+    order = np.array([cameras.index(name) for name in table.cameras])
+    return replace(table, cameras=cameras, camera=order[table.camera])
+
+
+def put_right_camera_first(table: Observations) -> Observations:
+    """Return observations of a rig with its right camera first: true poses are of that one."""
+    names = rig_cameras(table.cameras)
+    if names is None or len(np.unique(table.camera)) < 2:
+        return table
+    return order_cameras(table, (names[1], *(name for name in table.cameras if name != names[1])))
+
+
+def check_distinct(observations: Observations, other: Observations) -> None:
+    """Raise ObservationError where most of other observations are these once more."""
+    seen, again = (set(zip(table.landmark.tolist(), *table.uv.T.tolist(), strict=True))
+                   for table in (observations, other))
+    if len(seen & again) > _COPIED_SHARE * len(again):
+        raise ObservationError(f'{other.source}: these image points are those of '
+                               f'{observations.source}; other photographs are needed')
+
+
+def is_another_target(observations: Observations, other: Observations) -> bool:
+    """Whether landmarks of one number stand in different places of two tables."""
+    one, there = observations.landmarks(), other.landmarks()
+    _, mine, theirs = np.intersect1d(one.ids, there.ids, return_indices=True)
+    apart = np.abs(one.points[mine] - there.points[theirs])
+    return bool(apart.max(initial=0.0) > _PLACE_TOLERANCE * np.ptp(one.points, axis=0).max())
+
+
+def dither(table: Observations) -> Observations:
+    """Return observations with noise that nobody can measure, the same every time.
+
+    Where nothing else is left over, as of simulated points without noise, rounding is: it depends
+    on place and frame, and would be taken for a cause.
+    """
+    noise = 10 * ROUNDING * np.random.default_rng(0).standard_normal(table.uv.shape)
+    return replace(table, uv=table.uv + noise)
+
+
+def remove_copies(observations: Observations) -> tuple[Observations, tuple[int, ...]]:
+    """Return the frames whose image points no earlier one has, to the last digit, and the others.
+
+    A copy knows nothing new, and what is noise in it seems to come again.
+    """
+    table = observations
+    order = np.lexsort((table.landmark, table.camera, table.frame))
+    rows = np.column_stack([table.camera, table.landmark, table.uv])[order]
+    seen: set[bytes] = set()
+    again = []
+    for part in np.split(np.arange(len(order)), np.flatnonzero(np.diff(table.frame[order])) + 1):
+        points = rows[part].tobytes()
+        if points in seen:
+            again.append(int(table.frame[order[part[0]]]))
+        seen.add(points)
+    return table.take(~np.isin(table.frame, again)), tuple(again)
+
+
+def check_cameras(observations: Observations) -> None:
+    """Raise ObservationError where two cameras of a rig hold the same image points."""
+    tables = [replace(observations.take(observations.camera == camera),
+                      source=f'{observations.source}, camera {name}')
+              for camera, name in enumerate(observations.cameras)]
+    for one, other in combinations(tables, 2):
+        check_distinct(one, other)
+
+
+def thin_out(observations: Observations) -> Observations:
+    """Return about _MANY_POINTS points of more: every second landmark, every third ...
+
+    A view that would be left with less than _MIN_POINTS stays whole.
+    """
+    step = max(len(observations) // _MANY_POINTS, 1)
+    views = np.stack([observations.frame, observations.camera])
+    _, view, points = np.unique(views, axis=1, return_inverse=True, return_counts=True)
+    place = np.unique(observations.landmark, return_inverse=True)[1].reshape(-1)
+    whole = points[view.reshape(-1)] < _MIN_POINTS * step
+    return observations.take(whole | (place % step == 0))
+
+
+def quantization_step(uv: Array) -> float:
+    """Return the largest step of which all coordinates (M, 2) are multiples, px; 0 for none."""
+    values = np.unique(uv.ravel())
+    gaps = np.diff(values)
+    if len(values) < 8 or not len(gaps):
+        return 0.0
+    step = float(gaps[gaps > 1e-9].min(initial=np.inf))
+    offsets = (values - values[0]) / step
+    return step if np.abs(offsets - np.round(offsets)).max() < 0.02 else 0.0
