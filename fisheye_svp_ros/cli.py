@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from typing import NoReturn
 
+from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.threads import set_thread_count
 
@@ -33,7 +34,7 @@ COMMANDS = {
     'plot': 'pictures of a recording, a table or a sweep',
     'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
     'render': 'photographs of a chessboard through a lens, and the truth about them',
-    'run': 'one node, as `ros2 run` starts it',
+    'run': 'one node, as `ros2 run` starts it, or several in one process',
     'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
     'table': 'a recording to a table, one row an input stamp',
     'undistort': 'photographs and stereo pairs as ideal cameras take them; maps for cv2.remap',
@@ -92,6 +93,7 @@ def _run(arguments: Sequence[str]) -> None:
         description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
         'simulation gets wrong about measured image points.',
     )
+    parser.add_argument('--version', action='version', version=f'%(prog)s {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     for name, purpose in COMMANDS.items():
         commands.add_parser(name, help=purpose, description=purpose[0].upper() + purpose[1:] + '.')

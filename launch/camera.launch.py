@@ -3,7 +3,14 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 
-from fisheye_svp_ros.nodes.launching import COMMON, arguments, file_arguments, node, value
+from fisheye_svp_ros.nodes.launching import (
+    COMMON,
+    arguments,
+    composed,
+    file_arguments,
+    node,
+    value,
+)
 
 NODES = ('detector', 'localizer', 'model_critic')
 ARGUMENTS = {
@@ -18,10 +25,15 @@ def nodes(context):
     """Return the detector and what follows it."""
     image, info = value(context, 'image'), value(context, 'camera_info')
     beside = image.rpartition('/')
-    topics = [('image', image), ('image/compressed', f'{image}/compressed'),
-              ('camera_info', info or f'{beside[0]}{beside[1]}camera_info')]
-    given = {'detector': {'board': value(context, 'board')}}
-    return [node(context, name, given.get(name, {}), topics) for name in NODES]
+    topics = [('image', image), ('camera_info', info or f'{beside[0]}{beside[1]}camera_info')]
+    given = {'detector': {'board': value(context, 'board')}, 'localizer': {}, 'model_critic': {}}
+    for name, word, frame in (('detector', 'board_frame', 'world_frame'),
+                              ('localizer', 'camera_frame', 'camera_frame')):
+        if value(context, frame):
+            given[name][word] = value(context, frame)
+    if value(context, 'composed') == 'true':
+        return [composed(context, given, topics)]
+    return [node(context, name, own, topics) for name, own in given.items()]
 
 
 def generate_launch_description():
@@ -30,6 +42,8 @@ def generate_launch_description():
         *arguments(name for name in COMMON if name not in ARGUMENTS),
         *(DeclareLaunchArgument(name, default_value=default, description=text)
           for name, (default, text) in ARGUMENTS.items()),
+        DeclareLaunchArgument('composed', default_value='false', choices=['true', 'false'],
+                              description='all nodes in one process'),
         *file_arguments(NODES),
         OpaqueFunction(function=nodes),
     ])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
+from shutil import rmtree
 
 # What the nodes tell, and what they were told; markers and diagnostics are left out.
 TOPICS = (
@@ -60,6 +61,7 @@ def _sweep(name: str, bag: Path) -> None:
 def _record(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.commands.notes import say
     from fisheye_svp_ros.commands.ros import prepare_ros
+    from fisheye_svp_ros.errors import BagError
     from fisheye_svp_ros.io.bags import BagWriter
     from fisheye_svp_ros.nodes.executables import ending_quietly
 
@@ -72,6 +74,10 @@ def _record(args: argparse.Namespace) -> None:
         recorder = Recorder(bag, args.topics)
         recorder.spin()
         recorder.destroy_node()
+    if not bag.count:
+        rmtree(args.output)
+        raise BagError(f'{args.output}: no message came on a topic that is recorded, and nothing '
+                       'is kept; `ros2 topic list` says what there is, --topics what is recorded')
     say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
 
 

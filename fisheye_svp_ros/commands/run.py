@@ -1,9 +1,10 @@
-"""`fisheye-svp run`: one node, as `ros2 run` starts it."""
+"""`fisheye-svp run`: one node, as `ros2 run` starts it, or several in one process."""
 
 from __future__ import annotations
 
 import argparse
 import json
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.ros import prepare_ros
@@ -18,24 +19,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('node', choices=NODES, metavar='NODE', help=', '.join(NODES))
     parser.add_argument(
-        'arguments', nargs=argparse.REMAINDER, metavar='--ros-args ...',
-        help='as for `ros2 run`: -p NAME:=VALUE, --params-file FILE, -r FROM:=TO, '
-        '-r __ns:=/NAMESPACE; or --help: the parameters of the node'
+        'arguments', nargs=argparse.REMAINDER, metavar='[NODE ...] --ros-args ...',
+        help='more nodes, for the same process and executor; then as for `ros2 run`: '
+        '-p NAME:=VALUE, --params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE; or --help: the '
+        'parameters of the nodes'
     )
 
 
 def run(args: argparse.Namespace) -> None:
-    """Spin the node until it ends; exit with its status.  With --help, tell its parameters."""
+    """Spin nodes until one ends; exit with its status.  With --help, tell their parameters."""
     with executables.ending_quietly():
         prepare_ros()
-    if {'-h', '--help'} & set(args.arguments):
-        _print_parameters(args.node)
+    more = list(takewhile(NODES.__contains__, args.arguments))
+    nodes, arguments = [args.node, *more], args.arguments[len(more):]
+    if {'-h', '--help'} & set(arguments):
+        for node in nodes:
+            _print_parameters(node)
         return
-    first = next(iter(args.arguments), '--ros-args')
+    first, names = next(iter(arguments), '--ros-args'), ' '.join(nodes)
     if first != '--ros-args':
-        raise ParameterError(f'run {args.node}: {first!r} stands before --ros-args; ROS arguments '
-                             f'come after it: fisheye-svp run {args.node} --ros-args ...')
-    raise SystemExit(executables.run(args.node, args.arguments))
+        raise ParameterError(f'run {names}: {first!r} stands before --ros-args; ROS arguments '
+                             f'come after it: fisheye-svp run {names} --ros-args ...')
+    if len({*nodes}) < len(nodes):
+        raise ParameterError(f'run {names}: a node stands there twice, and its topics would be '
+                             'those of both; start one process for each namespace')
+    raise SystemExit(executables.run(*nodes, args=arguments))
 
 
 def _print_parameters(node: str) -> None:

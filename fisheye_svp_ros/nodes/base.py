@@ -215,10 +215,11 @@ class BaseNode(Node):  # type: ignore[misc]
     def warn(self, text: str) -> None:
         """Log a warning, and say it in the next report on /diagnostics."""
         self._complaint = text
-        self.get_logger().warning(text, throttle_duration_sec=1.0)
+        self.get_logger().warning(text, throttle_duration_sec=10.0)
 
     def _complain(self, error: Exception) -> None:
-        self.warn(f'dropped: {error}')
+        self._complaint = str(error)
+        self.get_logger().warning(f'dropped: {error}', throttle_duration_sec=1.0)
 
     def _consider(self, parameters: list[Any]) -> Any:
         self._candidate = None

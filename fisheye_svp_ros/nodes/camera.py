@@ -28,6 +28,7 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.study.settings import CameraSettings
 
 _TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
+_CAMERA_FRAME = 'camera_optical_frame'
 _SET_BACK = 10**9  # ns by which a clock is not early but set back
 _LONG = 15.0  # s without an answer after which a set is published again
 
@@ -38,7 +39,10 @@ class CameraTopics:
     def __init__(self, node: CameraNode, name: str, photographs: bool) -> None:
         prefix, settings = f'{name}/' if name else '', node.settings
         self._world, self._transforms = settings.world_frame, node.transforms
-        self.frame = f'{name}_{settings.camera_frame}' if name else settings.camera_frame
+        # Cameras in several namespaces are several cameras, also for tf2.
+        space = [] if settings.camera_frame else node.get_namespace().strip('/').split('/')
+        words = [*space, name, settings.camera_frame or _CAMERA_FRAME]
+        self.frame = '_'.join(filter(None, words))
         self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED)
         # Who solves listens to the true pose, but not to images.
         self._pose = node.announce(PoseStamped, f'{prefix}true_pose', wait=photographs)

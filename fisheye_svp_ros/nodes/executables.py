@@ -35,12 +35,15 @@ def ending_quietly() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def run(name: str, args: list[str] | None = None) -> int:
-    """Run a node until it ends; return its exit status.  args: as for rclpy.init()."""
+def run(*names: str, args: list[str] | None = None) -> int:
+    """Run nodes in one process until one ends; return the exit status.
+
+    args: as for rclpy.init().
+    """
     with ending_quietly():
-        kind = _kind(name)
+        kinds = [_kind(name) for name in names]
         from fisheye_svp_ros.nodes import running
-    return running.run(kind, args)
+    return running.run(kinds, args)
 
 
 def parameters(name: str) -> list[Row]:

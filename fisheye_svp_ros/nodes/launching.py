@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
+import yaml
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from fisheye_svp_ros.errors import GraphError, ParameterError
+from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
 
 PACKAGE = 'fisheye_svp_ros'
+PROGRAM = 'fisheye-svp'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _FLAG = ('true', 'false', 'True', 'False')  # launch itself and Python's own words
-_WORDS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'), ('lens',))}
+_WORDS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'),
+                                         ('lens', 'world_frame', 'camera_frame'))}
 _OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator')
 
 # By name: what it is for, the default, and the choices if there are any.
@@ -29,6 +34,9 @@ COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
     'params': ('parameter file for all nodes, after their own; empty: none', '', ()),
     'publish_tf': ('tell tf2 the cameras, as estimated and as true, and the rig; empty: as the '
                    'parameter files have it', '', ('', *_FLAG)),
+    'world_frame': ('frame of the landmarks; empty: as the parameter files have it', '', ()),
+    'camera_frame': ('frame of the camera, of a rig without left_ and right_; empty: as the '
+                     'parameter files have it', '', ()),
     'use_sim_time': ('take the time from /clock; empty: as the parameter files have it', '',
                      ('', *_FLAG)),
     'log_level': ('what the nodes log from', 'info', _LEVELS),
@@ -71,28 +79,63 @@ def value(context: Any, name: str) -> str:
 def node(
     context: Any, name: str, given: Mapping[str, Any], remappings: Sequence[Any] = ()
 ) -> Any:
-    """Return a node with its files, then what was given; lens and svp where it has them.
+    """Return a node with its files, then what was given; lens, svp and frames where it has them.
 
     Raises ParameterError for a file that is not there, of which launch_ros would only warn.
     """
-    words = _WORDS.get(name, ('lens', 'svp'))
-    flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
+    return Node(
+        # With its name, since what is for one node wins over what a file says of all.
+        executable=name, name=name,
+        parameters=[*_files(context, name), {**_given(context, name), **given}],
+        remappings=list(remappings), **_common(context),
+    )
+
+
+def composed(
+    context: Any, given: Mapping[str, Mapping[str, Any]], remappings: Sequence[Any] = ()
+) -> Any:
+    """Return one process with several nodes; given: parameters by their names, in their order.
+
+    What a file says of all nodes is for the one whose file it is, so all go into one file.
+    """
+    space = '/'.join(filter(None, ['', value(context, 'namespace').strip('/')]))
+    document = {}
+    for name, own in given.items():
+        values: dict[str, Any] = {}
+        for file in _files(context, name):
+            values |= parameters_of(f'{space}/{name}', read_parameter_file(Path(file)))
+        values |= {**_given(context, name), **own}
+        document[f'{space}/{name}'] = {'ros__parameters': values}
+    with NamedTemporaryFile('w', prefix='composed_', suffix='.yaml', delete=False) as stream:
+        yaml.safe_dump(document, stream)
+    return Node(
+        executable=PROGRAM, arguments=['run', *given], parameters=[stream.name],
+        remappings=list(remappings), **_common(context),
+    )
+
+
+def _common(context: Any) -> dict[str, Any]:
+    return {
+        'package': PACKAGE, 'namespace': value(context, 'namespace'), 'output': 'screen',
+        'ros_arguments': ['--log-level', value(context, 'log_level')],
+        'respawn': value(context, 'respawn') == 'true', 'respawn_delay': 1.0,
+    }
+
+
+def _files(context: Any, name: str) -> list[str]:
     files = {word: value(context, word) for word in (f'{name}_params', 'params')}
     for word, file in files.items():
         if file and not Path(file).is_file():
             raise ParameterError(f'{word}: {file!r} is no file; name a parameter file')
-    return Node(
-        package=PACKAGE, executable=name, namespace=value(context, 'namespace'), output='screen',
-        parameters=[
-            *filter(None, files.values()),
-            {word: value(context, word) for word in words if value(context, word)},
-            {flag: value(context, flag) == 'true' for flag in flags if value(context, flag)},
-            dict(given),
-        ],
-        ros_arguments=['--log-level', value(context, 'log_level')],
-        respawn=value(context, 'respawn') == 'true', respawn_delay=1.0,
-        remappings=list(remappings),
-    )
+    return [*filter(None, files.values())]
+
+
+def _given(context: Any, name: str) -> dict[str, Any]:
+    """Return the arguments that are parameters of a node and not empty."""
+    words = _WORDS.get(name, ('lens', 'svp'))
+    flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
+    return {word: value(context, word) for word in words if value(context, word)} | {
+        flag: value(context, flag) == 'true' for flag in flags if value(context, flag)}
 
 
 def fail(event: Any, context: Any) -> None:

@@ -1,4 +1,4 @@
-"""How a node runs as a process: from its arguments to its exit status."""
+"""How nodes run as a process: from its arguments to its exit status."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import rclpy
 from rclpy.exceptions import NameValidationException, ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
@@ -20,15 +20,18 @@ from fisheye_svp_ros.nodes.session import RCLError
 _SAME_INTERRUPT = 1.0  # s between two interrupts that are one
 
 
-def run(kind: type[BaseNode], args: list[str] | None = None) -> int:
-    """Spin a node until it ends; return the exit status, 2 for unusable arguments."""
+def run(kinds: Sequence[type[BaseNode]], args: list[str] | None = None) -> int:
+    """Spin nodes in one executor until one of them ends; return the exit status.
+
+    It is 2 for unusable arguments.
+    """
     signal.signal(signal.SIGINT, _interrupting_without_echo())
     try:
         try:
             rclpy.init(args=args)
         except Exception as error:
-            return _refuse(kind, f'ROS arguments or environment: {error}')
-        return _run(kind)
+            return _refuse(kinds, f'ROS arguments or environment: {error}')
+        return _run(kinds)
     except KeyboardInterrupt:
         return 0
 
@@ -50,43 +53,48 @@ def _interrupting_without_echo() -> Callable[..., None]:
     return interrupt
 
 
-def _run(kind: type[BaseNode]) -> int:
-    node = None
+def _run(kinds: Sequence[type[BaseNode]]) -> int:
+    nodes: list[BaseNode] = []
     try:
-        node = kind()
-        _spin(node)
+        for kind in kinds:
+            nodes.append(kind())
+        _spin(nodes)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except Failed as error:
-        return _refuse(kind, error)
+        return _refuse(kinds, error)
     except Finished:
         pass
     except (FisheyeSvpError, ParameterException, NameValidationException) as error:
-        return _refuse(kind, error)
+        return _refuse(kinds[len(nodes):][:1] or kinds, error)
     except Exception as error:
         # A signal ends the context between any two calls; what fails then is no failure.
         if rclpy.ok():
-            if node is None and isinstance(error, RCLError):  # such as security that it lacks
-                return _refuse(kind, f'ROS 2: {error}')
+            if not nodes and isinstance(error, RCLError):  # such as security that it lacks
+                return _refuse(kinds, f'ROS 2: {error}')
             raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        if node is not None:
+        for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
 
 
-def _spin(node: BaseNode) -> None:
+def _spin(nodes: Sequence[BaseNode]) -> None:
+    executor = SingleThreadedExecutor()
+    for node in nodes:
+        executor.add_node(node)
     while rclpy.ok():
         try:
-            rclpy.spin(node)
+            executor.spin()
         except (ExternalShutdownException, Finished):
             raise
         except Exception as error:  # of the client library, about what came over the wire
-            node.unforeseen(error)
+            nodes[0].unforeseen(error)
 
 
-def _refuse(kind: type[BaseNode], error: Exception | str) -> int:
-    print(f'{kind.NAME}: {" ".join(str(error).split())}', file=sys.stderr)
+def _refuse(kinds: Sequence[type[BaseNode]], error: Exception | str) -> int:
+    names = ', '.join(kind.NAME for kind in kinds)
+    print(f'{names}: {" ".join(str(error).split())}', file=sys.stderr)
     return 2

@@ -2,41 +2,64 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Any
+
+from rclpy.serialization import deserialize_message
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
-from fisheye_svp_ros.nodes.quality import LATCHED, RELIABLE
+from fisheye_svp_ros.nodes.quality import LATCHED, RELIABLE, TRANSFORMS
 from fisheye_svp_ros.pose import Pose
+
+_TOPICS = {False: ('/tf', RELIABLE), True: ('/tf_static', LATCHED)}
+_MAX_SENT = 100  # transforms by which those that come back may be late
 
 
 class Transforms:
     """What one node tells tf2, if it is to; static: what holds until it is told anew.
 
-    A frame has one parent (REP 105): two nodes must not tell of the same child.
+    A frame has one parent (REP 105): where another node tells of the same child, it is said.
     Raises ParameterError where it is to and tf2_msgs is not installed.
     """
 
     def __init__(self, node: BaseNode, wanted: bool, static: bool = False) -> None:
         self._node = node
         self._publisher = None
+        self._sent: deque[Any] = deque(maxlen=_MAX_SENT)
+        self._children: set[str] = set()
         if wanted:
-            topic, qos = ('/tf_static', LATCHED) if static else ('/tf', RELIABLE)
+            topic, qos = _TOPICS[static]
             self._kind = _message_class()
             self._publisher = node.announce(self._kind, topic, qos)
+            for topic, asked in TRANSFORMS.items():
+                node.create_subscription(
+                    self._kind, topic, node.guarded(self._compare), asked, raw=True)
 
     def publish(self, pose: Pose, stamp: int, frame: str, child: str) -> None:
         """Publish the pose of a frame in its parent; warn where frame ids cannot be used."""
         if self._publisher is None:
             return
         if not frame or not child or frame == child:
-            self._node.get_logger().warning(
-                f'no transform: frame_id {frame!r} cannot be the parent of {child!r}',
-                throttle_duration_sec=10.0)
+            self._node.warn(f'no transform: frame_id {frame!r} cannot be the parent of {child!r}')
             return
         transform = messages.transform_message(pose, stamp, frame, child)
+        self._sent.append(transform)
+        self._children.add(child)
         self._publisher.publish(self._kind(transforms=[transform]))
+
+    def _compare(self, data: bytes) -> None:
+        """Warn of what others tell of the frames of this node."""
+        if not any(child.encode() in data for child in self._children):
+            return  # a robot tells of many frames, many times a second
+        for transform in deserialize_message(data, self._kind).transforms:
+            child = transform.child_frame_id
+            if child in self._children and transform not in self._sent:
+                self._node.warn(
+                    f'/tf: another node tells of {child!r} as well, in '
+                    f'{transform.header.frame_id!r}, and a frame has one parent: give one of them '
+                    'another camera_frame, or publish_tf:=false')
 
 
 def _message_class() -> Any:

@@ -35,8 +35,9 @@ class CameraSettings(Settings):
     )
     world_frame: str = parameter('world', 'Frame id of the world', fixed=True)
     camera_frame: str = parameter(
-        'camera_optical_frame', 'Frame id of the camera; those of a rig have left_ and right_ '
-        'before it', fixed=True
+        '', 'Frame id of the camera; those of a rig have left_ and right_ before it. Empty: '
+        'camera_optical_frame, after the namespace where there is one: front_camera_optical_frame',
+        fixed=True
     )
     publish_tf: bool = parameter(
         False, 'Tell tf2 the true pose: `world_frame` to the frame of the camera with _true '

@@ -16,7 +16,7 @@ import pytest
 from helpers.nodes import hears_sigint, until
 from helpers.targets import plane, poses_around
 
-from fisheye_svp_ros import cli, commands
+from fisheye_svp_ros import __version__, cli, commands
 from fisheye_svp_ros.commands.notes import note_doubtful, note_gross_errors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import CsvTable
@@ -57,6 +57,13 @@ def process(*arguments, **options):
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hears_sigint,
         **options,
     )
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(['--version'])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f'fisheye-svp {__version__}\n'
 
 
 def refused(capsys, *arguments):

@@ -316,6 +316,19 @@ def test_a_camera_info_as_it_is_echoed(tmp_path: Path) -> None:
             load_lens(path)
 
 
+def test_a_camera_info_without_its_model_says_what_to_write(tmp_path: Path) -> None:
+    path = tmp_path / 'info.yaml'
+    text = yaml.safe_load(write_foreign(LENS, 'ros'))
+    del text['distortion_model']
+    path.write_text(yaml.safe_dump(text))
+    with pytest.raises(LensError, match=r'distortion_model is missing; .* equidistant$'):
+        load_lens(path)
+    path.write_text(yaml.safe_dump({**text, 'camera_model': 'fisheye'}))
+    with pytest.raises(LensError, match=r'info.yaml: distortion_model is missing; .* '
+                                        r'equidistant in place of camera_model: fisheye$'):
+        load_lens(path)
+
+
 def test_curves_that_a_form_cannot_say() -> None:
     bare = replace(LENS, image_height=Equidistant())
     assert yaml.safe_load(write_foreign(bare, 'kalibr'))['cam0']['distortion_coeffs'] == (

@@ -144,7 +144,7 @@ def test_a_signal_while_a_node_is_being_built_ends_it_quietly(
 
     monkeypatch.setattr(base.BaseNode, 'announce', interrupt)
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
-    assert executables.run(name, []) == 0
+    assert executables.run(name, args=[]) == 0
     assert capfd.readouterr().err == ''
 
 
@@ -173,7 +173,7 @@ def test_a_second_interrupt_does_not_disturb_what_the_first_one_ends(
         raise AssertionError(held)
 
     monkeypatch.setattr(base.BaseNode, 'announce', interrupt)
-    assert executables.run('localizer', []) == 0
+    assert executables.run('localizer', args=[]) == 0
     assert capfd.readouterr().err == ''
 
 
@@ -194,7 +194,7 @@ def test_an_interrupt_that_was_lost_can_be_repeated(
 
     went_on: list[bool] = []
     monkeypatch.setattr(base.BaseNode, 'announce', lose)
-    assert executables.run('localizer', []) == 0
+    assert executables.run('localizer', args=[]) == 0
     assert not went_on
 
 
@@ -210,4 +210,4 @@ def test_what_fails_once_a_signal_has_ended_the_context_is_no_failure(
     monkeypatch.setattr(base.BaseNode, 'announce', fail)
     monkeypatch.setattr(signal, 'signal', lambda *_: None)
     with nullcontext() if ended else pytest.raises(RuntimeError):
-        assert executables.run('localizer', []) == 0
+        assert executables.run('localizer', args=[]) == 0

@@ -20,8 +20,10 @@ from helpers.photographs import BOARD, LENS, poses
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.pose import quaternion_from_rotation
+from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 
@@ -38,7 +40,8 @@ FILES = {
 SWEEP = """
 synthetic_camera:
   ros__parameters:
-    sweep.radius: [2.0, 0.5]
+    noise_px: 0
+    sweep.radius: [2, 1]
     sweep.environment: [whole, inner]
 localizer: {ros__parameters: {svp: true}}
 """
@@ -93,7 +96,7 @@ def test_a_sweep_is_recorded_and_ends_by_itself(ros_domain: int, tmp_path: Path)
     text = '\n'.join(launch.lines)
     assert 'Traceback' not in text and 'has died' not in text, text
     columns = tabulate(Bag(bag).records(is_tabulated))
-    assert columns['scenario'] == [0, 1, 2, 3] and columns['radius'] == [2.0, 2.0, 0.5, 0.5]
+    assert columns['scenario'] == [0, 1, 2, 3] and columns['radius'] == [2.0, 2.0, 1.0, 1.0]
     assert all(error < 0.01 for error in columns['localizer.position_error_m'])
 
 
@@ -124,6 +127,59 @@ def test_an_argument_that_cannot_be_used_is_refused(
     assert mono.finish() != 0
     text = '\n'.join(mono.lines)
     assert reason in text and 'process started' not in text
+
+
+def test_observations_without_a_measured_camera_are_refused(
+    launch: Callable[..., NodeProcess]
+) -> None:
+    mono = launch('mono.launch.py', 'observations:=seen.csv')
+    assert mono.finish() != 0
+    assert 'add camera:=measured_camera' in '\n'.join(mono.lines)
+
+
+def test_observations_are_replayed(
+    launch: Callable[..., NodeProcess], graph: Graph, tmp_path: Path
+) -> None:
+    seen = simulate_scenario(Scenario(shift_scale=0.0)).observations
+    write_observations(tmp_path / 'seen.csv', seen)
+    results = graph.hear(DiagnosticArray, '/localizer/result')
+    launch('mono.launch.py', 'camera:=measured_camera', f'observations:={tmp_path}/seen.csv',
+           'lens:=fish214', 'svp:=true')
+    graph.until(lambda: any(read_key_values(m).get('rms_px') for m in results))
+
+
+def test_an_argument_wins_over_what_files_say_of_the_node(
+    launch: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    params = tmp_path / 'mine.yaml'
+    params.write_text('/**: {ros__parameters: {lens: fish214}}\n'
+                      'localizer: {ros__parameters: {lens: fish214, svp: true}}\n'
+                      '/robot/localizer: {ros__parameters: {lens: fish214}}\n')
+    mono = launch('mono.launch.py', 'namespace:=robot', 'lens:=fish180', 'svp:=false',
+                  f'localizer_params:={params}')
+    mono.wait_for(r'solving with the lens fish180 as it stands \(svp: false\)')
+
+
+@pytest.mark.parametrize('composed', ['true', 'false'])
+def test_a_camera_may_be_composed_in_one_process(
+    launch: Callable[..., NodeProcess], graph: Graph, tmp_path: Path, composed: str
+) -> None:
+    params = tmp_path / 'mine.yaml'
+    params.write_text('/**: {ros__parameters: {patience: 7}}')
+    camera = launch('camera.launch.py', 'namespace:=robot', 'image:=/camera/image_raw',
+                    'board:=chessboard:5x4:30mm', f'localizer_params:={params}',
+                    f'composed:={composed}', 'world_frame:=map')
+    graph.until(lambda: {('detector', '/robot'), ('localizer', '/robot'),
+                         ('model_critic', '/robot')} <= {
+        *graph.probe.get_node_names_and_namespaces()})
+    graph.until(lambda: len(graph.probe.get_subscriptions_info_by_topic(
+        '/camera/image_raw/compressed')))
+    said = '\n'.join(camera.lines)
+    for _ in range(3):
+        camera.wait_for('listening to ')
+    said = '\n'.join(camera.lines)
+    assert said.count('process started with pid') == (1 if composed == 'true' else 3)
+    assert '/camera/camera_info' in said and 'means nothing' not in said
 
 
 def test_everything_goes_below_a_namespace(graph: Graph) -> None:
@@ -181,10 +237,11 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
     mono = launch('mono.launch.py', 'namespace:=robot', f'params:={params}',
                   'log_level:=debug', 'respawn:=True')
     pid = int(mono.wait_for(r'\[localizer-\d\]: process started with pid \[(\d+)\]')[1])
-    for child in ('camera_optical_frame', 'camera_optical_frame_true'):
+    for child in ('robot_camera_optical_frame', 'robot_camera_optical_frame_true'):
         graph.until(lambda child=child: buffer.can_transform('map', child, Time()))
     between = buffer.lookup_transform(
-        'camera_optical_frame_true', 'camera_optical_frame', Time()).transform.translation
+        'robot_camera_optical_frame_true', 'robot_camera_optical_frame',
+        Time()).transform.translation
     assert max(abs(between.x), abs(between.y), abs(between.z)) < 1e-6
     assert read_key_values(scenarios[0])['radius'] == '0.5'
     os.kill(pid, signal.SIGKILL)

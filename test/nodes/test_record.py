@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
@@ -393,6 +394,17 @@ def test_the_recorder_writes_every_message_until_it_is_interrupted(
     assert '25 messages on 5 topics' in recorder.lines[-1]
     columns = tabulate(Bag(tmp_path / 'bag').records(is_tabulated))
     assert columns['seed'] == [1, 2, 3, 4, 5]
+
+
+def test_no_empty_recording_is_left_behind(
+    command: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    recorder = command('record', '-o', str(tmp_path / 'bag'), '--topics', '/nothing')
+    until((tmp_path / 'bag').exists)
+    time.sleep(0.5)
+    assert recorder.finish(signal.SIGINT) == 2
+    assert 'no message came on a topic that is recorded, and nothing is kept' in recorder.lines[-1]
+    assert not (tmp_path / 'bag').exists()
 
 
 def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(

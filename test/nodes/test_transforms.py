@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph
 
+from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped  # isort: skip
 from sensor_msgs.msg import PointCloud2  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
@@ -17,11 +18,12 @@ from visualization_msgs.msg import MarkerArray  # isort: skip
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.clouds import LANDMARKS, unpack
 from fisheye_svp_ros.io.decoding import columns, read_pose, read_transform, stamp_of
+from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.stereo_calibrator import StereoCalibrator
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, identity
 
 
 def edges(heard: list[Any]) -> dict[tuple[str, str], list[Any]]:
@@ -123,3 +125,41 @@ def test_a_frame_without_a_name_is_no_transform(
     g.start(SyntheticCamera)
     g.until(lambda: len(poses) > 2)
     assert not heard and "frame_id '' cannot be the parent" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(('words', 'given', 'frames'), [
+    ((), (), ('left_camera_optical_frame', 'right_camera_optical_frame')),
+    (('__ns:=/front/low',), (), ('front_low_left_camera_optical_frame',
+                                 'front_low_right_camera_optical_frame')),
+    (('__ns:=/front',), ('camera_frame:=cam',), ('left_cam', 'right_cam')),
+])
+def test_frames_follow_the_namespace_unless_they_are_named(
+    ros_domain: int, words: tuple[str, ...], given: tuple[str, ...], frames: tuple[str, str]
+) -> None:
+    g = Graph(*(w for one in words for w in ('-r', one)),
+              *(w for one in ('style:=parallel', *given) for w in ('-p', one)))
+    try:
+        node = g.start(SyntheticCamera)
+        assert tuple(node.camera(name).frame for name in ('left', 'right')) == frames
+    finally:
+        g.close()
+
+
+def test_a_frame_that_another_node_tells_of_is_said(
+    graph: Callable[..., Graph], tf_message: Any
+) -> None:
+    g = graph('publish_tf:=true', 'svp:=false', 'rate:=50.0')
+    reports = g.hear(DiagnosticArray, '/diagnostics')
+    g.start(SyntheticCamera)
+    g.start(Localizer)
+    other = g.tell(tf_message, '/tf')
+    g.idle(2.5)
+    assert not any('another node' in m.status[0].message for m in reports)
+    transform = messages.transform_message(identity(), 5, 'base_link', 'camera_optical_frame')
+
+    def said() -> Any:
+        other.publish(tf_message(transforms=[transform]))
+        return next((m for m in reports if "/tf: another node tells of 'camera_optical_frame' as "
+                     "well, in 'base_link'" in m.status[0].message), None)
+
+    assert g.until(said).status[0].name == '/localizer: inputs'

@@ -37,8 +37,11 @@ _MESSAGE = re.compile('^[kK]:', re.MULTILINE)
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return 'distortion_model:' in text and '%YAML' not in text and (
-        'camera_matrix:' in text or bool(_MESSAGE.search(text)))
+    if '%YAML' in text:
+        return False
+    if 'distortion_model:' in text:
+        return 'camera_matrix:' in text or bool(_MESSAGE.search(text))
+    return 'camera_matrix:' in text and 'distortion_coefficients:' in text
 
 
 def read(text: str, where: str) -> Foreign:
@@ -50,6 +53,11 @@ def read(text: str, where: str) -> Foreign:
         k = fields.numbers(document['camera_matrix'], 'data', 9, where)
         size = document['image_width'], document['image_height']
         name = str(document.get('camera_name', 'camera'))
+        if 'distortion_model' not in document:
+            other = document.get('camera_model')
+            instead = f' in place of camera_model: {other}' if other else ''
+            raise LensError(f'{where}: distortion_model is missing; a fisheye camera_info has '
+                            f'distortion_model: equidistant{instead}')
         model = str(document['distortion_model'])
         d = document['distortion_coefficients']['data']
         d = fields.numbers({'data': d}, 'data', len(d), where)
