@@ -24,7 +24,7 @@ SCRIPTS = {
     'diagnose_observations': ('viewpoint_shift: p = ', ['extended.yaml']),
     'stereo_depth_error': ('full lens: baseline 150.0', []),
 }
-NODE_SCRIPTS = {'publish_image_points'}
+NODE_SCRIPTS = {'publish_image_points', 'compose_nodes'}
 NOTEBOOKS = ('viewpoint_shift', 'diagnosis')
 
 
@@ -58,6 +58,16 @@ def test_poses_come_for_published_points(
     assert done.returncode == 0, (done.stderr, localizer.lines)
     poses = [line for line in done.stdout.splitlines() if line.startswith('x = ')]
     assert len(poses) == 10
+
+
+def test_nodes_are_composed(ros_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip('rclpy', reason='needs ROS 2 (rclpy)')
+    monkeypatch.setenv('PYTHONPATH', str(ROOT), prepend=':')
+    done = subprocess.run([sys.executable, str(EXAMPLES / 'compose_nodes.py')],
+                          capture_output=True, text=True, timeout=TIMEOUT)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == 5 * [done.stdout.splitlines()[0]]
+    assert done.stdout.startswith('x -0.0') or done.stdout.startswith('x 0.0')
 
 
 @pytest.mark.parametrize('name', NOTEBOOKS)

@@ -33,23 +33,35 @@ class _Track:
     """What has come on an optional topic, by stamp."""
 
     def __init__(self) -> None:
-        self.items: dict[int, Any] = {}  # that no set has taken yet
+        self.items: dict[int, Any] = {}  # that no set has taken yet, in the order of arrival
+        self._arrivals: dict[int, float] = {}  # of these, s
         self.expected, self.matched = True, False
         self.missed: deque[int] = deque(maxlen=_MAX_MISSED)  # stamps of sets that went without
         self._stamps: list[int] = []  # of the latest items in ascending order
         self._latest: list[Any] = []
 
-    def add(self, stamp: int, item: Any) -> None:
-        self.items.pop(stamp, None)
-        self.items[stamp] = item
+    def add(self, stamp: int, item: Any, now: float, keep: bool) -> None:
+        """Take an item in; keep: also for sets between it and another."""
+        self.take(stamp)
+        self.items[stamp], self._arrivals[stamp] = item, now
         if len(self.items) > LIMIT:
-            del self.items[next(iter(self.items))]
+            self.take(next(iter(self.items)))
         if self._stamps and stamp <= self._stamps[-1]:  # a recording that starts over, say
             self._stamps, self._latest = [], []
         self._stamps.append(stamp)
-        self._latest.append(item)
+        self._latest.append(item if keep else None)
         if len(self._stamps) > LIMIT:
             del self._stamps[0], self._latest[0]
+
+    def take(self, stamp: int) -> Any:
+        """Return the item of a stamp, which is nobody else's from now on; None for none."""
+        self._arrivals.pop(stamp, None)
+        return self.items.pop(stamp, None)
+
+    def expire(self, before: float) -> None:
+        """Forget what came before a time, s, and what no set has taken."""
+        while self._arrivals and next(iter(self._arrivals.values())) < before:
+            self.take(next(iter(self._arrivals)))
 
     def find(self, stamp: int, reach: int, taken: Mapping[int, None]) -> Any:
         """Return the item of a stamp, or of the two around it, or None."""
@@ -62,8 +74,10 @@ class _Track:
         # What has the stamp of another set belongs to that one.
         if second - first > reach or first in taken or second in taken:
             return None
-        fraction = (stamp - first) / (second - first)
-        return NeighborPair(self._latest[after - 1], self._latest[after], fraction)
+        before, behind = self._latest[after - 1:after + 1]
+        if before is None or behind is None:
+            return None
+        return NeighborPair(before, behind, (stamp - first) / (second - first))
 
     def is_past(self, stamp: int) -> bool:
         """Say whether nothing for a stamp can come: others have passed it, and never match."""
@@ -109,7 +123,7 @@ class StampJoin:
         """
         track = self._tracks.get(topic)
         if track is not None:
-            track.add(stamp, item)
+            track.add(stamp, item, now, bool(self.reaches.get(topic)))
             if any(self._find(topic, missed) is not None for missed in track.missed):
                 track.expected = True
                 track.missed.clear()
@@ -135,7 +149,7 @@ class StampJoin:
     def forget(self, topic: str, stamp: int) -> None:
         """Forget an item; of a required one its set."""
         if topic in self._tracks:
-            self._tracks[topic].items.pop(stamp, None)
+            self._tracks[topic].take(stamp)
         elif one := self._holding(topic, stamp):
             del self._pending[one.stamp]
 
@@ -173,6 +187,8 @@ class StampJoin:
 
     def given_up(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that lack a required item and are out of patience."""
+        for track in self._tracks.values():
+            track.expire(now - patience)
         surplus = len(self._pending) - LIMIT
         for number, one in enumerate(list(self._pending.values())):
             incomplete = any(topic not in one.items for topic in self._required)
@@ -191,7 +207,7 @@ class StampJoin:
             track.missed.append(stamp)
             return
         one.items[topic] = item
-        if track.items.pop(stamp, None) is not None:
+        if track.take(stamp) is not None:
             track.matched = True
 
     def _find_set(self, topic: str, stamp: int) -> Pending | None:

@@ -78,7 +78,7 @@ class Hour:
                        for report in self.reports for status in report.status)
 
         try:
-            self.graph.until(told, 20)
+            self.graph.until(told)
         except AssertionError:
             texts = {status.message for report in self.reports for status in report.status}
             pytest.fail(f'{pattern!r} is not in {texts}')

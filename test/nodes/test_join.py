@@ -141,6 +141,16 @@ def test_what_lacks_its_counterpart_is_given_up() -> None:
     assert told(sets.given_up(9.0, 1.0)) == []
 
 
+def test_what_no_set_takes_is_forgotten_with_patience() -> None:
+    """A large map that is sent each second, say, under stamps of its own."""
+    sets = mono()
+    for second in range(5):
+        sets.add('t', second, bytes(1), float(second))
+        assert told(sets.given_up(float(second), 2.0)) == []
+    assert [sets.waiting('t', stamp) for stamp in range(5)] == [None, None, b'\0', b'\0', b'\0']
+    assert not any(sets._tracks['t']._latest)
+
+
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(join, 'LIMIT', 3)
     sets = StampJoin(('l', 'r'), {'t': 'l'})

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from helpers.nodes import NodeProcess
+from helpers.nodes import ROOT, TIMEOUT, NodeProcess
 
 pytest.importorskip('launch_ros')
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
@@ -180,6 +180,25 @@ def test_a_camera_may_be_composed_in_one_process(
     said = '\n'.join(camera.lines)
     assert said.count('process started with pid') == (1 if composed == 'true' else 3)
     assert '/camera/camera_info' in said and 'means nothing' not in said
+
+
+def test_the_commands_of_the_documentation_show_metrics(
+    launch: Callable[..., NodeProcess], graph: Graph
+) -> None:
+    results = graph.hear(DiagnosticArray, '/localizer/result')
+    text = (ROOT / 'docs' / 'reference' / 'nodes.md').read_text(encoding='utf-8')
+    block = text.partition('<!-- a test with an installed ROS 2 runs this -->')[2].split('```')[1]
+    commands = block.splitlines()[1:]
+    assert len(commands) == 5
+    launch('mono.launch.py')
+    graph.until(lambda: results)
+    for command in commands:
+        for _ in range(5):  # the daemon of ros2cli may not know of the topics yet
+            done = subprocess.run(command.split(), capture_output=True, text=True, timeout=TIMEOUT)
+            if done.returncode == 0:
+                break
+        assert done.returncode == 0 and done.stdout.strip(), (command, done.stderr)
+    subprocess.run(['ros2', 'daemon', 'stop'], capture_output=True, timeout=TIMEOUT)
 
 
 def test_everything_goes_below_a_namespace(graph: Graph) -> None:
