@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
 from fisheye_svp_ros.commands.photographs import (
@@ -60,8 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'place of the port alone is fitted')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
                         help='lens file to write; covariances go beside it as .calibrate.json, '
-                        'the report as calibration.html; for the cameras left and right a folder, '
-                        'for a lens of each and rig.yaml')
+                        'the report as calibration.html; for several cameras a folder, for a lens '
+                        'of each and rig.yaml, of three and more also rig.json, rig.urdf, '
+                        'tf_static.yaml and camchain.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -102,9 +104,18 @@ def run(args: argparse.Namespace) -> None:
         _print(one)
         for warning in one.warnings:
             say(warning)
-    if pair := rig_cameras(observations.cameras):
-        lenses = {camera: one.lens for camera, one in found.items()}
+    lenses = {camera: one.lens for camera, one in found.items()}
+    if len(lenses) > 2:
+        calibrate_cameras(_joined([one.table for one in found.values()]), lenses, args.output)
+    elif pair := rig_cameras(observations.cameras):
         _rig(observations, lenses, pair, args.output)
+
+
+def _joined(tables: Sequence[Observations]) -> Observations:
+    """Return the rows of several tables of the same cameras."""
+    rows: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables])
+            for name in ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')}
+    return replace(tables[0], **rows)
 
 
 def _next_command(args: argparse.Namespace, paths: Mapping[str, Path]) -> str:

@@ -17,6 +17,7 @@ from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
 from fisheye_svp_ros.io.files import together, write_json, write_text
+from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording import (
     Columns,
     ResidualSet,
@@ -24,6 +25,7 @@ from fisheye_svp_ros.io.recording import (
     is_tabulated,
     tabulate,
 )
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.paper.demonstration import (
     TASKS,
     DemoRow,
@@ -32,9 +34,16 @@ from fisheye_svp_ros.paper.demonstration import (
     demo_rows,
     residual_fields,
 )
+from fisheye_svp_ros.paper.demonstration_pair import rectified_pair
 from fisheye_svp_ros.paper.tables import LENSES
 from fisheye_svp_ros.reporting.progress import progress
-from fisheye_svp_ros.reporting.tables import print_table
+from fisheye_svp_ros.reporting.tables import print_table, range_text
+from fisheye_svp_ros.reporting.undistort_report import (
+    draw_pair,
+    print_remaining,
+    remaining_document,
+    rows_left,
+)
 from fisheye_svp_ros.scene.landmarks import RADII
 
 _MARK, _RECORDING = '.demo', 'recording'
@@ -66,14 +75,21 @@ def run(args: argparse.Namespace) -> None:
     else:
         columns, fields = _record(args.output, args.lenses, args.radii)
     rows = demo_rows(columns, args.lenses, args.radii)
+    with progress('rectifying a pair'):
+        pair, images = rectified_pair(load_lens(lens_path(args.lenses[0])))
+        apart = rows_left(pair)
     with together():
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'demo.json', {
             'recording': bag and str(bag), 'rows': [row._asdict() for row in rows],
+            'rectified': remaining_document(apart),
         })
         _draw(args.output, rows, fields)
+        draw_pair(args.output / 'rectified.png', *images)
     note_formats()
     _print(rows)
+    print_remaining(f'A pair of {args.lenses[0]}, rectified at {range_text(pair.left.range)}: '
+                    'rows of left and right differ by', apart)
     print(f'  {"recording, " if bag else ""}table, pictures: {args.output}')
 
 

@@ -32,6 +32,7 @@ _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift'
 LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MOST = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
+_NO_LENSES = ('rig', 'camchain', 'tf_static')  # files of a rig beside those of its lenses
 OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
 _OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
 
@@ -167,7 +168,7 @@ def _in_folder(folder: Path) -> dict[str, Path]:
         above = '*/' * depth
         found = found or {
             str(file.relative_to(folder).with_suffix('')): file
-            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem != 'rig'
+            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem not in _NO_LENSES
         } or {
             str(file.parent.relative_to(folder)): file
             for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from fisheye_svp_ros.errors import LensError
@@ -10,16 +11,39 @@ from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
 from fisheye_svp_ros.io.lens_files import LARGEST, read_lens_file
 from fisheye_svp_ros.io.lens_formats import read_foreign
-from fisheye_svp_ros.pose import Pose, quaternion_from_rotation
+from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
 
 
-def save_rig(rig: Pose, path: str | Path, cameras: Sequence[str] = STEREO) -> None:
-    """Write the first camera in the second: position, m, and quaternion x, y, z, w."""
-    write_text(path, dump_yaml({'_in_'.join(cameras): {
-        'position': rig.position.tolist(),
-        'quaternion': quaternion_from_rotation(rig.rotation).tolist(),
-    }}))
+def save_rig(rig: Pose | Sequence[Pose], path: str | Path,
+             cameras: Sequence[str] = STEREO) -> None:
+    """Write each camera in the next one: position, m, and quaternion x, y, z, w.
+
+    rig: the first camera in the second, or so many as there are cameras after the first.
+    """
+    steps = [rig] if isinstance(rig, Pose) else rig
+    write_text(path, dump_yaml({f'{one}_in_{other}': {
+        'position': step.position.tolist(),
+        'quaternion': quaternion_from_rotation(step.rotation).tolist(),
+    } for (one, other), step in zip(pairwise(cameras), steps, strict=True)}))
+
+
+def load_rigs(path: str | Path) -> tuple[Pose, ...]:
+    """Return each camera in the next one, of a file that `load_rig` reads."""
+    foreign = read_foreign(path, read_text(path, LensError, LARGEST))
+    if foreign is None:
+        raise LensError(f'{path}: left_in_right with position and quaternion is needed')
+    if not foreign.rigs:
+        raise LensError(f'{path}: it holds one camera, or no transform between two')
+    return foreign.rigs
+
+
+def cameras_in_first(steps: Sequence[Pose]) -> Pose:
+    """Return the cameras (C,) of a rig in its first one, of each camera in the next one."""
+    poses = [identity()]
+    for step in steps:
+        poses.append(poses[-1].compose(step.inverse()))
+    return Pose.stack(poses)
 
 
 def load_rig(path: str | Path) -> Pose:
@@ -28,12 +52,7 @@ def load_rig(path: str | Path) -> Pose:
     Kalibr's camchain, Basalt, OpenCV's R and T, URDF, what `ros2 topic echo /tf_static` prints.
     Raises LensError, naming file and field, where there is none.
     """
-    foreign = read_foreign(path, read_text(path, LensError, LARGEST))
-    if foreign is None:
-        raise LensError(f'{path}: left_in_right with position and quaternion is needed')
-    if not foreign.rigs:
-        raise LensError(f'{path}: it holds one camera, or no transform between two')
-    return foreign.rigs[0]
+    return load_rigs(path)[0]
 
 
 def rig_of_lenses(path: str | Path) -> Pose | None:

@@ -1,4 +1,4 @@
-"""Stereo rigs: the three styles of Kita's figure 7 and the ten poses a rig is calibrated from."""
+"""Rigs: the three styles of Kita's figure 7, the poses that calibrate one, cameras all around."""
 
 from __future__ import annotations
 
@@ -28,6 +28,20 @@ def rig_from_angle(inward: float, baseline: float) -> Pose:
     """Return the left camera in the right one, turned inward by an angle, rad."""
     turn = rotation_from_vector(np.array([0.0, inward, 0.0]))
     return Pose(turn, np.array([-baseline, 0.0, 0.0]))
+
+
+def surround_rig(count: int, radius: float) -> Pose:
+    """Return cameras (count,) that look outward from a circle about y, m, in the first of them.
+
+    Raises ParameterError for fewer than two, or an impossible radius.
+    """
+    if count < 2 or not (np.isfinite(radius) and radius > 0):
+        raise ParameterError(f'{count} cameras on a circle of {radius} m; at least 2, and a '
+                             'radius above 0, are needed')
+    azimuth = 2 * np.pi * np.arange(count) / count
+    turns = azimuth[:, None] * np.array([0.0, 1.0, 0.0])
+    places = np.stack([np.sin(azimuth), np.zeros(count), np.cos(azimuth) - 1], axis=-1)
+    return Pose(rotation_from_vector(turns), radius * places)
 
 
 def paper_pose(*shape: int) -> Pose:

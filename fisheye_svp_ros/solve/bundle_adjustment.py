@@ -181,6 +181,25 @@ def adjust_lens_from(
     return problem.unpack(solved.state, int(np.argmin(solved.cost))).lens
 
 
+def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
+    """Return the covariances (C - 1, 6, 6) of the cameras but the first, m and rad, poses free.
+
+    Of the change in `Pose.retract`, for noise of sigma / weight, and of lenses that were held at
+    values of a covariance (K, K): of the free parameters of the linearization.
+    Raises GeometryError where the frames do not determine the rig.
+    """
+    cameras = linear.data.cameras - 1
+    count = 6 * cameras
+    names = [f'the place of camera {i + 2}' for i in range(cameras) for _ in range(6)]
+    _check_determined(_equations(linear, linear.shared_columns[..., :count])[1], names)
+    information = arrow_information(_equations(linear, linear.shared_columns)[1])[0]
+    inverse = np.linalg.inv(information[:count, :count])
+    moved = inverse @ information[:count, count:count + len(lenses)]
+    shared = sigma**2 * inverse + moved @ lenses @ moved.T
+    blocks = shared.reshape(cameras, 6, cameras, 6)
+    return np.stack([blocks[i, :, i] for i in range(cameras)])
+
+
 class _Adjustment:
     """S arrow systems, see least_squares.LeastSquares: frames are blocks, all else is shared."""
 

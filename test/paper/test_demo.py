@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from helpers.nodes import ROOT, need_ros
@@ -69,6 +70,16 @@ def test_every_scenario_is_there_once_beside_the_published_numbers(demo: Any) ->
             assert low / 2 < row[name] < 2 * high
 
 
+def test_a_rectified_pair_is_shown(demo: Any) -> None:
+    folder, out = demo
+    assert 'A pair of fish180, rectified at 0.5 m: rows of left and right differ by' in out
+    rows = json.loads((folder / 'demo.json').read_text())['rectified']
+    worst = dict(zip(rows['ranges_m'], rows['worst_px'], strict=True))
+    assert worst[0.5] < 1e-6 < 0.05 < worst[0.3]
+    picture = cv2.imread(str(folder / 'rectified.png'))
+    assert picture.shape == (480, 1280, 3)
+
+
 def test_everything_is_recorded(demo: Any) -> None:
     folder, _ = demo
     columns = tabulate(Bag(folder / 'recording').records(is_tabulated))
@@ -90,9 +101,10 @@ def test_as_observations_it_says_how_to_record_one_of_its_namespaces(demo: Any) 
 def test_the_table_and_the_pictures_are_there(demo: Any) -> None:
     folder, printed = demo
     assert printed.count(' as SVP. error: ') == 3
-    assert printed.count('fish180') == 9 and '-0.1614' in printed
+    lines = printed.splitlines()
+    assert sum(line.startswith('  fish180 ') for line in lines) == 9 and '-0.1614' in printed
     assert 'Error2' in printed and 'Error3' in printed
-    for name in ('errors.png', 'residuals.png'):
+    for name in ('errors.png', 'residuals.png', 'rectified.png'):
         assert (folder / name).read_bytes().startswith(b'\x89PNG')
     assert (folder / 'table.csv').exists()
 
@@ -130,7 +142,7 @@ def test_without_ros_the_same_scenarios_are_computed(computed: Any) -> None:
     assert first.startswith('  Without ROS 2 (') and 'in one process, no node graph' in first
     assert sum(line.startswith('  fish180 ') for line in others) == 9
     assert sorted(path.name for path in folder.iterdir() if path.suffix != '.parquet') == [
-        'demo.json', 'errors.png', 'residuals.png', 'table.csv']
+        'demo.json', 'errors.png', 'rectified.png', 'residuals.png', 'table.csv']
     assert json.loads((folder / 'demo.json').read_text())['recording'] is None
     counts = read_columns(folder / 'table.csv')['namespace']
     assert [counts.count(f'/{task.name}') for task in TASKS] == [3, 3 * 10, 3 * 2]

@@ -84,12 +84,23 @@ def _rig(rows: Any, where: str) -> Pose:
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as the one camera of its chain."""
-    near = radial.nearest(lens)
-    return dump_yaml({'cam0': {
-        'camera_model': 'pinhole',
-        'intrinsics': [near.fx, near.fy, near.cx, near.cy],
-        'distortion_model': 'equidistant',
-        'distortion_coeffs': radial.coefficients(near),
-        'resolution': [near.width, near.height],
-        'rostopic': f'/{near.name}/image_raw',
-    }}, default_flow_style=None)
+    return write_chain([lens], ())
+
+
+def write_chain(lenses: Sequence[Lens], rigs: Sequence[Pose]) -> str:
+    """Return lenses and each camera in the next one in this form; viewpoint shifts stay behind."""
+    document: dict[str, Any] = {}
+    for number, near in enumerate(map(radial.nearest, lenses)):
+        document[f'cam{number}'] = {
+            'camera_model': 'pinhole',
+            'intrinsics': [near.fx, near.fy, near.cx, near.cy],
+            'distortion_model': 'equidistant',
+            'distortion_coeffs': radial.coefficients(near),
+            'resolution': [near.width, near.height],
+            'rostopic': f'/{near.name}/image_raw',
+        }
+        if number:
+            rig = rigs[number - 1]
+            rows = np.column_stack([rig.rotation, rig.position]).tolist()
+            document[f'cam{number}']['T_cn_cnm1'] = [*rows, [0.0, 0.0, 0.0, 1.0]]
+    return dump_yaml(document, default_flow_style=None)

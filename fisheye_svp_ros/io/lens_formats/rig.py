@@ -1,7 +1,8 @@
-"""The rig file of this package: one camera in the other, and no lenses."""
+"""The rig file of this package: each camera in the next one, and no lenses."""
 
 from __future__ import annotations
 
+import itertools
 import re
 
 from fisheye_svp_ros.errors import LensError
@@ -19,9 +20,13 @@ def recognises(text: str) -> bool:
 def read(text: str, where: str) -> Foreign:
     """Read position, m, and quaternion x, y, z, w; raises LensError, naming the field."""
     document = parse_yaml(text, where, LensError)
-    name = next((name for name in map(str, document) if '_in_' in name), 'left_in_right')
-    entry = fields.section(document, name, where)
-    where = f'{where}: {name}'
-    place = fields.numbers(entry, 'position', 3, where)
-    turn = fields.numbers(entry, 'quaternion', 4, where)
-    return Foreign('rig', {}, (fields.pose(place, turn, where),), {})
+    names = [name for name in map(str, document) if '_in_' in name] or ['left_in_right']
+    rigs = []
+    for name in names:
+        entry, place = fields.section(document, name, where), f'{where}: {name}'
+        rigs.append(fields.pose(fields.numbers(entry, 'position', 3, place),
+                                fields.numbers(entry, 'quaternion', 4, place), place))
+    for one, other in itertools.pairwise(names):
+        if one.partition('_in_')[2] != other.partition('_in_')[0]:
+            raise LensError(f'{where}: {other} does not go on where {one} ends')
+    return Foreign('rig', {}, tuple(rigs), {})

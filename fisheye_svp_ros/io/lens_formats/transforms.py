@@ -6,7 +6,7 @@ The cameras are the two frames that are called left and right and, where several
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -14,9 +14,14 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.documents import parse_yaml
+from fisheye_svp_ros.io.documents import dump_yaml, parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
-from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.pose import (
+    Pose,
+    identity,
+    quaternion_from_rotation,
+    rotation_from_vector,
+)
 
 _Joint = tuple[str, str, Pose]  # parent, child, child in parent
 _OPTICAL = 'optical'
@@ -98,3 +103,30 @@ def _messages(text: str, where: str) -> Iterator[_Joint]:
             except (KeyError, TypeError, ValueError) as cause:
                 raise LensError(f'{where}: not a whole transform ({cause!r})') from cause
             yield (*ends, fields.pose(place, turn, f'{where}: {ends[1]}'))
+
+
+def urdf_text(cameras: Sequence[str], rig: Pose) -> str:
+    """Return fixed joints of the cameras' optical frames, a URDF; rig (C,): in the first one."""
+    frames = [f'{camera}_{_OPTICAL}_frame' for camera in cameras]
+    lines = ['<robot name="rig">', f'  <link name="{frames[0]}"/>']
+    for number, frame in enumerate(frames[1:], start=1):
+        place, turn = rig.position[number], rig.rotation[number]
+        angles = (np.arctan2(turn[2, 1], turn[2, 2]), -np.arcsin(np.clip(turn[2, 0], -1, 1)),
+                  np.arctan2(turn[1, 0], turn[0, 0]))
+        xyz, rpy = (' '.join(f'{value:.12g}' for value in values) for values in (place, angles))
+        lines += [f'  <link name="{frame}"/>',
+                  f'  <joint name="{frames[0]}_to_{frame}" type="fixed">',
+                  f'    <parent link="{frames[0]}"/><child link="{frame}"/>',
+                  f'    <origin xyz="{xyz}" rpy="{rpy}"/>', '  </joint>']
+    return '\n'.join([*lines, '</robot>', ''])
+
+
+def static_transforms_text(cameras: Sequence[str], rig: Pose) -> str:
+    """Return the same as a tf2_msgs/TFMessage for /tf_static, YAML."""
+    frames = [f'{camera}_{_OPTICAL}_frame' for camera in cameras]
+    turns = quaternion_from_rotation(rig.rotation)
+    return dump_yaml({'transforms': [{
+        'header': {'frame_id': frames[0]}, 'child_frame_id': frame,
+        'transform': {'translation': dict(zip('xyz', place.tolist(), strict=True)),
+                      'rotation': dict(zip('xyzw', turn.tolist(), strict=True))},
+    } for frame, place, turn in zip(frames[1:], rig.position[1:], turns[1:], strict=True)]})

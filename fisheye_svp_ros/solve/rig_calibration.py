@@ -1,0 +1,152 @@
+"""Rigs of any number of cameras: their poses in the first one, from what they saw together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, rig_covariance
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+
+_MIN_CAMERAS = 2  # that a frame must show the target to
+_TORN, _MOST_TORN = 5.0, 0.2  # times the median rms of frames; share of them
+
+
+class RigCalibration(NamedTuple):
+    """A rig of C cameras: rig (C,) in the first of them, m.
+
+    covariance (C - 1, 6, 6), m and rad, of the change in `Pose.retract`, of each camera but the
+    first, with the errors that its lenses state of themselves; frame (F,); pose (F,) of the first
+    camera in the target; rms_px (C,); sigma_px: noise of u and v, estimated, None where the
+    observations bring their own; shared (C,): frames that a camera shares with others; left_out:
+    frames that no rig explains.
+    """
+
+    cameras: tuple[str, ...]
+    rig: Pose
+    covariance: Array
+    frame: Index
+    pose: Pose
+    rms_px: Array
+    sigma_px: float | None
+    shared: Index
+    left_out: tuple[int, ...]
+
+    def steps(self) -> tuple[Pose, ...]:
+        """Return each camera in the next one (C - 1 poses), as rig files have them."""
+        return tuple(self.rig.take(i + 1).inverse().compose(self.rig.take(i))
+                     for i in range(len(self.cameras) - 1))
+
+
+def connected_cameras(table: Observations) -> list[tuple[str, ...]]:
+    """Return groups of cameras that frames hold together, each in an order in which they do.
+
+    A camera in no group with others never saw the target in the same frame as they did.
+    """
+    seen = np.zeros((len(table.cameras), len(table.frames)), dtype=bool)
+    seen[table.camera, np.searchsorted(table.frames, table.frame)] = True
+    shared = seen.astype(int) @ seen.T.astype(int)
+    left, groups = list(range(len(table.cameras))), []
+    while left:
+        group, frames = [left.pop(0)], shared[:, :]
+        while near := [camera for camera in left if frames[camera, group].any()]:
+            group.append(max(near, key=lambda camera: int(frames[camera, group].max())))
+            left.remove(group[-1])
+        groups.append(tuple(table.cameras[camera] for camera in group))
+    return groups
+
+
+def calibrate_rig(
+    table: Observations, lenses: Mapping[str, Lens], cameras: Sequence[str]
+) -> RigCalibration:
+    """Fit the rig and the poses of its frames to what the cameras saw, their lenses known.
+
+    cameras: connected ones, in the order in which they are wanted; the first is the frame of all.
+    Raises GeometryError, naming the frame, for a view that does not fix a pose, and where the rig
+    is not determined.
+    """
+    order = connected_cameras(_of_cameras(table, cameras))[0]
+    rows = _of_several(_of_cameras(table, order))
+    torn: list[int] = []
+    linear = _fitted(rows, [lenses[name] for name in order])
+    # One at a time: a frame that is torn pulls the rig, and others with it.
+    for _ in range(int(_MOST_TORN * len(rows.frames))):
+        worst = _torn_frame(linear, rows.frames)
+        if worst is None:
+            break
+        torn.append(worst)
+        rows = rows.take(rows.frame != worst)
+        linear = _fitted(rows, [lenses[name] for name in order])
+    # Cameras stand in the order in which frames hold them together; the first one stays the first.
+    place = [order.index(name) for name in cameras if name in order]
+    data, state = linear.data, linear.state
+    freedom = int(linear.is_observation.sum()) - 6 * (data.frames + data.cameras - 1)
+    if freedom < 1:
+        raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
+    known = bool(np.isfinite(rows.sigma).all())
+    sigma = None if known else float(np.sqrt((linear.residual**2).sum() / freedom))
+    covariance = rig_covariance(*_with_lenses(linear, order, sigma or 1.0))
+    off = np.where(data.views.used[..., None], data.views.uv - linear.linear.uv, np.nan)
+    return RigCalibration(
+        tuple(order[i] for i in place), state.rig.take(place),
+        covariance[[i - 1 for i in place[1:]]], rows.frames, state.pose,
+        np.array([np.sqrt(np.nanmean((off[data.camera_of == i] ** 2).sum(axis=-1)))
+                  for i in place]),
+        sigma, np.bincount(data.camera_of, minlength=len(order))[place],
+        tuple(sorted(torn)),
+    )
+
+
+def _fitted(rows: Observations, lenses: Sequence[Lens]) -> Linearization:
+    """Return the rig and the poses of its frames, fitted, with the lenses as they are."""
+    data = group_by_frame(rows)
+    start = initial_state(data, lenses[0], lenses[1:])
+    state = replace(start, lens=lenses[0], others=tuple(lenses[1:]), terms=(), corrected=True)
+    return Linearization(data, adjust(data, state, ()), ())
+
+
+def _with_lenses(
+    linear: Linearization, cameras: Sequence[str], sigma: float
+) -> tuple[Linearization, float, Array]:
+    """Return what `rig_covariance` needs: with what the lenses state of their own errors."""
+    free: list[str] = []
+    parts = []
+    for name, lens in zip(cameras, linear.state.lenses, strict=True):
+        stated = lens.calibration or {}
+        if 'covariance' in stated and 'stderr' in stated:
+            free += [f'{name}.{parameter}' for parameter in stated['stderr']]
+            parts.append(np.array(stated['covariance'], dtype=float))
+    stated_by_all = block_diag(*parts) if parts else np.zeros((0, 0))
+    return Linearization(linear.data, linear.state, free), sigma, stated_by_all
+
+
+def _torn_frame(linear: Linearization, frames: Index) -> int | None:
+    """Return the frame whose residuals are out of proportion: photographs of other moments."""
+    rms = np.sqrt((linear.residual**2).sum(axis=1) / linear.is_observation.sum(axis=1))
+    worst = int(np.argmax(rms))
+    return int(frames[worst]) if rms[worst] > _TORN * np.median(rms) else None
+
+
+def _of_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
+    """Return the rows of some cameras, numbered in their order."""
+    number = np.full(len(table.cameras), -1)
+    number[[table.cameras.index(name) for name in cameras]] = np.arange(len(cameras))
+    rows = table.take(number[table.camera] >= 0)
+    return replace(rows, cameras=tuple(cameras), camera=number[rows.camera])
+
+
+def _of_several(table: Observations) -> Observations:
+    """Return the rows of frames that several cameras saw."""
+    pairs = np.unique(np.stack([table.frame, table.camera], axis=-1), axis=0)
+    frames, counts = np.unique(pairs[:, 0], return_counts=True)
+    return table.take(np.isin(table.frame, frames[counts >= _MIN_CAMERAS]))

@@ -1,0 +1,91 @@
+"""`calibrate` of three and more cameras: the rig printed, and written as tools read it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.surround import CAMERAS, LENS, RIG, photographs
+
+from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
+from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.rig_files import cameras_in_first, load_rigs, save_rig
+from fisheye_svp_ros.pose import Pose
+
+
+@pytest.fixture(scope='module')
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp('rig')
+    table = photographs(1, (45.0, 135.0, 225.0, 315.0))
+    calibrate_cameras(table, dict.fromkeys(CAMERAS, LENS), folder)
+    return folder
+
+
+@pytest.mark.parametrize('file', ['rig.yaml', 'camchain.yaml'])
+def test_every_camera_is_where_it_stands(written: Path, file: str) -> None:
+    found = cameras_in_first(load_rigs(written / file))
+    assert found.position == pytest.approx(RIG.position, abs=1e-3)
+    assert found.rotation == pytest.approx(RIG.rotation, abs=1e-3)
+
+
+def test_transforms_of_a_robot_are_the_same_rig(written: Path, tmp_path: Path) -> None:
+    """Read back as those of a robot, whose frames left and right are two of the cameras."""
+    rig = cameras_in_first(load_rigs(written / 'rig.yaml'))
+    wanted = rig.take(2).inverse().compose(rig.take(1))
+    for name in ('rig.urdf', 'tf_static.yaml'):
+        text = (written / name).read_text()
+        assert all(f'{camera}_optical_frame' in text for camera in CAMERAS)
+        path = tmp_path / name
+        path.write_text(text.replace('cam1', 'left').replace('cam2', 'right'))
+        found, = load_rigs(path)
+        assert found.position == pytest.approx(wanted.position, abs=1e-9)
+        assert found.rotation == pytest.approx(wanted.rotation, abs=1e-9)
+
+
+def test_what_scripts_read(written: Path) -> None:
+    document = json.loads((written / 'rig.json').read_text())
+    assert document['frame'] == 'cam0' and document['frames'] == 40
+    assert list(document['cameras']) == [*CAMERAS]
+    third = document['cameras']['cam2']
+    assert third['position'] == pytest.approx([0.0, 0.0, -0.2], abs=1e-3)
+    deviation = np.sqrt(np.diag(third['covariance']))
+    assert (deviation[:3] < 2e-4).all() and (deviation[3:] < 2e-4).all()
+    assert document['cameras']['cam0']['covariance'] is None
+
+
+def test_the_command_calibrates_all(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_observations(tmp_path / 'obs.csv', photographs(2, (45.0, 135.0, 225.0), 36))
+    out = tmp_path / 'rig'
+    assert cli.main(['calibrate', str(tmp_path / 'obs.csv'), '--image-size', '1280x800',
+                     '-o', str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert 'rig: cameras in cam0, from 36 frames that several of them saw' in printed
+    assert cameras_in(out) == CAMERAS  # rig, camchain and tf_static are no lenses
+    assert load_lens(f'{out}/#cam3').name == 'cam3'
+    assert len(load_rigs(out / 'rig.yaml')) == 3
+
+
+def test_cameras_that_nothing_holds_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = photographs(3, (45.0, 135.0))
+    calibrate_cameras(table, dict.fromkeys(CAMERAS, LENS), tmp_path)
+    said = capsys.readouterr()
+    assert 'rig: nothing holds cam3 to cam0, cam1, cam2: no frame shows the target' in said.err
+    assert 'cam3' not in said.out
+    assert len(load_rigs(tmp_path / 'rig.yaml')) == 2
+
+
+def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
+    steps = [Pose(np.eye(3), np.array([i, 0.0, 0.0])) for i in range(3)]
+    save_rig(steps, tmp_path / 'rig.yaml', CAMERAS)
+    assert [step.position[0] for step in load_rigs(tmp_path / 'rig.yaml')] == [0.0, 1.0, 2.0]
+    text = (tmp_path / 'rig.yaml').read_text()
+    (tmp_path / 'broken.yaml').write_text(text.replace('cam1_in_cam2', 'cam2_in_cam1'))
+    assert cli.main(['lens', str(tmp_path / 'broken.yaml')]) == 2
