@@ -17,7 +17,7 @@ from fisheye_svp_ros.simulate.render import Exposure, Print, render
 
 RANGE = 0.5  # m, of the paper's nearer landmarks
 _BOARD = Print(9, 6, 0.065)
-_AHEAD = np.array([0.0, -0.25, 0.9])  # the board, in the left camera: above the axes
+_DIRECTION = np.array([0.0, -0.25, 0.9])  # the board, in the left camera: above the axes
 
 
 def rectified_pair(lens: Lens) -> tuple[RectifiedPair, tuple[NDArray[Any], ...]]:
@@ -33,7 +33,7 @@ def rectified_pair(lens: Lens) -> tuple[RectifiedPair, tuple[NDArray[Any], ...]]
 
 def _board_in_left() -> Pose:
     """Return the board, which faces the left camera."""
-    ahead: Array = _AHEAD / np.linalg.norm(_AHEAD)
+    ahead: Array = _DIRECTION / np.linalg.norm(_DIRECTION)
     right = np.cross([0.0, 1.0, 0.0], ahead)
     right /= np.linalg.norm(right)
     turn = np.stack([right, np.cross(ahead, right), ahead], axis=1)

@@ -75,10 +75,10 @@ def calibrate_rig(
     Raises GeometryError, naming the frame, for a view that does not fix a pose, and where the rig
     is not determined.
     """
-    order = connected_cameras(_of_cameras(table, cameras))[0]
-    rows = _of_several(_of_cameras(table, order))
+    order = connected_cameras(_select_cameras(table, cameras))[0]
+    rows = _select_shared(_select_cameras(table, order))
     torn: list[int] = []
-    linear = _fitted(rows, [lenses[name] for name in order])
+    linear = _fit_rig(rows, [lenses[name] for name in order])
     # One at a time: a frame that is torn pulls the rig, and others with it.
     for _ in range(int(_MOST_TORN * len(rows.frames))):
         worst = _torn_frame(linear, rows.frames)
@@ -86,11 +86,11 @@ def calibrate_rig(
             break
         torn.append(worst)
         rows = rows.take(rows.frame != worst)
-        linear = _fitted(rows, [lenses[name] for name in order])
+        linear = _fit_rig(rows, [lenses[name] for name in order])
     # Cameras stand in the order in which frames hold them together; the first one stays the first.
     place = [order.index(name) for name in cameras if name in order]
     data, state = linear.data, linear.state
-    freedom = int(linear.is_observation.sum()) - 6 * (data.frames + data.cameras - 1)
+    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + data.cameras - 1)
     if freedom < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
     known = bool(np.isfinite(rows.sigma).all())
@@ -107,7 +107,7 @@ def calibrate_rig(
     )
 
 
-def _fitted(rows: Observations, lenses: Sequence[Lens]) -> Linearization:
+def _fit_rig(rows: Observations, lenses: Sequence[Lens]) -> Linearization:
     """Return the rig and the poses of its frames, fitted, with the lenses as they are."""
     data = group_by_frame(rows)
     start = initial_state(data, lenses[0], lenses[1:])
@@ -132,12 +132,12 @@ def _with_lenses(
 
 def _torn_frame(linear: Linearization, frames: Index) -> int | None:
     """Return the frame whose residuals are out of proportion: photographs of other moments."""
-    rms = np.sqrt((linear.residual**2).sum(axis=1) / linear.is_observation.sum(axis=1))
+    rms = np.sqrt((linear.residual**2).sum(axis=1) / linear.row_mask.sum(axis=1))
     worst = int(np.argmax(rms))
     return int(frames[worst]) if rms[worst] > _TORN * np.median(rms) else None
 
 
-def _of_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
+def _select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
     """Return the rows of some cameras, numbered in their order."""
     number = np.full(len(table.cameras), -1)
     number[[table.cameras.index(name) for name in cameras]] = np.arange(len(cameras))
@@ -145,7 +145,7 @@ def _of_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
     return replace(rows, cameras=tuple(cameras), camera=number[rows.camera])
 
 
-def _of_several(table: Observations) -> Observations:
+def _select_shared(table: Observations) -> Observations:
     """Return the rows of frames that several cameras saw."""
     pairs = np.unique(np.stack([table.frame, table.camera], axis=-1), axis=0)
     frames, counts = np.unique(pairs[:, 0], return_counts=True)
