@@ -25,15 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.diagnosis import (
-    Diagnosis,
-    ErrorParts,
-    LensErrors,
-    depth_errors,
-    diagnose,
-    localize_with_errors,
-    pose_maps,
-)
+from fisheye_svp_ros.diagnosis import Diagnosis, ErrorParts, LensErrors, diagnose, pose_maps
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.readers import read_observations
@@ -51,6 +43,7 @@ from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
+from fisheye_svp_ros.study.pose_errors import depth_errors, localize_with_errors
 
 WITHIN = 1.959964  # standard deviations, 95 %
 LEVELS = ('noise', 'noise and parameters', 'with the misfit')

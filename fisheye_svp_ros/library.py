@@ -260,7 +260,8 @@ def localize(
     """
     table, known = _table(observations), load_lens(lens)
     if model_error:
-        from fisheye_svp_ros.diagnosis import LensErrors, localize_with_errors
+        from fisheye_svp_ros.diagnosis import LensErrors
+        from fisheye_svp_ros.study.pose_errors import localize_with_errors
 
         measured, _ = localize_with_errors(LensErrors.from_lens(known), table)
     else:
@@ -340,7 +341,8 @@ def stereo_depth(
     frame = np.broadcast_to(one.frame[:, None], both.shape)
     covariance = None
     if model_error:
-        from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
+        from fisheye_svp_ros.diagnosis import LensErrors
+        from fisheye_svp_ros.study.pose_errors import depth_errors
 
         errors = [LensErrors.from_lens(load_lens(lens)) for lens in (left, right)]
         covariance = depth_errors(errors[0], errors[1], rig, solved.points).total

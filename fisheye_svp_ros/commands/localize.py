@@ -50,11 +50,8 @@ def run(args: argparse.Namespace) -> None:
         table = observations.take(observations.camera == camera)
         with progress('localizing'):
             if args.model_error:
-                from fisheye_svp_ros.diagnosis import (
-                    LensErrors,
-                    localize_with_errors,
-                    pose_summary,
-                )
+                from fisheye_svp_ros.diagnosis import LensErrors, pose_summary
+                from fisheye_svp_ros.study.pose_errors import localize_with_errors
 
                 measured, parts = localize_with_errors(LensErrors.from_lens(lens), table)
                 uncertainty = pose_summary(parts)

@@ -35,8 +35,6 @@ from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.lens_errors import (
     InAir,
     LensErrors,
-    depth_errors,
-    localize_with_errors,
 )
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
@@ -90,11 +88,11 @@ __all__ = [
     'TwoDatasets',
     'can_be_included',
     'compare_errors',
-    'depth_errors',
+
     'deviations',
     'diagnose',
     'diagnose_against',
-    'localize_with_errors',
+
     'pose_maps',
     'pose_summary',
     'predict_other_data',

@@ -11,8 +11,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
@@ -20,6 +22,8 @@ from fisheye_svp_ros.effects.session_step import SessionStepEffect
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 _LONGEST_PAUSES = 4
+_BUMP_REACH = 3.0  # of a bump, in its standard deviations
+_BUMP_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
 _CURVE_DEGREE = 5  # degree of smooth curves over an angle
 _MAX_WAVES = 12
 
@@ -227,3 +231,20 @@ def _on_both_axes(scalars: list[Array]) -> list[Array]:
     zero = np.zeros_like(scalars[0])
     pairs = [pair for s in scalars for pair in ((s, zero), (zero, s))]
     return [np.stack(pair, axis=-1) for pair in pairs]
+
+
+def hexagons(low: Array, high: Array, pitch: float) -> Array:
+    """Return the centres (K, 2) of a hexagonal grid of a pitch over a rectangle."""
+    columns = np.arange(low[0] - pitch / 2, high[0] + pitch, pitch)
+    rows = np.arange(low[1] - pitch / 2, high[1] + pitch, pitch * np.sqrt(0.75))
+    return np.array([(x + pitch / 2 * (j % 2), y) for j, y in enumerate(rows) for x in columns])
+
+
+def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.csr_array:
+    """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
+    sd = _BUMP_WIDTH * pitch
+    near = cKDTree(at[mine]).sparse_distance_matrix(
+        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray')
+    row = np.flatnonzero(mine)[near['i']]
+    values = np.exp(-((near['v'] / sd) ** 2) / 2)
+    return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))

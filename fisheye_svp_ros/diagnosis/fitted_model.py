@@ -14,13 +14,13 @@ from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.effect_forms import bump_values
 from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column_norms
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
     NAMES,
     Grid,
     RandomEffects,
-    bump_values,
     make_random_effects,
 )
 from fisheye_svp_ros.effects.target_map import at_landmarks

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, ColumnGeometry
 from fisheye_svp_ros.diagnosis.uncertainty import (
     ErrorParts,
@@ -25,16 +25,14 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.mixed_model import LAMBDA_ABSENT, Variances
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations, Views, views_of
+from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.localization import Localization
-from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured
 from fisheye_svp_ros.solve.outliers import find_outliers, without_points
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
 _STEP_SIGMAS = 1e-3  # of a standard error
-_MAX_POINTS = 500  # stereo points
 _KNOWN_SHARE = 0.01  # of an image height, beside what the focal length is off by
 _SAMPLES = 200
 _REACH_GROWTH = 1.25  # from fit to fit: the field whose points are taken in
@@ -193,53 +191,6 @@ class LensErrors:
         own = [name for name in self.model.names if name in bare.parameters]
         state = RigState(pose, identity(1), bare, terms)
         return Linearization(RigViews.of_one_camera(views), state, own)
-
-
-def localize_with_errors(
-    errors: LensErrors, observations: Observations
-) -> tuple[MeasuredPoses, ErrorParts]:
-    """Pose every frame of one camera's table that can be posed, and say how far off each may be.
-
-    Raises ObservationError and GeometryError as `localize_measured` does.
-    """
-    allowed = replace(observations, sigma=np.asarray(errors.inflate_sigma(observations.sigma)))
-    found = localize_measured(ForwardModel(errors.lens), allowed)
-    kept = found.views._replace(weight=np.where(found.gross, 0.0, found.views.weight))
-    parts = errors.of_solved_poses(kept, found.result, found.sigma)
-    return found._replace(result=found.result._replace(covariance=parts.total)), parts
-
-
-def depth_errors(left: LensErrors, right: LensErrors, rig: Pose, points: Array) -> ErrorParts:
-    """Return covariances (N, 3, 3), m^2, of stereo points (N, 3), m, in the right camera.
-
-    Of points of least reprojection error; rig: left camera in the right one, taken as it is.  NaN
-    where a point is NaN or a camera does not see it.
-    """
-    found = [np.full((len(points), 3, 3), np.nan) for _ in ErrorParts._fields]
-    for rows in _split_rows(np.flatnonzero(np.isfinite(points).all(axis=1))):
-        views = views_of(points[rows, None], np.zeros((len(rows), 1, 2)))
-        pairs = [(errors, errors.linearize(views, pose)) for errors, pose in (
-            (left, rig.broadcast_to(len(rows))), (right, identity(len(rows))))]
-        by = [linear.whiten(linear.linear.d_target) / errors.noise for errors, linear in pairs]
-        seen = np.asarray(np.isfinite(by[0] + by[1]).all(axis=(1, 2)))
-        by = [np.where(seen[:, None, None], one, np.eye(2, 3)) for one in by]
-        rows_of_both = np.concatenate(by, axis=1)
-        information = np.swapaxes(rows_of_both, -1, -2) @ rows_of_both
-        information[~seen] = np.eye(3)
-        for (errors, linear), one in zip(pairs, by, strict=True):
-            maps = np.linalg.solve(information * errors.noise, np.swapaxes(one, -1, -2))
-            parts = errors.model.propagate(linear, np.asarray(maps))
-            parts = parts._replace(noise=parts.noise * errors.noise**2)
-            for whole, part in zip(found, parts, strict=True):
-                whole[rows] = np.nan_to_num(whole[rows]) + part
-        for whole in found:
-            whole[rows[~seen]] = np.nan
-    return ErrorParts(*found)
-
-
-def _split_rows(rows: Index) -> Iterator[Index]:
-    for first in range(0, len(rows), _MAX_POINTS):
-        yield rows[first:first + _MAX_POINTS]
 
 
 @dataclass(frozen=True)

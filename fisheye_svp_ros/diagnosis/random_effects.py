@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
-from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.effect_forms import bump_values, hexagons
 from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.mixed_model import Components, RandomColumns
 from fisheye_svp_ros.scene.boards import Board, find_boards
@@ -34,8 +34,6 @@ _IMAGE_GRIDS = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine'
            ('image_finest', 26, 3.0))
 _FRAME_CELLS, _BOARD_CELLS = 4, 4
 _MIN_LANDMARKS = 12
-_BUMP_REACH = 3.0  # of a bump, in its standard deviations
-_BUMP_WIDTH = 0.65  # standard deviation of a bump over the distance of its neighbours
 MILLIMETRE = 1e-3  # unit of offsets on the target
 
 
@@ -112,14 +110,36 @@ class ColumnGeometry(NamedTuple):
                    views.board[used][first], views.points[used][first], modes, alone)
 
 
+class BoardLandmarks(NamedTuple):
+    """The landmarks of a design: ids (L,), their boards, by place (L,), and where on them (L, 2).
+
+    board_of (L,): among `boards`; at (L, 2): place on the board over its size.
+    """
+
+    ids: Index
+    boards: list[Board]
+    board_of: Index
+    at: Array
+
+    @classmethod
+    def of_geometry(cls, geometry: ColumnGeometry) -> BoardLandmarks:
+        """Return those that a geometry is of."""
+        boards = find_boards(geometry.points, geometry.board)
+        board_of = np.searchsorted([one.id for one in boards], geometry.board)
+        at = np.zeros((len(geometry.points), 2))
+        for i, one in enumerate(boards):
+            mine = board_of == i
+            at[mine] = one.to_board(geometry.points[mine])[:, :2]
+        return cls(geometry.landmark, boards, board_of, at)
+
+
 class GatheredPoints(NamedTuple):
     """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
 
-    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none,
-    landmark (L,): their ids; board: place among the boards; local (F, N, 2): place on
-    the board over its size; place (F, N, 2, 3): whitened derivatives by an offset along the
-    board's axes, per mm.  extents (C, 2, 2), px: see `ColumnGeometry`; boards, and of_landmark
-    (L,): that of each landmark, at (L, 2): where it is on it.
+    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none;
+    board: place among the boards; local (F, N, 2): place on the board over its size; place
+    (F, N, 2, 3): whitened derivatives by an offset along the board's axes, per mm; extents
+    (C, 2, 2), px: see `ColumnGeometry`.
     """
 
     used: Mask
@@ -127,59 +147,59 @@ class GatheredPoints(NamedTuple):
     weight: Array
     camera: Index
     slot: Index
-    landmark: Index
     board: Index
     local: Array
     place: Array
     extents: Array
-    boards: list[Board]
-    of_landmark: Index
-    at: Array
+    landmarks: BoardLandmarks
 
     @classmethod
     def gather(
         cls, linear: Linearization, geometry: ColumnGeometry | None = None
     ) -> GatheredPoints:
-        """Gather the points of a linearised state; geometry: None for its own."""
+        """Gather the points of a linearized state; geometry: None for its own."""
         data, views = linear.data, linear.data.views
 
         def rows(values: Array | Index) -> Array:
             return data.blocks(np.asarray(values, dtype=float)[..., None, :])
 
         weight = rows(linear.weight[..., None])[..., 0]
-        used = weight > 0
+        shown = used = weight > 0
         camera = np.broadcast_to(data.camera_of[:, None, None], (*views.landmark.shape, 1))
         camera = rows(camera)[..., 0].astype(np.int64)
         points, uv = rows(views.points), rows(np.nan_to_num(linear.linear.uv))
         landmark = rows(views.landmark[..., None])[..., 0].astype(np.int64)
         number = rows(views.board[..., None])[..., 0].astype(np.int64)
         if geometry is None:
-            known, shown, boards = np.unique(landmark[used]), used, linear.scene.boards
-            extents = _extents(uv, used, camera)
+            ids, boards = np.unique(landmark[used]), linear.scene.boards
         else:
             target = Target((), geometry.landmark, geometry.board, geometry.points)
-            there = rows(target.shown(views).astype(float)[..., None])[..., 0] > 0
-            known, shown = geometry.landmark, used & there
-            boards, extents = find_boards(geometry.points, geometry.board), geometry.extents
-        slot = np.where(shown, np.searchsorted(known, landmark).clip(max=len(known) - 1), -1)
+            shown = used & (rows(target.shown(views).astype(float)[..., None])[..., 0] > 0)
+            known = BoardLandmarks.of_geometry(geometry)
+            ids, boards = known.ids, known.boards
+        slot = np.where(shown, np.searchsorted(ids, landmark).clip(max=len(ids) - 1), -1)
         if geometry is not None:
             number, points = geometry.board[slot], geometry.points[slot]
         place = linear.whiten(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
-        board, local = np.zeros(used.shape, dtype=np.int64), np.zeros((*used.shape, 2))
-        for i, one in enumerate(boards):
-            mine = shown & (number == one.id)
-            board[mine], local[mine] = i, one.to_board(points[mine])[:, :2]
-            place[mine] = place[mine] @ one.axes.T
-        of_landmark, at = np.zeros(len(known), dtype=np.int64), np.zeros((len(known), 2))
+        board, local, place = _turn_to_boards(boards, shown, number, points, place)
         if geometry is None:
-            of_landmark[slot[used]], at[slot[used]] = board[used], local[used]
-        else:
-            of_landmark = np.searchsorted([one.id for one in boards], geometry.board)
-            for i, one in enumerate(boards):
-                mine = of_landmark == i
-                at[mine] = one.to_board(geometry.points[mine])[:, :2]
-        return cls(used, uv, weight, camera, slot, known, board, local, place, extents, boards,
-                   of_landmark, at)
+            known = BoardLandmarks(
+                ids, boards, np.zeros(len(ids), dtype=np.int64), np.zeros((len(ids), 2)))
+            known.board_of[slot[used]], known.at[slot[used]] = board[used], local[used]
+        extents = _extents(uv, used, camera) if geometry is None else geometry.extents
+        return cls(used, uv, weight, camera, slot, board, local, place, extents, known)
+
+
+def _turn_to_boards(
+    boards: list[Board], shown: Mask, number: Index, points: Array, place: Array
+) -> tuple[Index, Array, Array]:
+    """Return the board of each point, by place, where it is on it, derivatives along its axes."""
+    board, local = np.zeros(shown.shape, dtype=np.int64), np.zeros((*shown.shape, 2))
+    for i, one in enumerate(boards):
+        mine = shown & (number == one.id)
+        board[mine], local[mine] = i, one.to_board(points[mine])[:, :2]
+        place[mine] = place[mine] @ one.axes.T
+    return board, local, place
 
 
 def _extents(uv: Array, used: Mask, camera: Index) -> Array:
@@ -213,16 +233,18 @@ def make_random_effects(
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
     )
-    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3 for one in points.boards]
+    landmarks = points.landmarks
+    kinds = [[in_plane, in_plane, normal] if one.flat else [free] * 3
+             for one in landmarks.boards]
     columns = RandomColumns(
-        frame, label, points.place, points.slot, np.array(kinds)[points.of_landmark],
+        frame, label, points.place, points.slot, np.array(kinds)[landmarks.board_of],
         sparse.hstack(
             [sparse.csr_array((points.weight.size * 2, 0)), *parts], format='csr'),
         np.concatenate([np.zeros(0, dtype=np.int64), *of]),
         Components(OF_LANDMARKS, _NUMEROUS),
     )
-    return RandomEffects(columns, points.landmark, tuple(grids), tuple(fields),
-                         np.stack([one.axes for one in points.boards])[points.of_landmark])
+    axes = np.stack([one.axes for one in landmarks.boards])[landmarks.board_of]
+    return RandomEffects(columns, landmarks.ids, tuple(grids), tuple(fields), axes)
 
 
 def _frame_columns(points: GatheredPoints, compact: bool) -> tuple[Array, Index]:
@@ -266,7 +288,7 @@ def _bend_columns(points: GatheredPoints) -> Array:
     x, y = np.moveaxis(points.local, -1, 0)
     powers = np.stack([x * x, x * y, y * y], axis=-1)
     bend = points.place[..., 2:] * powers[..., None, :]
-    boards = len(points.boards)
+    boards = len(points.landmarks.boards)
     mine = (points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
@@ -314,20 +336,20 @@ def _board_fields(points: GatheredPoints) -> list[BoardField]:
     smooth shapes that the catalogue has are taken out.
     """
     fields = []
-    for i, board in enumerate(points.boards):
-        mine = points.of_landmark == i
+    for i, board in enumerate(points.landmarks.boards):
+        mine = points.landmarks.board_of == i
         if not board.flat or mine.sum() < _MIN_LANDMARKS:
             continue
-        at = points.at[mine]
+        at = points.landmarks.at[mine]
         pitch = max(float(np.ptp(at, axis=0).max()) / _BOARD_CELLS, 1e-9)
         centres = hexagons(at.min(axis=0), at.max(axis=0), pitch)
         bumps = bump_values(at, np.ones(len(at), dtype=bool), centres, pitch).toarray()
-        stretch = np.zeros((len(points.at), 2))
+        stretch = np.zeros((len(points.landmarks.at), 2))
         stretch[mine] = at - at.mean(axis=0)
         fields.append(BoardField('board_stretch', (0, 1), stretch))
         smooth = ('board_in_plane', (0, 1), 1), ('board_normal', (2,), board.highest_degree)
         for name, axes, degree in smooth:
-            values = np.zeros((len(points.at), len(centres)))
+            values = np.zeros((len(points.landmarks.at), len(centres)))
             values[mine] = _remove_polynomial(bumps, at, degree)
             kept = np.sqrt((values**2).sum(axis=0)) > 0.05
             if kept.any():
@@ -348,23 +370,6 @@ def _field_columns(points: GatheredPoints, field: BoardField) -> sparse.csr_arra
     values = np.where(points.slot[..., None] >= 0, field.values[points.slot], 0.0)
     columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
     return sparse.csr_array(np.concatenate(columns, axis=-1).reshape(points.used.size * 2, -1))
-
-
-def hexagons(low: Array, high: Array, pitch: float) -> Array:
-    """Return the centres (K, 2) of a hexagonal grid of a pitch over a rectangle."""
-    columns = np.arange(low[0] - pitch / 2, high[0] + pitch, pitch)
-    rows = np.arange(low[1] - pitch / 2, high[1] + pitch, pitch * np.sqrt(0.75))
-    return np.array([(x + pitch / 2 * (j % 2), y) for j, y in enumerate(rows) for x in columns])
-
-
-def bump_values(at: Array, mine: Mask, centres: Array, pitch: float) -> sparse.csr_array:
-    """Return Gaussian bumps (n, K) at places (..., 2), zero out of reach and not of `mine`."""
-    sd = _BUMP_WIDTH * pitch
-    near = cKDTree(at[mine]).sparse_distance_matrix(
-        cKDTree(centres), _BUMP_REACH * sd, output_type='ndarray')
-    row = np.flatnonzero(mine)[near['i']]
-    values = np.exp(-((near['v'] / sd) ** 2) / 2)
-    return sparse.csr_array((values, (row, near['j'])), (mine.size, len(centres)))
 
 
 def _compact_columns(columns: Array) -> Array:

@@ -224,7 +224,8 @@ def _own_errors(setup: Setup, points: Array) -> dict[str, dict[str, Array]]:
     """Return what the lens's own errors do to caps (S, N, 3): (S,) by part and quantity."""
     if setup.lens.uncertainty is None:
         return {}
-    from fisheye_svp_ros.diagnosis import LensErrors, depth_errors
+    from fisheye_svp_ros.diagnosis import LensErrors
+    from fisheye_svp_ros.study.pose_errors import depth_errors
 
     errors, lens = LensErrors.from_lens(setup.lens), ForwardModel(setup.lens)
     some = points[:, ::_STEREO_CAPS]

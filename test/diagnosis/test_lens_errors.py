@@ -18,13 +18,7 @@ from helpers.uncertain import (
 )
 
 import fisheye_svp_ros as fsvp
-from fisheye_svp_ros.diagnosis import (
-    DiagnosisOptions,
-    LensErrors,
-    depth_errors,
-    diagnose,
-    localize_with_errors,
-)
+from fisheye_svp_ros.diagnosis import DiagnosisOptions, LensErrors, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
@@ -34,6 +28,7 @@ from fisheye_svp_ros.scene.observations import make_observations, views_of
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.stereo_depth import triangulate_optimally
 from fisheye_svp_ros.study.budget import Setup, make_budget
+from fisheye_svp_ros.study.pose_errors import depth_errors, localize_with_errors
 
 SAMPLES = 300
 

@@ -8,7 +8,6 @@ from helpers.uncertain import STDERR, uncertain
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, InAir, diagnose
-from fisheye_svp_ros.diagnosis.checks.medium import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -17,6 +16,7 @@ from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.initial_rig import initial_state, prediction_distances
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 from fisheye_svp_ros.solve.outliers import find_outliers
+from fisheye_svp_ros.solve.port_fit import MEDIUM_INDEX, PORT_PLACE
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
 

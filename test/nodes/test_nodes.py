@@ -21,7 +21,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2  # isort: skip
 from std_msgs.msg import Float64  # isort: skip
 from visualization_msgs.msg import MarkerArray  # isort: skip
 
-from fisheye_svp_ros.diagnosis import LensErrors, localize_with_errors
+from fisheye_svp_ros.diagnosis import LensErrors
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.bags import BagWriter
@@ -48,6 +48,7 @@ from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve import reliability
 from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.study.pose_errors import localize_with_errors
 
 
 class Endpoint(NamedTuple):

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import special
 
-from fisheye_svp_ros.arrays import Array, flat_rows
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison, HeldOut, predict_other_data
 from fisheye_svp_ros.diagnosis.lens_errors import InAir
@@ -25,31 +24,32 @@ from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
-from fisheye_svp_ros.optics.ports import MEDIA, FlatGlass
+from fisheye_svp_ros.optics.ports import MEDIA
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
-from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
+from fisheye_svp_ros.solve.outliers import Outliers
+from fisheye_svp_ros.solve.port_fit import (
+    CURVE_TERMS,
+    MEDIUM_INDEX,
+    PORT_PLACE,
+    THICKNESS,
+    fit_free_curve,
+    fit_port,
+    is_glass,
+    start_port,
+    sum_of_squares,
+)
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, rms_px
 
-PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
-MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
 _UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_tilt_y': 'rad',
           THICKNESS: 'm'}
 _SUSPICIOUS_PX = 1.0  # px: less than this is no third of the image
-_LOST_PX = 5.0  # px: what leaves more explains nothing
 _MIN_MAGNIFICATION = 1.1  # than in air: what looks so much larger may be seen through a flat port
 _FOLDS = 5
-_START_FRAMES = 12  # frames, enough for a start
-_CURVE_TERMS = 8  # of a free lens curve
 _EXPLAINED_SHARE = 0.98  # of what a free lens curve explains
 _MAX_COST_RATIO = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
-_LIQUID_INDICES = (1.30, 1.56)  # refractive: of what one photographs through, water to oils
-_MIN_KEPT_SHARE = 0.8  # of the points, at least, are no outliers behind a port that is there
-_MAX_THICKNESS = 0.05  # m, of glass
 _THICKNESS_SIGMAS = 3.0  # standard errors of its thickness
-_MAX_INDEX_ERROR = 0.02  # standard error above which the index is not told by the data
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Medium:
             return None
         thickness = null.linear.state.lens.parameters[THICKNESS]
         error = standard_errors(null)[null.linear.free.index(THICKNESS)]
-        if _is_glass(thickness) and thickness > _THICKNESS_SIGMAS * error:
+        if is_glass(thickness) and thickness > _THICKNESS_SIGMAS * error:
             return None
         names = tuple(name for name in self.names if name != THICKNESS)
         lens = self.state.lens.with_parameters([THICKNESS], [0.0])
@@ -156,12 +156,12 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     if not (_is_magnified(air, lens, base) if free else rms_px(air) > _SUSPICIOUS_PX):
         return None
     progress('asking whether the camera looks into another medium', 0.02)
-    curve = _free_curve(data, base)
+    curve = fit_free_curve(data, base)
     if not (_is_magnified(air, lens, curve)
             or rms_px(Linearization(data, curve, ())) > _SUSPICIOUS_PX):
         return None
     known = InAir.from_lens(lens)
-    media = [_assess_port(table, lens, _start_port(data, lens), free, 0.0)]
+    media = [_assess_port(table, lens, start_port(data, lens), free, 0.0)]
     if known is not None:
         progress('asking what photographs in air left open of the lens', 0.03)
         wet = _correct_lens(table, lens, known)
@@ -186,7 +186,7 @@ def behind_port(problem: Problem, medium: Medium) -> Problem:
 def _correct_lens(everything: RigViews, lens: Lens, known: InAir) -> Lens | None:
     """Return a lens behind its port, moved within what photographs in air had left open of it."""
     near = known.select_points(everything, known.reach)
-    wet = None if near is None else _start_port(near, lens)
+    wet = None if near is None else start_port(near, lens)
     if wet is None:
         return None
     try:
@@ -205,23 +205,23 @@ def _assess_port(
     wet: the lens with its port about where it is and the intrinsics that it is held to; moved: how
     unlikely these are by the calibration in air, as `InAir.squared_distance` says.
     """
-    found = None if wet is None else _fit_port(everything, wet)
+    found = None if wet is None else fit_port(everything, wet)
     if found is None:
         return None
     data, outliers, state, names = found
     base = adjust(data, initial_state(data, lens), free)
-    air, curve = Linearization(data, base, free), _free_curve(data, base)
+    air, curve = Linearization(data, base, free), fit_free_curve(data, base)
     plain = replace(base, lens=replace(state.lens, port=None))
-    before, after, least = (_cost(Linearization(data, fitted, ())) for fitted in (
+    before, after, least = (sum_of_squares(Linearization(data, fitted, ())) for fitted in (
         adjust(data, plain, ()), state, curve))
     rows = int(air.row_mask.sum())
     square = min(after, least) / rows
     criteria = (after / square + len(names) * np.log(rows) + moved,
-              least / square + (len(INTRINSICS) + _CURVE_TERMS) * np.log(rows))
+                least / square + (len(INTRINSICS) + CURVE_TERMS) * np.log(rows))
     near = before - after > _EXPLAINED_SHARE * (before - least) and after < _MAX_COST_RATIO * least
     if not (criteria[0] < criteria[1] or near):
         return None
-    mine = _cost(air)
+    mine = sum_of_squares(air)
     p_value = float(special.chdtrc(len(names), max(before - after, 0.0) / square))
     return Medium(
         state, names, outliers, air, p_value, max(0.0, 1 - after / mine),
@@ -238,79 +238,6 @@ def _focal_error(lens: Lens) -> float:
     return 0.0
 
 
-def _start_port(data: RigViews, lens: Lens) -> Lens | None:
-    """Return the lens with a port about where it is, fitted to a few frames."""
-    chosen = np.linspace(0, data.frames - 1, min(_START_FRAMES, data.frames)).astype(int)
-    few = data.select(np.isin(data.frame_of, chosen))
-    tried: list[tuple[float, Lens]] = []
-    for port in FlatGlass(0.0, MEDIA['water']).starts():
-        try:
-            state = adjust(few, initial_state(few, replace(lens, port=port)), PORT_PLACE)
-        except GeometryError:
-            continue  # nothing of a view is seen through a port there
-        tried.append((_cost(Linearization(few, state, PORT_PLACE)), state.lens))
-    if not tried or not np.isfinite(min(cost for cost, _ in tried)):
-        return None
-    found = min(tried, key=lambda one: one[0])[1]
-    return replace(lens, port=found.port)
-
-
-def _fit_port(
-    everything: RigViews, wet: Lens
-) -> tuple[RigViews, Outliers, RigState, tuple[str, ...]] | None:
-    """Fit the place of a port; free the index where the data tell it.
-
-    Returns also the data without the outliers that stand out behind the port: in air other
-    points may have seemed to be some.
-    """
-    data, outliers = find_outliers(everything, initial_state(everything, wet))
-    if data.views.used.sum() < _MIN_KEPT_SHARE * everything.views.used.sum():
-        return None
-    state = adjust(data, initial_state(data, wet), PORT_PLACE)
-    if not np.isfinite(_cost(Linearization(data, state, ()))):
-        return None
-    freed, errors, _ = _free_parameters(data, state, (*PORT_PLACE, MEDIUM_INDEX))
-    names: tuple[str, ...] = PORT_PLACE
-    liquid = _LIQUID_INDICES[0] <= freed.lens.parameters[MEDIUM_INDEX] <= _LIQUID_INDICES[1]
-    if errors[-1] < _MAX_INDEX_ERROR and liquid:
-        state, names = freed, (*PORT_PLACE, MEDIUM_INDEX)
-    freed, errors, gain = _free_parameters(data, state, (*names, THICKNESS))
-    # Glass of no thickness is part of the distance.
-    there = _is_glass(freed.lens.parameters[THICKNESS])
-    if there and gain > np.log(2 * len(data.observations)):
-        state, names = freed, (*names, THICKNESS)
-    if rms_px(Linearization(data, state, ())) > _LOST_PX:
-        return None
-    return data, outliers, state, names
-
-
-def _is_glass(thickness: float) -> bool:
-    return 0 < thickness < _MAX_THICKNESS
-
-
-def _free_parameters(
-    data: RigViews, state: RigState, names: tuple[str, ...]
-) -> tuple[RigState, Array, float]:
-    """Fit named parameters; return their standard errors, and the last one's likelihood ratio."""
-    freed = adjust(data, state, names)
-    linear = Linearization(data, freed, names)
-    basis, clean = group_basis(linear.frame_columns), linear.shared_columns
-    flat = flat_rows(clean - basis @ (np.swapaxes(basis, -1, -2) @ clean))
-    inverse, _ = pseudo_inverse(flat.T @ flat, 1e-13)
-    square = _cost(linear) / int(linear.row_mask.sum())
-    gain = (_cost(Linearization(data, state, ())) - _cost(linear)) / square
-    return freed, np.sqrt(np.diag(inverse) * square), gain
-
-
-def _free_curve(data: RigViews, base: RigState) -> RigState:
-    """Return the fit of a lens curve and a centre of any kind, in air."""
-    theta = Linearization(data, base, ()).scene.theta_max
-    known = [t for t in base.terms if t[0].name != RadialProfileEffect.name]
-    effect = RadialProfileEffect(_CURVE_TERMS, round(theta, 6))
-    free = replace(base, terms=(*known, (effect, np.zeros(_CURVE_TERMS))))
-    return adjust(data, free, INTRINSICS)
-
-
 def _is_magnified(air: Linearization, lens: Lens, state: RigState) -> bool:
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
@@ -318,7 +245,3 @@ def _is_magnified(air: Linearization, lens: Lens, state: RigState) -> bool:
     height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
                      for one in (model, lens))
     return height > _MIN_MAGNIFICATION * known
-
-
-def _cost(linear: Linearization) -> float:
-    return float((linear.residual**2).sum())
