@@ -54,7 +54,7 @@ def advise(
     advice += _check_held_out(evaluation)
     advice += [
         Advice(f'{cause.effect}: {cause.to_separate}') for cause in causes
-        if cause.kind.budget_stage() in ('noise', 'frame') or cause.indistinguishable_from
+        if cause.effect_class.budget_stage() in ('noise', 'frame') or cause.indistinguishable_from
     ]
     if evaluation.medium is not None:
         advice += _calibrate_in_air(evaluation.medium, causes)
@@ -65,17 +65,18 @@ def advise(
 def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]:
     """Return what to do about causes of lens and target that held-out data bear out."""
     gains, advice = evaluation.gains, []
-    stages = {cause.kind.budget_stage() for cause in causes}
+    stages = {cause.effect_class.budget_stage() for cause in causes}
     if 'lens' in stages and gains['lens'].value > 0:
         advice.append(Advice('solve with the extended lens file', gain=gains['lens'].value))
     target = gains['named'].value - max(gains['lens'].value, 0.0)
     if 'target' in stages and target > 0:
-        boards = sorted({board for cause in causes if cause.kind.budget_stage() == 'target'
+        boards = sorted({board for cause in causes if cause.effect_class.budget_stage() == 'target'
                          for board in _boards(cause)})
         advice.append(Advice(
             'measure the target again (the extended lens file corrects it for this target alone)',
             boards=boards,
-            landmarks=[n for c in causes if c.kind.target_map == 'single' for n in _landmarks(c)],
+            landmarks=[n for c in causes if c.effect_class.target_map == 'single'
+                       for n in _landmarks(c)],
             gain=target,
         ))
     return advice
@@ -110,7 +111,7 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
 def _calibrate_in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
     """Return what would make a lens surer that was calibrated in air."""
     advice = []
-    others = {cause.effect for cause in causes if cause.kind.budget_stage() == 'lens'}
+    others = {cause.effect for cause in causes if cause.effect_class.budget_stage() == 'lens'}
     told = medium.state.lens.uncertainty is not None  # by `diagnose`
     if not told and (medium.moved or len(others) > 1):
         advice.append(Advice(DIAGNOSE_AIR))

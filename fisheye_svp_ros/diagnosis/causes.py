@@ -43,7 +43,7 @@ class Cause:
     to_separate: str
 
     @property
-    def kind(self) -> type[Effect]:
+    def effect_class(self) -> type[Effect]:
         """The class of the effect, which says what it is."""
         return CATALOGUE[self.effect]
 

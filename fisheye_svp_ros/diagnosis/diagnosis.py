@@ -365,7 +365,7 @@ def _remaining(
     remaining = remaining_structure(
         EffectTests(selection.null), evaluation.fitted, components, stated)
     remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
-    hidden = {name for cause in noise_causes for name in cause.kind.hidden_structure}
+    hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
     return [one for one in remaining if one.variable not in hidden]
 
 

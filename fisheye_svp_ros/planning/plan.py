@@ -131,7 +131,7 @@ def _choose_question(
         known = {*after.free, *(p.name for e, _ in after.state.terms for p in e.parameters)}
         return number, (), [] if number in known | fitted else [_holding(after, number)]
     mine = [c for c in causes if c.effect in fitted
-            and c.kind.budget_stage() in ('lens', 'target')]
+            and c.effect_class.budget_stage() in ('lens', 'target')]
     for cause in mine:
         if cause.indistinguishable_from:
             alike = tuple(cause.indistinguishable_from)

@@ -131,7 +131,7 @@ def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterato
 
 def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
     """Yield maps of the boards where landmarks are displaced other than all together."""
-    mapped = [c.effect for c in diagnosis.causes if c.kind.target_map]
+    mapped = [c.effect for c in diagnosis.causes if c.effect_class.target_map]
     shown: list[tuple[str, tuple[str, ...]]] = []
     if mapped:
         shown.append(('the target in the extended model', ()))
@@ -163,7 +163,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
             ],
             'count': len(cause.parameters),
         })
-    stages = {cause.kind.stage for cause in diagnosis.causes}
+    stages = {cause.effect_class.stage for cause in diagnosis.causes}
     return {'causes': causes, 'on_target': 'target' in stages}
 
 

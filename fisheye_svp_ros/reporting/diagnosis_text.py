@@ -88,7 +88,7 @@ def quantity(entry: Mapping[str, Any]) -> str:
 
 def size(diagnosis: Diagnosis, cause: Cause) -> str:
     """Return how large a cause is: its parameters, or what many of them amount to."""
-    shown = cause.kind.target_map
+    shown = cause.effect_class.target_map
     if shown == 'smooth':
         maps = diagnosis.board_maps((cause.effect,))
         return '; '.join(
@@ -208,7 +208,7 @@ def _name(cause: Cause) -> str:
 def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     before, named, best = (quality.heldout_rms_px for quality in (
         d.figures.base, d.figures.named, d.figures.extended))
-    moving = [c for c in d.causes if c.kind.stage != 'noise']
+    moving = [c for c in d.causes if c.effect_class.stage != 'noise']
     local = ''
     if best < 0.99 * named:
         local = (f'; with the local offsets of single landmarks and of the image, which have no '
@@ -236,7 +236,7 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         text += (f', which takes away {value} (95 % interval {low} to {high}) of the error above '
                  'the noise')
     lens = d.figures.lens_only.heldout_rms_px
-    if 'target' in {c.kind.budget_stage() for c in moving}:
+    if 'target' in {c.effect_class.budget_stage() for c in moving}:
         better = lens < before
         text += (f'; the lens alone, on the target as it is said to be, '
                  f'{"reaches" if better else "does not help:"} {lens:.3g} px')
@@ -289,17 +289,17 @@ def _next(d: Diagnosis) -> str:
     steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
-            if c.kind.budget_stage() == 'frame' and c.effect in d.lens.corrections]
+            if c.effect_class.budget_stage() == 'frame' and c.effect in d.lens.corrections]
     refuted = d.figures.named.heldout_rms_px >= d.figures.base.heldout_rms_px
     if held and not refuted and f'solve with {EXTENDED}' not in steps:
         steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
-              if c.kind.budget_stage() == 'frame' and not c.indistinguishable_from]
+              if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
         f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
     ]
-    steps += [_remedy(c) for c in d.causes if c.kind.stage == 'noise']
+    steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
     if 'frame' in {one.variable for one in d.remaining}:
         steps += filter(None, (CATALOGUE[name].when_untestable for name in d.untestable))
     if d.remaining:
