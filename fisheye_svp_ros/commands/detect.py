@@ -52,6 +52,12 @@ def _print(detection: Detection, board: str) -> None:
     print(f'{board}: found in {len(found)} of {len(detection.searched)} photographs, '
           f'{len(table)} points'
           + ('' if np.isnan(table.sigma).any() else f', sigma {np.median(table.sigma):.3f} px'))
+    pairing, cameras = detection.pairing, detection.observations.cameras
+    if len(cameras) > 1:
+        both = len({one.key for i, one in enumerate(detection.searched) if i not in pairing.alone})
+        apart = f', {1e3 * pairing.apart:.3g} ms apart at most' if pairing.way == 'stamp' else ''
+        print(f'  cameras {", ".join(cameras)}: {both} moments shared, paired by {pairing.way}'
+              f'{apart}; {len(pairing.alone)} photographs without a partner')
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
         print('  the board looks the same when turned, and too few photographs tell how it lies')
@@ -68,6 +74,7 @@ def _document(detection: Detection, board: str) -> dict[str, Any]:
         'board': board,
         'image_size': list(detection.image_size),
         'image_sizes': detection.image_sizes,
+        'pairing': detection.pairing.way,
         'photographs': [
             {
                 'name': one.name, 'camera': one.camera, 'frame': frame,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +25,9 @@ if TYPE_CHECKING:
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _MAX_LISTED = 12
 _UNCERTAIN = 0.9
+_LARGER = 0.2  # of all boards; a wrong count is seen where the next squares are lit and in sight
+_TIME = re.compile(r'([\d.]+) *(s|ms|us|ns)')
+_UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
 
 def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
@@ -35,12 +40,16 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         help='what finds the points; by default the best for the board')
     parser.add_argument('--every', type=_count, default=1, metavar='N',
                         help='take one of N photographs or video frames')
+    parser.add_argument('--sync', type=_seconds, metavar='TIME',
+                        help='largest difference of the stamps (of messages, or in the names of '
+                        'files) of one moment of a rig (5ms)')
 
 
 def search_options(args: argparse.Namespace) -> tuple[str, ...]:
     """Return the options with which another command finds the same board in photographs."""
     options = ['--board', args.board]
     options += ['--detector', args.detector] if args.detector else []
+    options += ['--sync', f'{args.sync}s'] if args.sync else []
     return (*options, *(['--every', str(args.every)] if args.every > 1 else []))
 
 
@@ -138,7 +147,7 @@ def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
 
 def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     """Search photographs for the board; say which have none, and which are odd."""
-    from fisheye_svp_ros.detect.detection import detect
+    from fisheye_svp_ros.detect.detection import LARGER_BOARD, detect
     from fisheye_svp_ros.detect.photographs import (
         count_photographs,
         doubtful_folders,
@@ -154,7 +163,7 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         say(line)
     with progress('searching', count) as done:
         detection = detect(find_photographs(paths, args.every), pattern, args.detector,
-                           progress=done, source=', '.join(paths))
+                           progress=done, source=', '.join(paths), sync=args.sync)
     odd = [f'{one.name}: {"; ".join(filter(None, (one.reason, *one.notes)))}'
            for one in sorted(detection.searched, key=lambda one: not one.reason)
            if one.reason or one.notes]
@@ -162,15 +171,44 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
         say(line)
     if len(odd) > _MAX_LISTED:
         say(f'and {len(odd) - _MAX_LISTED} more such photographs')
+    _note_alone(detection)
     unsure = int((detection.certainty < _UNCERTAIN).sum())
     if unsure:
         say(f'{unsure} photographs: which corner is the first is less than '
             f'{100 * _UNCERTAIN:.0f} % sure, since {args.board} looks the same when turned')
     found = sum(one.points is not None for one in detection.searched)
+    larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
+    if larger and larger >= _LARGER * found:
+        say(f'{larger} of {found} boards look larger than {args.board}, which counts inner '
+            'corners: count them again, or corners are not the same ones in all photographs')
     if 2 * found < len(detection.searched):
         say(f'most photographs show no {args.board}: check kind and size of the board'
             + (', which counts inner corners' if pattern.kind == 'chessboard' else ''))
     return detection
+
+
+def _note_alone(detection: Detection) -> None:
+    """Say which photographs of a rig have no partner of the same moment."""
+    alone = [detection.searched[i].name for i in detection.pairing.alone]
+    if len(alone) == len(detection.searched):
+        say('no photograph of one camera has a partner of the same moment, by '
+            f'{detection.pairing.way}: name those of a moment alike, number them alike, or name '
+            'them by their stamps and give a larger --sync')
+    elif alone:
+        more = f' and {len(alone) - _MAX_LISTED} more' if len(alone) > _MAX_LISTED else ''
+        say(f'{len(alone)} of {len(detection.searched)} photographs have no partner of the same '
+            f'moment, by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}')
+
+
+def _seconds(text: str) -> float:
+    match = _TIME.fullmatch(text)
+    try:
+        value = float(match[1]) * _UNITS[match[2]] if match else 0.0
+    except ValueError:
+        value = 0.0
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r} is not a time with its unit, as in 5ms')
+    return value
 
 
 def _count(text: str) -> int:

@@ -17,7 +17,7 @@ from fisheye_svp_ros.detect.corner_fit import CONTRAST, Corners
 from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
-from fisheye_svp_ros.detect.windows import PIXEL, WindowProblem, Windows, windows
+from fisheye_svp_ros.detect.windows import IN_SILENCE, PIXEL, WindowProblem, Windows, windows
 
 # Of the lens that fits one photograph, as far as that determines it
 _FREE = (('f', 'cx', 'cy', 'k1', 'k2', 'k3'), ('f', 'cx', 'cy', 'k1'), ('f', 'k1', 'k2', 'k3'))
@@ -29,8 +29,13 @@ _UNKNOWNS = 10  # u, v; ellipse (3); log blur; brightness, contrast, its gradien
 _ROOT = float(np.sqrt(2 / np.pi))
 
 
-def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
+@np.errstate(**IN_SILENCE)
+def fit_circles(
+    pixels: Pixels, start: Array, points: Array, censored: bool = True
+) -> Corners:
     """Fit the circles at start (N, 2), px, in an image (H, W); points (N, 3), m: their centres.
+
+    censored: light at the end of the scale may have been any beyond it.
 
     Of what is found contrast is above 0 for dark circles; sigma is that of the centre, NaN where
     nothing tells how the image bends.
@@ -40,7 +45,7 @@ def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
     axes = local_axes(points[:, :2], start)
     longest = np.linalg.norm(axes, axis=(1, 2)).max()
     if 0.5 * apart * longest > _LARGEST:
-        return _halved(pixels, start, points)
+        return _halved(pixels, start, points, censored)
     radius = _radius(pixels, start, axes, 0.5 * apart)
     nothing = np.full(len(start), np.nan)
     found = Corners(start, nothing, nothing, nothing, np.zeros(len(start), dtype=bool))
@@ -48,16 +53,16 @@ def fit_circles(pixels: Pixels, start: Array, points: Array) -> Corners:
         return found
     for _ in range(_ROUNDS):
         axes, bend = _bends(points, found.uv, pixels.shape, radius)
-        fitted = _fitted(pixels, found.uv, axes, bend, radius, apart)
+        fitted = _fitted(pixels, found.uv, axes, bend, radius, apart, censored)
         found = fitted._replace(uv=np.where(fitted.ok[:, None], fitted.uv, found.uv))
     return found
 
 
-def _halved(pixels: Pixels, start: Array, points: Array) -> Corners:
+def _halved(pixels: Pixels, start: Array, points: Array, censored: bool) -> Corners:
     height, width = (side // 2 * 2 for side in pixels.shape)
     half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
                       interpolation=cv2.INTER_AREA)
-    found = fit_circles(half, (start + 0.5) / 2 - 0.5, points)
+    found = fit_circles(half, (start + 0.5) / 2 - 0.5, points, censored)
     return found._replace(uv=2 * found.uv + 0.5, sigma=2 * found.sigma, blur=2 * found.blur)
 
 
@@ -103,13 +108,16 @@ def _radius(pixels: Pixels, start: Array, axes: Array, reach: float) -> float:
 
 
 def _fitted(
-    pixels: Pixels, start: Array, axes: Array, bend: Array, radius: float, apart: float
+    pixels: Pixels, start: Array, axes: Array, bend: Array, radius: float, apart: float,
+    censored: bool,
 ) -> Corners:
     reach = radius + _WITHIN * (apart - 2 * radius)
     longest = np.linalg.norm(axes, axis=(1, 2)).max()
     known = np.isfinite(bend).all()
     bend = np.nan_to_num(bend)
     cut = windows(pixels, start, float(reach * longest))
+    if not censored:
+        cut = cut._replace(clipped=np.zeros_like(cut.clipped))
     problem = _Problem(cut, start, axes, bend, reach)
     values = problem.solve(problem.start(radius))
     judged = problem.judge(values, symmetric=True)
@@ -117,13 +125,12 @@ def _fitted(
     uv, contrast = values[:, :2] + PIXEL * values[:, 8:] + cut.place, values[:, 7]
     blur = np.sqrt(np.maximum(np.exp(2 * values[:, 5]) - PIXEL, 0.0))
     least = 1 / np.linalg.norm(_matrix(values), ord=2, axis=(1, 2))
-    with np.errstate(invalid='ignore'):
-        ok = (
-            judged.settled & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
-            & (blur < 2 * least) & (least > _SMALLEST)
-            & (np.abs(contrast) > CONTRAST * judged.noise)
-            & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
-        )
+    ok = (
+        judged.settled & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
+        & (blur < 2 * least) & (least > _SMALLEST)
+        & (np.abs(contrast) > CONTRAST * judged.noise)
+        & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
+    )
     sigma, ok = judged.common(ok)
     return Corners(uv, sigma if known else sigma + np.nan, blur, -contrast, ok)
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import erf
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.detect.windows import PIXEL, WindowProblem, Windows, windows
+from fisheye_svp_ros.detect.windows import IN_SILENCE, PIXEL, WindowProblem, Windows, windows
 
 _SMALLEST, _LARGEST = 2.5, 10.0  # radius of the window, px
 _WITHIN = 0.62  # of the distance to the next edge
@@ -38,17 +38,23 @@ class Corners(NamedTuple):
     ok: Mask
 
 
+@np.errstate(**IN_SILENCE)
 def fit_corners(
-    pixels: Array, start: Array, axes: Array, clearance: Array, square: bool = False
+    pixels: Array, start: Array, axes: Array, clearance: Array, square: bool = False,
+    censored: bool = True,
 ) -> Corners:
     """Fit corners in an image (H, W) of any brightness scale.
 
     start (N, 2), px, to within about a third of the clearance; axes (N, 2, 2): rows are the
     directions, in the image, of the board's two axes (into the square for an L); clearance (N,):
-    distance to the next parallel edge, px; square: they are L corners.
+    distance to the next parallel edge, px; square: they are L corners; censored: light at the end
+    of the scale may have been any beyond it.
     """
     radius = np.clip(_WITHIN * clearance, _SMALLEST, _LARGEST)
     cut = windows(pixels, start, radius.max(initial=_SMALLEST))
+    if square or not censored:
+        # An edge of unknown height would move an L; paper as bright as pixels can be is usual.
+        cut = cut._replace(clipped=np.zeros_like(cut.clipped))
     problem = _Problem(cut, radius, start - cut.place, square)
     values = problem.solve(problem.start(axes))
     judged = problem.judge(values, symmetric=not square)
@@ -75,9 +81,6 @@ class _Problem(WindowProblem):
     """Corners; state (N, 12)."""
 
     def __init__(self, cut: Windows, radius: Array, start: Array, square: bool) -> None:
-        if square:
-            # An edge of unknown height would move an L; paper as bright as pixels can be is usual.
-            cut = cut._replace(clipped=np.zeros_like(cut.clipped))
         distance = np.hypot(cut.offset[0] - start[:, :1], cut.offset[1] - start[:, 1:])
         super().__init__(cut, np.clip(radius[:, None] + 0.5 - distance, 0.0, 1.0) * cut.inside)
         self._first, self._square = start, square

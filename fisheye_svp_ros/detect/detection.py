@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,11 +13,14 @@ import cv2
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.detect.finders import default_detector
+from fisheye_svp_ros.detect.effort import Effort, Look
+from fisheye_svp_ros.detect.extent import goes_on
+from fisheye_svp_ros.detect.finders import FIRST_LOOKS, at_inverted, default_detector
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turned
+from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
-from fisheye_svp_ros.detect.points import Points, find_points
+from fisheye_svp_ros.detect.points import OVER_EXPOSED, Points, find_points, full_scale_share
 from fisheye_svp_ros.detect.workers import Late, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
@@ -27,11 +30,11 @@ from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SECONDS = 30.0  # a photograph
 _BLURRED = 1.5  # times the median blur, and px
-_BURNT = 0.02  # of the board's pixels as bright as pixels can be
 _SAME_PLACE = 0.3  # px
 _FEWEST = 3  # frames of two cameras that say how they stand
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
 _UNTURNED = 'asks to be shown turned; taken as the sensor lay'
+LARGER_BOARD = 'the board looks larger: its squares go on beyond the corners looked for'
 _DAMAGED = 'damaged: the JPEG decodes in part; fetch it again'
 
 
@@ -39,7 +42,8 @@ _DAMAGED = 'damaged: the JPEG decodes in part; fetch it again'
 class Searched:
     """One photograph after the search; points: None where there is no board, `reason` says why.
 
-    notes: what is odd about it; bright: share of the board's pixels at the end of the scale.
+    notes: what is odd about it; bright: share of the board's pixels at the end of the scale;
+    inverted: what is dark in print is bright.
     """
 
     name: str
@@ -52,6 +56,7 @@ class Searched:
     notes: tuple[str, ...] = ()
     bright: float = 0.0
     digest: str = ''
+    inverted: bool = False
 
 
 class Detection(NamedTuple):
@@ -59,7 +64,7 @@ class Detection(NamedTuple):
 
     frame of each is that of its row in `frames` (S,), -1 without a board; image_sizes: width,
     height of each camera; certainty (S,): of the order of corners, 1 where the board tells it, NaN
-    unknown.
+    unknown; pairing: of photographs of one moment.
     """
 
     observations: Observations
@@ -67,6 +72,7 @@ class Detection(NamedTuple):
     frames: Index
     image_sizes: dict[str, tuple[int, int]]
     certainty: Array
+    pairing: Pairing
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -78,6 +84,7 @@ class _Task(NamedTuple):
     photograph: Photograph
     pattern: Pattern
     detector: str
+    look: Look = Look.THOROUGH
 
 
 def detect(
@@ -86,27 +93,45 @@ def detect(
     detector: str = '',
     progress: Callable[[], object] = lambda: None,
     source: str = 'photographs',
+    sync: float | None = None,
 ) -> Detection:
     """Search photographs for a board, in processes of their own, SECONDS at most for each.
 
-    progress is called after each.  Raises ObservationError where no photograph shows the board.
+    progress is called after each; sync: see `pairing.pair_photographs`.  Raises ObservationError
+    where no photograph shows the board.
     """
-    taken: list[Photograph] = []
+    detector = detector or default_detector(pattern)
+    effort, begun = Effort(detector in FIRST_LOOKS), list[_Task]()
     results: dict[int, Searched] = {}
 
-    def tasks() -> Iterable[_Task]:
-        for photograph in photographs:
+    def tasks() -> Iterator[_Task]:
+        for number, photograph in enumerate(photographs):
+            repeatable = isinstance(photograph.data, Path)
+            look = effort.look(number, repeatable)
             # Pixels of a video would fill the memory.
-            taken.append(replace(photograph, data=b''))
-            yield _Task(photograph, pattern, detector or default_detector(pattern))
+            kept = photograph if repeatable else replace(photograph, data=b'')
+            begun.append(_Task(kept, pattern, detector, look))
+            yield begun[-1]._replace(photograph=photograph)
 
-    for number, result in bounded_map(examine, tasks(), SECONDS):
-        if isinstance(result, Late):
-            one = taken[number]
-            why = f'no board within {SECONDS:g} s' if result.timed_out else 'the search crashed'
-            result = Searched(one.name, one.key, one.camera, one.t, reason=why)
-        results[number] = result
-        progress()
+    def search(todo: Iterable[_Task], numbers: Sequence[int] | None = None) -> None:
+        for index, result in bounded_map(examine, todo, SECONDS):
+            number = index if numbers is None else numbers[index]
+            if isinstance(result, Late):
+                one = begun[number].photograph
+                why = (f'no board within {SECONDS:g} s' if result.timed_out
+                       else 'the search crashed')
+                result = Searched(one.name, one.key, one.camera, one.t, reason=why)
+            results[number] = result
+            effort.note(result.points is not None, result.inverted)
+            if numbers is None:
+                progress()
+
+    search(tasks())
+    postponed = [number for number, task in enumerate(begun)
+                 if task.look is Look.FIRST and results[number].points is None]
+    if effort.found:
+        search((begun[number]._replace(look=effort.look(number, True))
+                for number in postponed), postponed)
     searched = _noted(_one_size([results[number] for number in sorted(results)]))
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
@@ -116,12 +141,29 @@ def detect(
         raise ObservationError(f'{source}: no {pattern.spec} in {len(searched)} photographs: '
                                f'{said}; check kind and size of the board'
                                + counted.get(pattern.kind, ''))
-    return _table(searched, pattern, source)
+    return _table(*_moments(searched, sync), pattern, source)
+
+
+def _moments(
+    searched: tuple[Searched, ...], sync: float | None
+) -> tuple[tuple[Searched, ...], Pairing]:
+    """Return photographs with the time that their names say, and equal keys for one moment."""
+    t = np.array([one.t for one in searched])
+    stamps = [stamp for one in searched if (stamp := stamp_of(one.key)) is not None]
+    if len(stamps) == len(searched) and np.isnan(t).all():
+        searched = tuple(replace(one, t=stamp / 1e9)
+                         for one, stamp in zip(searched, stamps, strict=True))
+        # Numbers of s since 1970 are no finer than a quarter of a microsecond.
+        t = np.array([stamp - min(stamps) for stamp in stamps]) / 1e9
+    pairing = pair_photographs(
+        [one.key for one in searched], [one.camera for one in searched], t, sync)
+    return tuple(replace(one, key=key)
+                 for one, key in zip(searched, pairing.keys, strict=True)), pairing
 
 
 def examine(task: _Task) -> Searched:
     """Search one photograph; what is wrong with it becomes its reason."""
-    photograph, pattern, detector = task
+    photograph, pattern = task.photograph, task.pattern
     blank = Searched(photograph.name, photograph.key, photograph.camera, photograph.t)
     try:
         with caught_stderr() as said:
@@ -129,16 +171,35 @@ def examine(task: _Task) -> Searched:
         notes = (_UNTURNED,) if _turned(photograph) else ()
         if any(line.startswith('Corrupt JPEG') for line in said):
             notes = (*notes, _DAMAGED)
-        points = find_points(pixels, pattern, detector)
+        points, inverted = _look(pixels, task)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
         text = str(cause).removeprefix(f'{photograph.name}: ')
         return replace(blank, reason=text.splitlines()[0] if text else 'not enough memory')
     size = (int(pixels.shape[1]), int(pixels.shape[0]))
     if isinstance(points, str):
         return replace(blank, size=size, reason=points, notes=notes)
+    if pattern.kind == 'chessboard' and goes_on(pixels, points, pattern):
+        notes = (*notes, LARGER_BOARD)
     digest = hashlib.sha1(pixels.tobytes()).hexdigest()
-    return replace(blank, size=size, points=points, notes=notes, digest=digest,
-                   bright=_bright(pixels, points))
+    return replace(blank, size=size, points=points, notes=notes, digest=digest, inverted=inverted,
+                   bright=full_scale_share(pixels, points.uv))
+
+
+def _look(pixels: Pixels, task: _Task) -> tuple[Points | str, bool]:
+    """Return what `find_points` does, and whether the board is found inverted alone."""
+    _, pattern, detector, look = task
+    if look is Look.FIRST:
+        return find_points(pixels, pattern, detector, finder=FIRST_LOOKS[detector]), False
+    if look is Look.INVERTED:
+        points = find_points(pixels, pattern, detector, finder=at_inverted(FIRST_LOOKS[detector]))
+        if isinstance(points, Points):
+            return points, True
+    points = find_points(pixels, pattern, detector)
+    if look is not Look.SAMPLE or isinstance(points, str):
+        return points, False
+    own, inverted = (find_points(pixels, pattern, detector, finder=finder) for finder in (
+        FIRST_LOOKS[detector], at_inverted(FIRST_LOOKS[detector])))
+    return points, isinstance(own, str) and isinstance(inverted, Points)
 
 
 def _turned(photograph: Photograph) -> bool:
@@ -146,14 +207,6 @@ def _turned(photograph: Photograph) -> bool:
     if isinstance(data, Path):
         data = read_bytes(data, ObservationError)
     return isinstance(data, bytes) and exif_turned(data)
-
-
-def _bright(pixels: Pixels, points: Points) -> float:
-    mask = np.zeros(pixels.shape, np.uint8)
-    hull = cv2.convexHull(np.round(points.uv).astype(np.int32).reshape(-1, 1, 2))
-    cv2.fillConvexPoly(mask, hull, 1)
-    board = pixels[mask > 0]
-    return float((board >= np.iinfo(pixels.dtype).max).mean()) if board.size else 0.0
 
 
 def _one_size(searched: list[Searched]) -> list[Searched]:
@@ -182,7 +235,7 @@ def _noted(searched: list[Searched]) -> tuple[Searched, ...]:
         notes = list(one.notes)
         if one.points.blur > max(_BLURRED, _BLURRED * blur):
             notes.append(f'blurred by {one.points.blur:.1f} px')
-        if one.bright > _BURNT:
+        if one.bright > OVER_EXPOSED:
             notes.append(f'over-exposed: {100 * one.bright:.0f} % of the board at full scale')
         for other in (o for o in done if o.points is not None and o.camera == one.camera):
             if one.digest == other.digest:
@@ -203,7 +256,9 @@ def _together(one: Searched, other: Searched) -> bool:
     return len(mine) > 3 and float(np.abs(a.uv[mine] - b.uv[theirs]).max()) < _SAME_PLACE
 
 
-def _table(searched: tuple[Searched, ...], pattern: Pattern, source: str) -> Detection:
+def _table(
+    searched: tuple[Searched, ...], pairing: Pairing, pattern: Pattern, source: str
+) -> Detection:
     keys = sorted({one.key for one in searched}, key=[o.key for o in searched].index)
     number = {key: i for i, key in enumerate(keys)}
     cameras = tuple(sorted({one.camera for one in searched if one.points}))
@@ -217,7 +272,7 @@ def _table(searched: tuple[Searched, ...], pattern: Pattern, source: str) -> Det
     frames = np.array([number[one.key] if one.points else -1 for one in searched])
     observations = _observations(found, pattern, cameras, number, source)
     sizes = {name: next(one.size for one in found if one.camera == name) for name in cameras}
-    return Detection(observations, searched, frames, sizes, certainty)
+    return Detection(observations, searched, frames, sizes, certainty, pairing)
 
 
 def _agreed(

@@ -33,18 +33,31 @@ _SB = cv2.CALIB_CB_ACCURACY
 _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 
 
+def _at_small_scale(find: Finder) -> Finder:
+    """Return a finder that searches large images at a smaller scale."""
+    def search(image: Grey, pattern: Pattern) -> Found | None:
+        scale = _SEARCHED / max(image.shape)
+        if scale >= 1:
+            return find(image, pattern)
+        small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        found = find(small, pattern)
+        return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5)
+
+    return search
+
+
 def _smaller(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale first."""
     def search(image: Grey, pattern: Pattern) -> Found | None:
-        scale = _SEARCHED / max(image.shape)
-        if scale < 1:
-            small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-            found = find(small, pattern)
-            if found is not None:
-                return found[0], (found[1] + 0.5) / scale - 0.5
-        return find(image, pattern)
+        found = _at_small_scale(find)(image, pattern)
+        return find(image, pattern) if found is None and max(image.shape) > _SEARCHED else found
 
     return search
+
+
+def at_inverted(find: Finder) -> Finder:
+    """Return a finder that searches the inverted image."""
+    return lambda image, pattern: find(np.asarray(255 - image, np.uint8), pattern)
 
 
 def _sharper(find: Finder) -> Finder:
@@ -161,6 +174,8 @@ DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
     'circles': (('circles', 'asymmetric_circles'), _smaller(find_circles)),
     'squares': (('squares',), find_squares),
 }, tuple)
+# What a detector does first, alone
+FIRST_LOOKS: dict[str, Finder] = {'saddle': _at_small_scale(classic)}
 AS_FOUND = ('sb', 'classic')  # keep their own points; the others are fitted
 
 

@@ -11,11 +11,12 @@ from scipy.spatial import cKDTree
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.circle_fit import fit_circles
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
-from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Found, Grey, why_none
+from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Finder, Found, Grey, why_none
 from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 
+OVER_EXPOSED = 0.02  # of a board's pixels at the end of the scale
 _ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _GLANCE = 350  # px, of these surroundings; without a board larger ones take up to half a second
@@ -45,24 +46,28 @@ class Points(NamedTuple):
 
 
 def find_points(
-    pixels: Pixels, pattern: Pattern, detector: str, near: Array | None = None
+    pixels: Pixels, pattern: Pattern, detector: str, near: Array | None = None,
+    finder: Finder | None = None,
 ) -> Points | str:
     """Return the points of a pattern in a grey image, or why there are none.
 
     near (M, 2): image points of the board in the image before; its surroundings are searched
-    first, and the rest only where the board is not there any more.
+    first, and the rest only where the board is not there any more.  finder: in place of the
+    detector's own.
     """
     height, width = pixels.shape
     if not _SHORTEST <= min(height, width) <= max(height, width) <= _LONGEST:
         return f'no board found: the image is {width} x {height} px'
     try:
-        return _found(pixels, pattern, detector, near)
+        return _found(pixels, pattern, detector, near, finder or DETECTORS[detector][1])
     except cv2.error as cause:
         return f'no board found: {cause.err}'
 
 
-def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) -> Points | str:
-    grey, finder = _eight_bit(pixels), DETECTORS[detector][1]
+def _found(
+    pixels: Pixels, pattern: Pattern, detector: str, near: Array | None, finder: Finder
+) -> Points | str:
+    grey = _eight_bit(pixels)
     found = _near(grey, pattern, finder, near) if near is not None else None
     found = found or finder(grey, pattern)
     if found is None:
@@ -76,10 +81,32 @@ def _found(pixels: Pixels, pattern: Pattern, detector: str, near: Array | None) 
             index, uv = _completed(pixels, index, uv, pattern)
     elif len(index) == len(pattern.points):
         uv = _right_handed(uv, pattern)
+    measured = _measure(pixels, index, uv, pattern, detector, censored=True)
+    if isinstance(measured, str) and full_scale_share(pixels, uv) > OVER_EXPOSED:
+        # Where little light is left within the scale, only its end tells where an edge is: too far
+        # on the dark side, but on both sides of a corner, or all around a circle, alike.
+        again = _measure(pixels, index, uv, pattern, detector, censored=False)
+        measured = measured if isinstance(again, str) else again
+    return measured
+
+
+def full_scale_share(pixels: Pixels, uv: Array) -> float:
+    """Return the share of pixels around image points (M, 2), px, at the end of the scale."""
+    mask = np.zeros(pixels.shape, np.uint8)
+    hull = cv2.convexHull(np.round(uv).astype(np.int32).reshape(-1, 1, 2))
+    cv2.fillConvexPoly(mask, hull, 1)
+    board = pixels[mask > 0]
+    return float((board >= np.iinfo(pixels.dtype).max).mean()) if board.size else 0.0
+
+
+def _measure(
+    pixels: Pixels, index: Index, uv: Array, pattern: Pattern, detector: str, censored: bool
+) -> Points | str:
+    """Fit the points found at uv (M, 2), px; censored: see `corner_fit.fit_corners`."""
     if detector == 'circles':
-        circles = fit_circles(pixels, uv, pattern.points[index])
+        circles = fit_circles(pixels, uv, pattern.points[index], censored)
         return _checked(index, circles, pattern, _surroundings(index, uv, pattern)[1])
-    corners, reach = _fitted(pixels, index, uv, pattern, detector == 'quick')
+    corners, reach = _fitted(pixels, index, uv, pattern, detector == 'quick', censored)
     if detector in AS_FOUND:
         corners = corners._replace(uv=uv)
     return _checked(index, corners, pattern, reach)
@@ -141,7 +168,7 @@ def _completed(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Fou
 
 
 def _fitted(
-    pixels: Pixels, index: Index, start: Array, pattern: Pattern, live: bool
+    pixels: Pixels, index: Index, start: Array, pattern: Pattern, live: bool, censored: bool
 ) -> tuple[Corners, Array]:
     """Fit corners, and again where the first fit puts them; return how far (M,) is left, px.
 
@@ -154,7 +181,7 @@ def _fitted(
     square = bool(np.any(pattern.inward))
     axes, reach = _surroundings(index, start, pattern)
     first = reach if live else np.minimum(_NARROW * reach, _NARROWEST)
-    corners = fit_corners(pixels, start, axes, first, square)
+    corners = fit_corners(pixels, start, axes, first, square, censored)
     wrong = _off(corners, start) if live else np.ones(len(start), dtype=bool)
     for _ in range(_ROUNDS):
         if not wrong.any():
@@ -164,7 +191,7 @@ def _fitted(
         # The next edge has its blur, too.
         free = np.where(corners.ok, np.minimum(reach, room(reach, corners.blur)), reach)
         off = np.flatnonzero(wrong) if live else np.arange(len(start))
-        again = fit_corners(pixels, start[off], axes[off], free[off], square)
+        again = fit_corners(pixels, start[off], axes[off], free[off], square, censored)
         for whole, part in zip(corners, again, strict=True):
             whole[off] = part
         wrong = _off(corners, start)
@@ -175,7 +202,7 @@ def _fitted(
     half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
                       interpolation=cv2.INTER_AREA)
     again = fit_corners(half, (start[soft] + 0.5) / 2 - 0.5, axes[soft] / 2, reach[soft] / 2,
-                        square)
+                        square, censored)
     found = soft[again.ok]
     size = {'uv': 2 * again.uv + 0.5, 'sigma': 2 * again.sigma, 'blur': 2 * again.blur}
     for name, whole, part in zip(Corners._fields, corners, again, strict=True):
@@ -211,7 +238,7 @@ def _least_square(uv: Array, pattern: Pattern) -> Array:
         [height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]]).ravel())
 
 
-def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | None:
+def _near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | None:
     low, high = near.min(axis=0), near.max(axis=0)
     margin = _MARGIN * float((high - low).max()) + 10
     height, width = grey.shape
@@ -223,7 +250,7 @@ def _near(grey: Grey, pattern: Pattern, finder: object, near: Array) -> Found | 
     scale = min(glance, 1.0) if pattern.kind == 'chessboard' else 1.0
     crop = cv2.resize(grey[top:bottom, left:right], None, fx=scale, fy=scale,
                       interpolation=cv2.INTER_AREA)
-    found: Found | None = finder(crop, pattern)  # type: ignore[operator]
+    found = finder(crop, pattern)
     return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5 + (left, top))
 
 

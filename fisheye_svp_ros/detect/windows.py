@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -30,6 +30,10 @@ _TOUCHED = 0.02  # of a smoothed pixel
 _SIGHT = 4  # px that smoothing sees
 _ROUNDING = 1 / 12  # variance of a whole number
 _RIM = 2  # px along the border, where smoothing has seen the image's mirror image
+
+
+# A fit that diverges overflows, and is rejected for that; nobody needs to read about it.
+IN_SILENCE: dict[str, Any] = {'over': 'ignore', 'invalid': 'ignore', 'divide': 'ignore'}
 
 
 class Windows(NamedTuple):
@@ -153,7 +157,7 @@ class WindowProblem(ABC):
         return residual * known, jacobian * known[..., None], self.weight[index] * known
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
-        with np.errstate(over='ignore', invalid='ignore'):  # wild states are lost, see below
+        with np.errstate(**IN_SILENCE):
             residual, jacobian, weight = self.parts(state[0], index)
         weight = weight / self._noise[index, None] ** 2
         transposed = np.swapaxes(jacobian * weight[..., None], -1, -2)

@@ -21,6 +21,8 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_text, write_text
 
 _SHOWN = 60  # characters of a header
+_RECENT = 1e9  # s since 1970, in 2001
+_PER_SECOND = {'nanoseconds': 1e9, 'microseconds': 1e6, 'milliseconds': 1e3}
 _LARGEST = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
 
 
@@ -69,14 +71,21 @@ class CsvTable:
         """Return columns as finite numbers (N, len(names)) of at most 1e12."""
         values = np.stack([self._numbers(name) for name in names], axis=-1)
         for name, column in zip(names, values.T, strict=True):
-            self.refuse(np.abs(column) > _LARGEST, name, f'a number of at most {_LARGEST:g}')
+            needed = f'a number of at most {_LARGEST:g}'
+            if name == 't':
+                unit = _stamp_unit(column)
+                needed = 'a time in seconds' + (
+                    f' (these are {unit}: divide by {_PER_SECOND[unit]:g})' if unit else '')
+            self.refuse(np.abs(column) > _LARGEST, name, needed)
         return values
 
     def whole(self, name: str, most: int = 2**53) -> Index:
         """Return a column of whole numbers (N,) from 0 to `most`."""
         values = self._numbers(name)
         bad = (values != np.floor(values)) | (values < 0) | (values > most)
-        self.refuse(bad, name, f'a whole number from 0 to {most}')
+        unit = _stamp_unit(values)
+        hint = f' (stamps in {unit} belong in t, in seconds)' if unit and name == 'frame' else ''
+        self.refuse(bad, name, f'a whole number from 0 to {most}{hint}')
         return values.astype(np.int64)
 
     def refuse(self, bad: Sequence[bool] | Mask, name: str, needed: str) -> None:
@@ -128,6 +137,12 @@ class CsvTable:
             raise
         self.refuse(~np.isfinite(values), name, 'a finite number')
         return values
+
+
+def _stamp_unit(values: Array) -> str:
+    """Return the unit that stamps since 1970 must be in, '' for seconds and small numbers."""
+    largest = np.abs(values).max(initial=0.0)
+    return next((unit for unit, scale in _PER_SECOND.items() if largest > _RECENT * scale), '')
 
 
 def _uncomment(lines: list[str], required: Sequence[str]) -> int:

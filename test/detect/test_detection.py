@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.memory import page_faults
+from helpers.nodes import SHARED
 from helpers.patterns import pattern_photograph
 from helpers.photographs import (
     BOARD,
@@ -26,6 +28,7 @@ from helpers.photographs import (
 )
 from rosbags.typesys import Stores, get_typestore
 
+from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
 from fisheye_svp_ros.detect.finders import DETECTORS
@@ -709,3 +712,63 @@ def test_a_process_that_dies_between_two_calls_is_replaced() -> None:
 def test_workers_keep_their_memory() -> None:
     """What is given back has to be cleared anew, page by page, which took as long as the fit."""
     assert dict(bounded_map(page_faults, [10], 60.0))[0] < 1000
+
+
+def half_hidden() -> np.ndarray:
+    """Return a photograph of a board, most of it behind light of one brightness."""
+    image = photograph(poses(4).take(1)).astype(float)
+    middle = true_corners(poses(4).take(1)).mean(axis=0)
+    u, v = np.meshgrid(*map(np.arange, image.shape[::-1]))
+    image[(u - middle[0]) + 0.4 * (v - middle[1]) > 3] = 255
+    return image.astype(np.uint8)
+
+
+@pytest.mark.filterwarnings('error')
+def test_fits_that_diverge_say_nothing() -> None:
+    """Windows of anything but corners, with neighbors of any size."""
+    rng = np.random.default_rng(3)
+    image = half_hidden()
+    start = rng.uniform(20, 380, (400, 2))
+    axes = rng.normal(0, 300, (400, 2, 2))
+    for square in (False, True):
+        corners = fit_corners(image, start, axes, rng.uniform(2, 40, 400), square)
+        assert np.isfinite(corners.uv[corners.ok]).all()
+    noise = rng.integers(0, 2, image.shape).astype(np.uint8) * 255
+    fit_corners(noise, start, axes, np.full(400, 12.0))
+
+
+@pytest.mark.parametrize('name', ['half_hidden_charuco.png', 'gapped_chessboard.png'])
+def test_odd_boards_leave_no_warnings(name: str, capfd: pytest.CaptureFixture[str]) -> None:
+    path = SHARED.parent / 'faults' / 'numpy_warnings' / name
+    if not path.exists():
+        pytest.skip('the photographs are not here')
+    board = {'half': 'charuco:8x6:25mm:18mm:DICT_4X4_50', 'gapp': 'chessboard:5x4:30mm'}[name[:4]]
+    seen = detect(find_photographs([str(path)]), parse_pattern(board))
+    assert seen.searched[0].points is not None
+    assert 'Warning' not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize('gain', [1.4, 2.0])
+def test_an_over_exposed_board_is_found_where_it_is(gain: float) -> None:
+    """Light cut off at the end of the scale moves edges, and corners stay in their middle."""
+    for i in range(4):
+        pose = poses(4, 5).take(i)
+        image, true = photograph(pose).astype(float), true_corners(pose)
+        burnt = np.clip(gain * image, 0, 255).astype(np.uint8)
+        points = find_points(burnt, PATTERN, 'saddle')
+        assert not isinstance(points, str), points
+        assert len(points.ids) > 0.8 * len(true)
+        assert np.abs(points.uv - true[points.ids]).max() < 0.3
+
+
+def test_a_board_with_more_squares_is_said_to_be_larger(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    larger = Print(9, 6, 0.02)
+    write(tmp_path, [photograph(poses(12, 1, larger).take(i), larger) for i in range(12)])
+    assert cli.main(['detect', str(tmp_path), '--board', 'chessboard:9x6:20mm']) == 0
+    assert 'larger' not in capsys.readouterr().err
+    cli.main(['detect', str(tmp_path), '--board', 'chessboard:8x6:20mm'])
+    told = capsys.readouterr().err
+    assert re.search(r'\d+ of \d+ boards look larger than chessboard:8x6:20mm, which counts', told)
+    assert 'its squares go on beyond the corners looked for' in told
