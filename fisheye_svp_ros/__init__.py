@@ -18,6 +18,11 @@ _HOMES = {
     'read_observations': 'io.readers',
     'write_observations': 'io.readers',
     'read_poses': 'io.readers',
+    'detect': '',
+    'observations': 'library_boards',
+    'render': 'library_boards',
+    'plan': 'library_boards',
+    'write_lens': 'library_boards',
     'load_lens': 'library',
     'load_rig': 'io.rig_files',
     'save_lens': 'library',
@@ -40,6 +45,8 @@ __all__ = [*_HOMES]
 def __getattr__(name: str) -> _Any:
     if name not in _HOMES:
         raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+    if not _HOMES[name]:  # a room that can be called
+        return _import_module(f'{__name__}.{name}')
     return getattr(_import_module(f'{__name__}.{_HOMES[name]}'), name)
 
 

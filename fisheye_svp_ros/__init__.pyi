@@ -18,6 +18,10 @@ from fisheye_svp_ros.library import simulate_scenario as simulate_scenario
 from fisheye_svp_ros.library import stereo_depth as stereo_depth
 from fisheye_svp_ros.library import sweep as sweep
 from fisheye_svp_ros.library import undistort_maps as undistort_maps
+from fisheye_svp_ros.library_boards import observations as observations
+from fisheye_svp_ros.library_boards import plan as plan
+from fisheye_svp_ros.library_boards import render as render
+from fisheye_svp_ros.library_boards import write_lens as write_lens
 from fisheye_svp_ros.optics.lens import Lens as Lens
 from fisheye_svp_ros.pose import Pose as Pose
 from fisheye_svp_ros.scene.observations import Observations as Observations

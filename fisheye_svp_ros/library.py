@@ -353,11 +353,15 @@ def stereo_depth(
 def simulate_scenario(**scenario: Any) -> Simulated:
     """Return what the cameras of a scenario see; keywords: parameters of `Scenario`.
 
+    lens may be a `Lens`, too.
     Raises ParameterError for an unknown parameter or a value that is not allowed, FisheyeSvpError
     for a lens, landmarks or poses that cannot be used.
     """
     _check_names(sweeps.CAMERA, scenario)
-    seen = scenarios.simulate_scenario(changed(scenarios.Scenario(), scenario))
+    lens = scenario.pop('lens', None)
+    named = {} if lens is None or isinstance(lens, Lens) else {'lens': str(lens)}
+    seen = scenarios.simulate_scenario(changed(scenarios.Scenario(), {**scenario, **named}),
+                                       lens=lens if isinstance(lens, Lens) else None)
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
 

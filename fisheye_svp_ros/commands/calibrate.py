@@ -82,6 +82,10 @@ def run(args: argparse.Namespace) -> None:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
         raise ParameterError(f'{args.observations}: the size of the images is not known; add '
                              f'--image-size {head}1280x800')
+    if args.output and args.output.suffix in ('.yaml', '.yml') and len(observations.cameras) > 1:
+        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(observations.cameras)} '
+                             f'and their rig go into a folder, as in '
+                             f'-o {args.output.with_suffix("")}')
     found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
+import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.scene.photograph_names import frame_name, list_frames
@@ -14,6 +17,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.solve.outliers import Outliers
 
 _MAX_SIMILAR_NOTES = 3  # frames whose reasons differ by numbers alone; of more, the first only
+_DAY = 86_400.0  # s
 _DIGITS = re.compile(r'\d')
 _MAX_TARGET_SIZE = 20.0  # m; a target larger than this was measured in other units
 
@@ -24,12 +28,26 @@ def say(note: str) -> None:
 
 
 def note_formats() -> None:
-    """Say it where tables come in one form only."""
+    """Say it where tables come in one form only, once a day."""
     from fisheye_svp_ros.io.columns import arrow
 
     _, problem = arrow()
-    if problem:
+    if problem and _first_today('no_parquet'):
         say(problem)
+
+
+def _first_today(name: str) -> bool:
+    """Return whether this is the first call of the day with a name; True where none is kept."""
+    home = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache')
+    mark = home / 'fisheye_svp_ros' / f'{name}.said'
+    try:
+        if mark.exists() and time.time() - mark.stat().st_mtime < _DAY:
+            return False
+        mark.parent.mkdir(parents=True, exist_ok=True)
+        mark.touch()
+    except OSError:
+        pass
+    return True
 
 
 def note_left_out(table: Observations, frames: Sequence[int]) -> None:

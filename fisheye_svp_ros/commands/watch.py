@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
 
     from fisheye_svp_ros.nodes.watcher import Watcher
 
+_UNITS = {'m': ('mm', 1000.0), 'rad': ('deg', math.degrees(1.0))}
 _MIN_COLUMNS = 64  # columns: three numbers, and some of the names, which are broken into lines
 
 
@@ -37,6 +39,14 @@ def run(args: argparse.Namespace) -> None:
         watcher.destroy_node()
 
 
+def _for_people(name: str) -> tuple[str, float]:
+    """Return the name of a metric with the unit that people read, and the factor to it."""
+    for unit, (shown, scale) in _UNITS.items():
+        if name.endswith(f'_{unit}'):
+            return f'{name.removesuffix(unit)}{shown}', scale
+    return name, 1.0
+
+
 def _result_table(watcher: Watcher, width: int) -> RenderableType:
     from rich import box
     from rich.table import Table
@@ -52,6 +62,7 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
         lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
         table.add_row(node, f'{results.sets} sets{lost}')
         for name, metric in results.metrics.items():
+            shown, scale = _for_people(name)
             values = metric.latest, metric.total / metric.count, metric.largest
-            table.add_row('', name, *(f'{value:.6g}' for value in values))
+            table.add_row('', shown, *(f'{scale * value:.6g}' for value in values))
     return table

@@ -1,7 +1,47 @@
-"""Photographs to observations: sources, detectors, the order of corners, their uncertainty."""
+"""Photographs to observations: sources, detectors, the order of corners, their uncertainty.
+
+The room can be called: `fsvp.detect(photographs, board)` searches photographs as the command does.
+"""
+
+from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.detect.detection import Detection
 
 # Pixels of an image that OpenCV decodes, 67 million: a small file can ask for any number.  OpenCV
 # reads this as it is loaded.
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(1 << 26))
+
+
+class _Room(ModuleType):
+    """A package that is a function of the library, too: both have the name `detect`."""
+
+    def __call__(
+        self, photographs: str | Path | Sequence[str | Path], board: str, *, detector: str = '',
+        every: int = 1, sync: float | None = None,
+    ) -> Detection:
+        """Search photographs (files, folders, videos, recordings) for a board.
+
+        board: as in `--board`; every: take one of so many; sync: largest difference, s, of the
+        stamps of one moment of a rig.  The result has `observations` and `searched`.
+        Raises ObservationError where no photograph shows the board, ParameterError for a board
+        that cannot be.
+        """
+        from fisheye_svp_ros.detect.detection import detect
+        from fisheye_svp_ros.detect.patterns import parse_pattern
+        from fisheye_svp_ros.detect.photographs import find_photographs
+
+        given = [photographs] if isinstance(photographs, str | Path) else photographs
+        paths = [str(path) for path in given]
+        return detect(find_photographs(paths, every), parse_pattern(board), detector,
+                      source=', '.join(paths), sync=sync)
+
+
+sys.modules[__name__].__class__ = _Room

@@ -74,6 +74,11 @@ class Detection(NamedTuple):
     certainty: Array
     pairing: Pairing
 
+    def __repr__(self) -> str:
+        found = sum(one.points is not None for one in self.searched)
+        return (f'Detection(board in {found} of {len(self.searched)} photographs, '
+                f'{self.observations})')
+
     @property
     def image_size(self) -> tuple[int, int]:
         """Width and height, px, of the first camera's images."""

@@ -18,6 +18,7 @@ from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
+_BRIEF = 60  # characters of a value in a repr
 _KIND = 'result'
 
 
@@ -47,8 +48,28 @@ class Columns(dict[str, list[Any]]):
         )
 
 
+def _brief(value: Any) -> str:
+    """Return an array's shape, a mapping's or list's length, a lens's name, a number as it is."""
+    shape = getattr(value, 'shape', None)
+    if shape:
+        return f'array{shape}'
+    if isinstance(value, Mapping | list | tuple) and not hasattr(value, '_fields'):
+        return f'{type(value).__name__} of {len(value)}'
+    name = getattr(value, 'name', None)
+    text = f'{type(value).__name__} {name!r}' if name else repr(value)
+    return text if len(text) <= _BRIEF else f'{text[:_BRIEF].splitlines()[0]} ...'
+
+
 class Result(ABC):
     """A dataclass of arrays, poses, lenses, tables and plain values that is kept as JSON."""
+
+    def __init_subclass__(cls) -> None:
+        # Before the dataclass has its own, which prints whole arrays.
+        cls.__repr__ = Result.__repr__  # type: ignore[method-assign]
+
+    def __repr__(self) -> str:
+        parts = (f'{name}={_brief(value)}' for name, value in vars(self).items())
+        return f'{type(self).__name__}({", ".join(parts)})'
 
     @abstractmethod
     def table(self) -> Columns:

@@ -37,6 +37,11 @@ class Observations:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def __repr__(self) -> str:
+        cameras = f', cameras {", ".join(self.cameras)}' if self.cameras != ('',) else ''
+        return (f'Observations({len(self)} points in {len(self.frames)} frames{cameras}, '
+                f'of {self.source})')
+
     def take(self, index: Index | Mask) -> Observations:
         """Return some of the rows."""
         rows = {

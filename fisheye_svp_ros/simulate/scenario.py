@@ -100,15 +100,18 @@ class Simulation(NamedTuple):
     rig: Pose | None
 
 
-def simulate_scenario(scenario: Scenario, number: int = 0, repetition: int = 0) -> Simulation:
+def simulate_scenario(
+    scenario: Scenario, number: int = 0, repetition: int = 0, lens: Lens | None = None
+) -> Simulation:
     """Simulate all sets of a scenario.
 
-    number: of the scenario in its sweep; repetition: of the sweep; each draws noise of its own.
+    number: of the scenario in its sweep; repetition: of the sweep; each draws noise of its own;
+    lens: in place of the file that the scenario names.
     Raises FisheyeSvpError for a lens, landmarks or poses that
     cannot be used.
     """
     return _simulate_poses(scenario, scenario_poses(scenario),
-                      noise_generator(scenario.seed, number, repetition))
+                           noise_generator(scenario.seed, number, repetition), lens)
 
 
 def simulate_in_pieces(
@@ -127,8 +130,11 @@ def simulate_in_pieces(
         yield first, sets, _simulate_poses(scenario, piece, rng)
 
 
-def _simulate_poses(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
-    lens = true_lens(scenario.lens, scenario.shift_scale)
+def _simulate_poses(
+    scenario: Scenario, poses: Pose, rng: np.random.Generator, lens: Lens | None = None
+) -> Simulation:
+    lens = true_lens(scenario.lens, scenario.shift_scale) if lens is None else (
+        _scaled(lens, scenario.shift_scale))
     landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
     model, sigma = ForwardModel(lens), scenario.noise_px
     if rig is None:
@@ -169,11 +175,15 @@ def true_lens(lens: str, shift_scale: float = 1.0) -> Lens:
 
 @lru_cache(maxsize=64)
 def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
-    loaded = load_lens(path)
-    shift = loaded.viewpoint_shift
+    return _scaled(load_lens(path), shift_scale)
+
+
+def _scaled(lens: Lens, shift_scale: float) -> Lens:
+    """Return a lens, its viewpoint shift scaled."""
+    shift = lens.viewpoint_shift
     if shift is None or shift_scale == 1.0:
-        return loaded
-    return replace(loaded, viewpoint_shift=shift.scale_by(shift_scale) if shift_scale else None)
+        return lens
+    return replace(lens, viewpoint_shift=shift.scale_by(shift_scale) if shift_scale else None)
 
 
 def model_of(lens: str, shift_scale: float, svp: bool) -> ForwardModel:

@@ -430,6 +430,7 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     capsys.readouterr()
     tables.arrow.cache_clear()
     monkeypatch.setitem(sys.modules, 'pyarrow', None)
+    monkeypatch.setenv('XDG_CACHE_HOME', str(tmp_path / 'cache'))
     assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 0
     err = capsys.readouterr().err
     tables.arrow.cache_clear()

@@ -1,0 +1,87 @@
+"""The library's part about boards: their image points, photographs and views; lens files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.io.lens_formats import write_foreign
+from fisheye_svp_ros.library import AnyLens, load_lens, save_lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.planning.plan import Plan
+
+
+def observations(
+    u: Array, v: Array, landmark: Index, board: str | Array, *, frame: Index | int = 0
+) -> Observations:
+    """Return a table of image points u, v (N,), px, of landmarks (N,).
+
+    board: as in `--board`, or places (L, 3), m, of landmarks 0 to L - 1; frame (N,).
+    Raises ParameterError for arrays of different lengths and for landmarks that are not there.
+    """
+    places = parse_pattern(board).points if isinstance(board, str) else np.asarray(board, float)
+    columns = np.broadcast_arrays(*map(np.atleast_1d, (u, v, landmark, frame))) if len(
+        {np.size(column) for column in (u, v, landmark)}) == 1 else []
+    if not columns or places.shape[1:] != (3,):
+        raise ParameterError('u, v and landmark must have one length, places the shape (L, 3)')
+    number = np.asarray(columns[2], dtype=np.int64)
+    if number.min(initial=0) < 0 or number.max(initial=0) >= len(places):
+        raise ParameterError(f'landmarks are 0 to {len(places) - 1}; there is {number.max()}')
+    return make_observations(np.asarray(columns[3], dtype=np.int64), number,
+                             np.stack(columns[:2], axis=-1), places[number])
+
+
+def render(
+    lens: AnyLens, board: str, pose: Pose, *, noise: float = 2.0, seed: int = 0
+) -> NDArray[np.uint8]:
+    """Return a photograph (H, W) of a chessboard by a lens with its viewpoint shift.
+
+    pose: one, of the camera in the board's frame; noise: grey levels, rms.
+    Raises ParameterError for another board.
+    """
+    from fisheye_svp_ros.simulate.render import Exposure, Print
+    from fisheye_svp_ros.simulate.render import render as expose
+
+    pattern = parse_pattern(board)
+    if pattern.kind != 'chessboard':
+        raise ParameterError(f'board {board!r}: chessboards alone can be rendered')
+    printed = Print(pattern.columns, pattern.rows, pattern.size)
+    return expose(load_lens(lens), printed, pose, Exposure(noise=noise),
+                  np.random.default_rng(seed))
+
+
+def plan(
+    lens: AnyLens, board: str, room: tuple[float, float], *, count: int = 12,
+    number: str | None = None, noise_px: float = 0.1,
+) -> Plan:
+    """Return which photographs to take of a board, as the command does.
+
+    room: nearest and furthest distance, m; number: the parameter that matters most, None for the
+    lens as a whole.
+    """
+    from fisheye_svp_ros.planning.optimal_design import ViewLimits
+    from fisheye_svp_ros.planning.plan import plan as choose
+
+    return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(*room), count, number,
+                  noise_px)
+
+
+def write_lens(lens: AnyLens, path: str | Path, form: str = '') -> None:
+    """Write a lens file, or in the form of another tool: kalibr, ros, opencv, colmap, ...
+
+    Raises LensError for a lens that the form cannot hold to a hundredth of a pixel.
+    """
+    if form:
+        write_text(path, write_foreign(load_lens(lens), form))
+    else:
+        save_lens(load_lens(lens), path)
