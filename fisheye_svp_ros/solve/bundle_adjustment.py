@@ -47,8 +47,9 @@ class PosePrior(NamedTuple):
 class Prior(NamedTuple):
     """What is known before of a state: a Gaussian of any of its parts.
 
-    mean (K,), root (R, K): of free intrinsics and effect values, root times what is off the mean
-    being of unit covariance; pose: of the frames (F,); rig: of the cameras (C - 1,) in the first.
+    mean (K,), root (R, K): of the last K of free intrinsics and effect values, root times what is
+    off the mean being of unit covariance; pose: of the frames (F,); rig: of the cameras (C - 1,)
+    in the first.
     """
 
     mean: Array | None = None
@@ -270,12 +271,13 @@ class _Adjustment:
         self, state: RigState, cost: Array, normal: Arrays
     ) -> tuple[Array, Arrays]:
         blocks, _, shared, block_gradient, shared_gradient = (array[0] for array in normal)
-        prior, cameras = self._prior, 6 * (self._data.cameras - 1)
+        prior = self._prior
         if prior.mean is not None and prior.root is not None:
-            off = prior.root @ (state.shared_values(self._free) - prior.mean)
+            last = np.arange(len(shared))[-len(prior.mean) :]
+            off = prior.root @ (state.shared_values(self._free)[-len(prior.mean) :] - prior.mean)
             cost = cost + off @ off
-            shared[cameras:, cameras:] += prior.root.T @ prior.root
-            shared_gradient[cameras:] += prior.root.T @ off
+            shared[np.ix_(last, last)] += prior.root.T @ prior.root
+            shared_gradient[last] += prior.root.T @ off
         if prior.pose is not None:
             off, columns = _pose_rows(prior.pose, state.pose)
             cost = cost + (off**2).sum()

@@ -82,14 +82,14 @@ def test_each_view_is_predicted_from_the_others_of_its_landmark():
     left = 7
     known = process.known
     view = known.row // linear.data.views.used.shape[1]
-    view = np.where(known.there, view, -1)
+    view = np.where(known.mask, view, -1)
     kernel = np.exp(-((known.seen[:, :, None] - known.seen[:, None]) ** 2).sum(axis=-1)
                     / (2 * process.reach**2)
                     - np.abs(known.t[:, :, None] - known.t[:, None]) / process.lasting)
     rows = linear.residual.reshape(*linear.data.views.used.shape, 2)
     for landmark in (0, 11, 40):
         mine = view[landmark] == left
-        others = known.there[landmark] & ~mine
+        others = known.mask[landmark] & ~mine
         covariance = process.variance * kernel[landmark] + np.eye(len(mine))
         told = rows[view[landmark][others], int(known.key[landmark, 1])]
         expected = process.variance * kernel[landmark][np.ix_(mine, others)] @ np.linalg.solve(
@@ -102,7 +102,7 @@ def test_what_was_fitted_is_predicted_at_the_same_views():
     linear = linearised(photographed(0.3))
     process = similar_views(linear, linear.residual)
     rows = linear.residual.reshape(*linear.data.views.used.shape, 2)
-    assert np.std(rows - process.at(linear)) < 0.4 * np.std(rows)
+    assert np.std(rows - process.predict(linear)) < 0.4 * np.std(rows)
 
 
 def test_views_of_unknown_time_are_like_none():
@@ -111,7 +111,7 @@ def test_views_of_unknown_time_are_like_none():
     process = similar_views(linear, linear.residual)
     assert np.isfinite(process.lasting)
     timeless = linearised(replace(table, t=np.full(len(table), np.nan)))
-    assert not process.at(timeless).any()
+    assert not process.predict(timeless).any()
     assert similar_views(timeless, timeless.residual).lasting == np.inf
 
 
@@ -121,9 +121,9 @@ def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
     stated = replace(table, sigma=np.full(len(table), NOISE))
     linear, plain = linearised(stated), linearised(table)
     process = similar_views(linear, linear.residual)
-    np.testing.assert_allclose(process.at(plain), process.at(linear), atol=1e-6)
+    np.testing.assert_allclose(process.predict(plain), process.predict(linear), atol=1e-6)
     np.testing.assert_allclose(
-        process.at(plain), similar_views(plain, plain.residual).at(plain), rtol=0.02, atol=2e-3)
+        process.predict(plain), similar_views(plain, plain.residual).predict(plain), rtol=0.02, atol=2e-3)
 
 
 def test_landmarks_that_were_never_seen_are_left_alone():
@@ -131,4 +131,4 @@ def test_landmarks_that_were_never_seen_are_left_alone():
     linear = linearised(table)
     process = similar_views(linear, linear.residual)
     other = linearised(replace(table, landmark=table.landmark + 1000))
-    assert not process.at(other).any()
+    assert not process.predict(other).any()
