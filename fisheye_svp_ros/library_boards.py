@@ -18,7 +18,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 if TYPE_CHECKING:
-    from fisheye_svp_ros.planning.plan import Plan
+    from fisheye_svp_ros.planning.plan import PhotographPlan
 
 
 def observations(
@@ -63,7 +63,7 @@ def render(
 def plan(
     lens: AnyLens, board: str, room: tuple[float, float], *, count: int = 12,
     number: str | None = None, noise_px: float = 0.1,
-) -> Plan:
+) -> PhotographPlan:
     """Return which photographs to take of a board, as the command does.
 
     room: nearest and furthest distance, m; number: the parameter that matters most, None for the
