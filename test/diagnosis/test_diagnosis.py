@@ -457,7 +457,7 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
 
     values = spread * np.random.default_rng(27).normal(size=40)
     null = SimpleNamespace(
-        own=1, included=np.arange(1), terms=[], scale=np.array([2.0]),
+        column_count=1, included_columns=np.arange(1), terms=[], scale=np.array([2.0]),
         information=information(values), information_without_frames=lambda at: [
             information(np.delete(values, i)) for i in range(40)],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
@@ -472,7 +472,8 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     rows[:, 2] = np.random.default_rng(28).normal(size=40) + 100 * rows[:, 1]
     without = [np.delete(rows, i, axis=0) for i in range(40)]
     null = SimpleNamespace(
-        own=2, included=np.arange(2), terms=[], scale=np.ones(2), information=rows.T @ rows,
+        column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
+        information=rows.T @ rows,
         information_without_frames=lambda at: [w.T @ w for w in without],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     assert standard_errors(null) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])

@@ -134,7 +134,8 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
 def test_what_no_frame_tells_of_has_no_error():
     information = np.diag([0.0, 4.0, 1.0])
     null = SimpleNamespace(
-        own=2, included=np.arange(2), terms=[], scale=np.ones(2), information=information,
+        column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
+        information=information,
         information_without_frames=lambda at: np.stack([0.9 * information] * 3),
         linear=SimpleNamespace(data=SimpleNamespace(frames=3)))
     np.testing.assert_allclose(standard_errors(null), [np.nan, 0.5])

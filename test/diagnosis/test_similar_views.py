@@ -123,7 +123,8 @@ def test_a_table_that_does_not_state_sigma_is_predicted_by_one_that_does():
     process = similar_views(linear, linear.residual)
     np.testing.assert_allclose(process.predict(plain), process.predict(linear), atol=1e-6)
     np.testing.assert_allclose(
-        process.predict(plain), similar_views(plain, plain.residual).predict(plain), rtol=0.02, atol=2e-3)
+        process.predict(plain), similar_views(plain, plain.residual).predict(plain),
+        rtol=0.02, atol=2e-3)
 
 
 def test_landmarks_that_were_never_seen_are_left_alone():
