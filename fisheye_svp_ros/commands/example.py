@@ -12,6 +12,7 @@ from fisheye_svp_ros.io.files import together, write_text
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.simulate.render import Exposure, Print
 from fisheye_svp_ros.simulate.targets import board, board_views
 
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> None:
     poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
     with together():
-        write_photographs(lens, board(printed), poses, Exposure(), 0,
+        write_photographs({'': (lens, identity())}, board(printed), poses, Exposure(), 0,
                           args.output / 'photographs', truth)
         save_lens(lens, truth / 'lens.yaml')
         write_text(args.output / 'README.md', _README)

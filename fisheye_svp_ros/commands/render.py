@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import itertools
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -14,30 +16,35 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import together, write_bytes
+from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
+from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.simulate.render import Exposure, Field, Placed, Print, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
+Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='a lens file, or the name of one that comes with the package')
+                        help='a lens file, or the name of one that comes with the package; a '
+                        'folder or file with the lenses of a rig and where they stand')
     parser.add_argument('--board', required=True, metavar='SPEC',
                         help='the board: chessboard:9x6:25mm (inner corners)')
     parser.add_argument('--target', choices=('board', 'cube', 'room'), default='board',
                         help='one board, or six: on the faces of a cube, on the walls of a room')
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
-                        help='folder for the photographs, observations.csv (the true corners) and '
-                        'poses.csv')
+                        help='folder for the photographs (of a rig a folder for each camera), '
+                        'observations.csv (the true corners) and poses.csv')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help="poses of the camera in the frame of the board, or of the target's "
-                        'middle; at random by default')
+                        help="poses of the camera, of a rig the first one, in the frame of the "
+                        "board, or of the target's middle; at random by default")
     parser.add_argument('--count', type=int, default=30, metavar='N',
                         help='how many photographs from random poses (30)')
     parser.add_argument('--ranges', type=float, nargs=2, default=(0.12, 0.35), metavar='M',
@@ -62,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
         raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
                              'finite')
-    lens, rng = load_with_notes(lens_path(args.lens)), np.random.default_rng(args.seed)
+    cameras, rng = _cameras(args.lens), np.random.default_rng(args.seed)
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     if args.bow:
         printed = Print(pattern.columns, pattern.rows, pattern.size,
@@ -70,18 +77,45 @@ def run(args: argparse.Namespace) -> None:
     boards = TARGETS.get(args.target, board)(printed)
     if args.poses:
         poses = read_poses(args.poses).pose
-    elif len(boards) > 1:
-        poses = target_views(lens, args.target, boards, args.count, tuple(args.ranges), rng)
     else:
-        poses = board_views(lens, printed, args.count, tuple(args.ranges), rng)
+        poses = _random_poses(cameras, boards, args, rng)
     with together():
-        write_photographs(lens, boards, poses, Exposure(blur=args.blur, noise=args.noise),
-                          args.seed, args.output, args.output)
-    others = len(list(args.output.glob('*.png'))) - len(poses.position)
+        count = write_photographs(cameras, boards, poses,
+                                  Exposure(blur=args.blur, noise=args.noise), args.seed,
+                                  args.output, args.output)
+    others = sum(len(list((args.output / name).glob('*.png'))) for name in cameras) - count
     if others:
         say(f'{args.output}: {others} other photographs are in it, too; `detect` takes them all')
-    print(f'{args.output}: {len(poses.position)} photographs, observations.csv with their true '
-          'corners, poses.csv')
+    print(f'{args.output}: {count} photographs, observations.csv with their true corners, '
+          'poses.csv')
+
+
+def _cameras(given: str) -> Cameras:
+    """Return lens and place of each camera, the first being that of the poses."""
+    path = lens_path(given)
+    names = cameras_in(path)
+    rigs = rigs_of_lenses(path) if names else ()
+    if len(rigs) + 1 != len(names):
+        return {'': (load_with_notes(path), identity())}
+    places = cameras_in_first(rigs)
+    return {name: (load_with_notes(f'{path}#{name}'), places.take(i))
+            for i, name in enumerate(names)}
+
+
+def _random_poses(
+    cameras: Cameras, boards: tuple[Placed, ...], args: argparse.Namespace,
+    rng: np.random.Generator,
+) -> Pose:
+    """Return poses (P,) of the first camera; the cameras of a rig look at the target in turn."""
+    poses = identity(args.count)
+    for number, (lens, place) in enumerate(cameras.values()):
+        mine = np.arange(number, args.count, len(cameras))
+        if len(boards) > 1:
+            own = target_views(lens, args.target, boards, len(mine), tuple(args.ranges), rng)
+        else:
+            own = board_views(lens, boards[0].printed, len(mine), tuple(args.ranges), rng)
+        poses.put(mine, own.compose(place.inverse().broadcast_to(len(mine))))
+    return poses
 
 
 def parabola(corners: Array, height: float) -> Field:
@@ -93,24 +127,35 @@ def parabola(corners: Array, height: float) -> Field:
 
 
 def write_photographs(
-    lens: Lens, boards: tuple[Placed, ...], poses: Pose, exposure: Exposure, seed: int,
+    cameras: Cameras, boards: tuple[Placed, ...], poses: Pose, exposure: Exposure, seed: int,
     folder: Path, truth: Path,
-) -> None:
-    """Write a photograph a pose (P,); the true corners, observations.csv, poses.csv to `truth`."""
-    count = len(poses.position)
+) -> int:
+    """Write photographs from poses (P,) of the first camera, and the truth; return how many.
+
+    Of a rig each camera has a folder; one that sees nothing of the target takes no photograph.
+    truth: folder for the true corners, observations.csv, and poses.csv.
+    """
+    count, taken = len(poses.position), 0
     uv: list[Array] = []
     seen: list[Array] = []
-    with progress('rendering', count) as done:
-        for number in range(count):
-            rng, pose = np.random.default_rng([seed, number]), poses.take(number)
-            image = render(lens, boards, pose, exposure, rng)
-            write_bytes(folder / f'{number:03d}.png', cv2.imencode('.png', image)[1].tobytes())
+    with progress('rendering', count * len(cameras)) as done:
+        for number, (camera, (name, (lens, place))) in itertools.product(
+                range(count), enumerate(cameras.items())):
+            pose = poses.take(number).compose(place)
             for kept, part in zip((uv, seen), visible(lens, boards, pose), strict=True):
                 kept.append(part)
+            if seen[-1].any() or len(cameras) == 1:
+                rng = np.random.default_rng([seed, number, *([camera] if camera else [])])
+                image = render(lens, boards, pose, exposure, rng)
+                write_bytes(folder / name / f'{number:03d}.png',
+                            cv2.imencode('.png', image)[1].tobytes())
+                taken += 1
             done()
-    frame, board, corner = np.nonzero(seen)
+    view, board, corner = np.nonzero(seen)
+    frame, camera_of = np.divmod(view, len(cameras))
     points = np.stack([one.pose.transform(one.printed.corners) for one in boards])
     write_observations(truth / 'observations.csv', make_observations(
-        frame, board * points.shape[1] + corner, np.stack(uv)[frame, board, corner],
-        points[board, corner], board=board))
+        frame, board * points.shape[1] + corner, np.stack(uv)[view, board, corner],
+        points[board, corner], board=board, camera=camera_of, cameras=tuple(cameras)))
     write_poses(truth / 'poses.csv', np.arange(count), poses)
+    return taken

@@ -60,8 +60,14 @@ def rig_of_lenses(path: str | Path) -> Pose | None:
 
     The first camera in the second one.  Raises LensError for a file that cannot be read.
     """
+    rigs = rigs_of_lenses(path)
+    return rigs[0] if len(rigs) == 1 else None
+
+
+def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
+    """Return each camera in the next one, as a file or folder of lenses holds them, if it does."""
     if Path(path).is_dir():
         file = Path(path) / 'rig.yaml'
-        return load_rig(file) if file.exists() else None
+        return load_rigs(file) if file.exists() else ()
     foreign = read_lens_file(path)
-    return foreign.rigs[0] if foreign and len(foreign.rigs) == 1 else None
+    return foreign.rigs if foreign else ()

@@ -242,3 +242,22 @@ class TestLensForOneViewpoint:
         said = refused(capsys, 'lens', lens, '-o', tmp_path / 'x', '--format', 'ros',
                        '--range', -1)
         assert "range is -1 m; lens 'small' needs more than" in said
+
+
+def test_a_rendered_rig_has_its_truth(folder: Path, tmp_path: Path) -> None:
+    """Each camera sees the corners from where the rig file says that it stands."""
+    assert cli.main(['render', '--lens', f'{folder / "lenses"}/', '--board', 'chessboard:6x5:30mm',
+                     '--count', '3', '--ranges', '0.15', '0.2', '-o', str(tmp_path)]) == 0
+    table, poses_of = fsvp.read_observations(tmp_path / 'observations.csv'), fsvp.read_poses(
+        tmp_path / 'poses.csv')
+    assert table.cameras == ('left', 'right') and len(poses_of.pose.position) == 3
+    both = {'left': (LENS, Pose(np.eye(3), np.zeros(3))), 'right': (RIGHT, RIG.inverse())}
+    for number, (name, (lens, place)) in enumerate(both.items()):
+        mine = table.take(table.camera == number)
+        camera = poses_of.pose.take(mine.frame).compose(place.broadcast_to(len(mine)))
+        seen = fsvp.project(lens, camera.inverse().transform(mine.xyz)).uv
+        assert np.abs(seen - mine.uv).max() < 1e-5
+        assert {path.name for path in (tmp_path / name).iterdir()} == {
+            f'{frame:03d}.png' for frame in np.unique(mine.frame)}
+    run(f'{folder / "lenses"}/', tmp_path, '-o', tmp_path / 'out', '--range', 0.2)
+    assert (tmp_path / 'out' / 'pair.png').exists()
