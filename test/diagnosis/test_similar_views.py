@@ -95,7 +95,8 @@ def test_each_view_is_predicted_from_the_others_of_its_landmark():
         expected = process.variance * kernel[landmark][np.ix_(mine, others)] @ np.linalg.solve(
             covariance[np.ix_(others, others)], told)
         np.testing.assert_allclose(
-            process.own[left, int(known.key[landmark, 1])], expected[0], rtol=1e-6, atol=1e-9)
+            process.cross_predictions[left, int(known.key[landmark, 1])], expected[0],
+            rtol=1e-6, atol=1e-9)
 
 
 def test_what_was_fitted_is_predicted_at_the_same_views():

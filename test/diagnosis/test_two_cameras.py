@@ -102,7 +102,8 @@ def test_a_calibrated_rig_leaves_out_frames_that_contradict_it(tmp_path, capsys)
     assert cli.main([*words, 'left=1280x960']) == 2
     assert 'add --image-size right=1280x800' in capsys.readouterr().err
     assert cli.main([*words, 'left=1280x960,right=1024x768', '-o', str(tmp_path / 'rig')]) == 0
-    assert f'frames {one}, {other} are left out' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f'frames {one} and {other}: its cameras contradict each other' in said
     assert [load_lens(tmp_path / 'rig' / f'{name}.yaml').width for name in ('left', 'right')] == [
         1280, 1024]
     place = load_rig(tmp_path / 'rig' / 'rig.yaml').position
