@@ -14,7 +14,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import LocalizedSpread, localize_environments
+from fisheye_svp_ros.paper.lens_evaluation import LocalizedSpread, localize_environments
 from fisheye_svp_ros.paper.studies import NAMES
 from fisheye_svp_ros.paper.tables import LOCALIZATION
 from fisheye_svp_ros.pose import Pose

@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import LocalizedSpread, localize_spreads
+from fisheye_svp_ros.paper.lens_evaluation import LocalizedSpread, localize_spreads
 from fisheye_svp_ros.paper.tables import LENSES, LOCALIZATION, OUT_OF_LINE
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views

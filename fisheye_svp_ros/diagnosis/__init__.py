@@ -24,7 +24,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 from fisheye_svp_ros.diagnosis.diagnosis import (
     Diagnosis,
     Figures,
-    Record,
+    SearchRecord,
     diagnose,
     diagnose_against,
 )
@@ -78,7 +78,7 @@ __all__ = [
     'NullModel',
     'PredictedOffsets',
     'Problem',
-    'Record',
+    'SearchRecord',
     'Selection',
     'SharedParameter',
     'Structure',

@@ -64,7 +64,7 @@ class Figures(NamedTuple):
     gain: Comparison
 
 
-class Record(NamedTuple):
+class SearchRecord(NamedTuple):
     """What else was tried: steps, what could not be tested and why, outliers, cross-checks.
 
     cameras: what each two cameras of a rig say of each other; against: what another data set says.
@@ -91,7 +91,7 @@ class Diagnosis:
     remaining: list[Structure]
     advice: list[Advice]
     lenses: dict[str, Lens]
-    record: Record
+    record: SearchRecord
 
     @property
     def problem(self) -> Problem:
@@ -340,7 +340,7 @@ def _conclude(evaluation: Evaluation, cameras: list[TwoCameras]) -> Diagnosis:
                 evaluation.gain),
         components, causes, _remaining(evaluation, noise_causes, significant),
         advise(evaluation, causes, significant), lenses,
-        Record(list(selection.trace), EffectTests(selection.first).untestable,
+        SearchRecord(list(selection.trace), EffectTests(selection.first).untestable,
                _outliers(evaluation), cameras))
 
 

@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
     NAMES,
-    Grid,
+    ImageGrid,
     RandomEffects,
     make_random_effects,
 )
@@ -76,7 +76,7 @@ class PredictedOffsets(NamedTuple):
 
     landmark: Index
     offset: Array
-    grids: tuple[tuple[Grid, Array], ...]
+    grids: tuple[tuple[ImageGrid, Array], ...]
     views: RepeatedErrors | None = None
 
     @property

@@ -37,7 +37,7 @@ _MIN_LANDMARKS = 12
 MILLIMETRE = 1e-3  # unit of offsets on the target
 
 
-class Grid(NamedTuple):
+class ImageGrid(NamedTuple):
     """Bumps over the image of one camera: component, camera, centres (K, 2) and pitch, px."""
 
     name: str
@@ -63,7 +63,7 @@ class RandomEffects(NamedTuple):
 
     columns: RandomColumns
     landmark: Index
-    grids: tuple[Grid, ...]
+    grids: tuple[ImageGrid, ...]
     fields: tuple[BoardField, ...]
     axes: Array
 
@@ -294,7 +294,9 @@ def _bend_columns(points: GatheredPoints) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _image_grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, sparse.csr_array]]:
+def _image_grids(
+    points: GatheredPoints, finest: bool
+) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
     """Yield bumps over the image that all frames share, camera by camera, coarse to fine.
 
     Each grid with its values (F N, K) at the points.
@@ -312,12 +314,12 @@ def _image_grids(points: GatheredPoints, finest: bool) -> Iterator[tuple[Grid, s
             seen = np.asarray(bumps.sum(axis=0)) > 4.0
             # A grid finer than the points is noise by another name.
             if seen.any() and mine.sum() >= fewest * seen.sum():
-                yield Grid(name, camera, centres[seen], pitch), bumps[:, seen]
+                yield ImageGrid(name, camera, centres[seen], pitch), bumps[:, seen]
 
 
 def _complete_grids(
     points: GatheredPoints, finest: float
-) -> Iterator[tuple[Grid, sparse.csr_array]]:
+) -> Iterator[tuple[ImageGrid, sparse.csr_array]]:
     """Yield the bumps wherever there are points; finest: pitch of the finest grid, px, or NaN."""
     for camera, (low, high) in enumerate(points.extents):
         mine = points.used & (points.camera == camera)
@@ -325,7 +327,7 @@ def _complete_grids(
             pitch = finest if name == 'image_finest' else float((high - low).max()) / most
             if np.isfinite(pitch):
                 centres = _cover_points(points, mine, pitch)
-                yield (Grid(name, camera, centres, pitch),
+                yield (ImageGrid(name, camera, centres, pitch),
                        bump_values(points.uv, mine, centres, pitch))
 
 

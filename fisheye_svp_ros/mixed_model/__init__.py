@@ -4,20 +4,14 @@ In: y, fixed columns X, random columns Z (by group, by unit, shared; a component
 whitened.  Out: variances (REML), log-likelihood, score tests of added columns, BLUPs and their
 covariance, leave-one-group-out predictions.  It knows no camera, board, lens or pixel.
 
-    columns      X and Z, and their products
-    equations    Henderson's mixed-model equations, factored block by block
-    solution     estimates and predictions, their covariance, groups left out in turn
-    reml         variances by restricted maximum likelihood (average information)
-    components   which variances the data call for, and their p-values
-    score_tests  Rao's score test of added fixed columns, on one information matrix
+    model_columns  X and Z, and their products
+    equations      Henderson's mixed-model equations, factored block by block
+    solution       estimates and predictions, their covariance, groups left out in turn
+    reml           variances by restricted maximum likelihood (average information)
+    components     which variances the data call for, and their p-values
+    score_tests    Rao's score test of added fixed columns, on one information matrix
 """
 
-from fisheye_svp_ros.mixed_model.columns import (
-    Components,
-    RandomColumns,
-    multiply_rows,
-    predict_rows,
-)
 from fisheye_svp_ros.mixed_model.components import (
     component_p_values,
     component_traces,
@@ -31,6 +25,12 @@ from fisheye_svp_ros.mixed_model.equations import (
     factor_equations,
     make_equations,
     solve_lower,
+)
+from fisheye_svp_ros.mixed_model.model_columns import (
+    Components,
+    RandomColumns,
+    multiply_rows,
+    predict_rows,
 )
 from fisheye_svp_ros.mixed_model.reml import (
     LAMBDA_ABSENT,

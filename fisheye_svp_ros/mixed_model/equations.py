@@ -20,7 +20,7 @@ import numpy as np
 from scipy import linalg
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.mixed_model.columns import (
+from fisheye_svp_ros.mixed_model.model_columns import (
     Blocks,
     Components,
     RandomColumns,

@@ -18,7 +18,6 @@ import numpy as np
 from scipy import linalg
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.mixed_model.columns import RandomColumns
 from fisheye_svp_ros.mixed_model.equations import (
     Equations,
     FactoredEquations,
@@ -26,6 +25,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     solve_lower,
     solve_upper,
 )
+from fisheye_svp_ros.mixed_model.model_columns import RandomColumns
 
 
 class Posterior(NamedTuple):

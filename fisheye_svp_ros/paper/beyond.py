@@ -11,8 +11,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.evaluation import (
-    Evaluation,
+from fisheye_svp_ros.paper.lens_evaluation import (
+    LensEvaluation,
     evaluate,
     landmarks_at,
     localize_environments,
@@ -107,7 +107,7 @@ VARIANTS: dict[str, Callable[[Lens], Lens]] = {
 }
 
 
-def evaluate_variant(lens: Lens, variant: str) -> Evaluation:
+def evaluate_variant(lens: Lens, variant: str) -> LensEvaluation:
     """Evaluate a lens with the solver that a variant believes in."""
     return evaluate(lens, VARIANTS[variant](lens))
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
-from fisheye_svp_ros.paper.evaluation import Evaluation, shift_at
+from fisheye_svp_ros.paper.lens_evaluation import LensEvaluation, shift_at
 from fisheye_svp_ros.paper.tables import ERROR2_RANGE, ERROR3_RANGE, LENSES, NAMES
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 
@@ -33,7 +33,7 @@ class Claim(NamedTuple):
     numbers: dict[str, float]
 
 
-def claims(found: Mapping[str, Evaluation]) -> list[Claim]:
+def claims(found: Mapping[str, LensEvaluation]) -> list[Claim]:
     """Check every statement on the evaluations of both lenses with the SVP solver."""
     pair = [found[name] for name in LENSES]
     return [
@@ -47,7 +47,7 @@ def _verdict(*holds: bool | Mask) -> str:
     return HOLDS if flat.all() else IN_PART if flat.any() else FAILS
 
 
-def _localization_bounds(one: Evaluation) -> Iterator[Claim]:
+def _localization_bounds(one: LensEvaluation) -> Iterator[Claim]:
     lens, table = one.lens.name, one.localization
     name = NAMES[lens]
     worst = float(np.abs(table[..., :2]).max())
@@ -73,7 +73,7 @@ def _localization_bounds(one: Evaluation) -> Iterator[Claim]:
     )
 
 
-def _localization(one: Evaluation, other: Evaluation) -> Iterator[Claim]:
+def _localization(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     z = [found.localization[..., _Z] for found in (one, other)]
     size = [float(np.abs(values).mean()) for values in z]
     spans = [
@@ -118,7 +118,7 @@ def _localization(one: Evaluation, other: Evaluation) -> Iterator[Claim]:
     )
 
 
-def _calibration(one: Evaluation, other: Evaluation) -> Iterator[Claim]:
+def _calibration(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     position = [np.linalg.norm(f.calibration[..., :3], axis=-1) for f in (one, other)]
     axis = [found.calibration[..., _AXIS] for found in (one, other)]
     worst, worst_axis = float(position[0].max()), float(axis[0].max())
@@ -136,7 +136,7 @@ def _calibration(one: Evaluation, other: Evaluation) -> Iterator[Claim]:
     )
 
 
-def _stereo(one: Evaluation, other: Evaluation) -> Iterator[Claim]:
+def _stereo(one: LensEvaluation, other: LensEvaluation) -> Iterator[Claim]:
     # Lens, radius, style.
     error2, largest, error3 = (
         np.stack([found.panels(name).reshape(3, 3) for found in (one, other)])

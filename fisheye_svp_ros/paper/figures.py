@@ -14,8 +14,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.beyond import NOISES, Crossings
-from fisheye_svp_ros.paper.evaluation import (
-    Evaluation,
+from fisheye_svp_ros.paper.lens_evaluation import (
+    LensEvaluation,
     LocalizedSpread,
     Measurement,
     landmarks_at,
@@ -39,7 +39,7 @@ _INK = '#404850'
 _LINES = ('-', '--', ':')
 # Views of the paper's world: axes that run to the right and up, and their names.
 _VIEWS = (((0, 1), 'x / m', 'y / m'), ((0, 2), 'x / m', 'z / m'))
-_SUMMARIES: dict[str, Callable[[Evaluation], float]] = {
+_SUMMARIES: dict[str, Callable[[LensEvaluation], float]] = {
     'Localization: mean |z| / mm': lambda e: float(np.abs(e.localization[..., 2]).mean()),
     'Stereo calibration:\nmean position error / mm':
         lambda e: float(np.linalg.norm(e.calibration[..., :3], axis=-1).mean()),
@@ -81,7 +81,7 @@ def draw_height(path: Path, lenses: dict[str, Lens]) -> None:
         axis.legend(loc='center left')
 
 
-def draw_localization(path: Path, found: dict[str, Evaluation]) -> None:
+def draw_localization(path: Path, found: dict[str, LensEvaluation]) -> None:
     """Figure 6: two views of every environment, and the residuals of both lenses, x 100."""
     rows = [(radius, spread) for radius in range(len(RADII)) for spread in range(len(SPREADS))]
     with picture(path, 10.5, 2.5 * len(rows)) as figure:
@@ -139,7 +139,7 @@ def draw_calibration_poses(path: Path) -> None:
         legend_below(figure, axis)
 
 
-def draw_stereo(path: Path, found: Evaluation, panels: list[Panel]) -> None:
+def draw_stereo(path: Path, found: LensEvaluation, panels: list[Panel]) -> None:
     """Nine rows: left image with epipolar curves and vertical errors; two views of 3-D points."""
     with picture(path, 9.6, 3.2 * len(panels)) as figure:
         axes = _fixed_grid(figure, len(panels), 3)
@@ -157,7 +157,7 @@ def draw_stereo(path: Path, found: Evaluation, panels: list[Panel]) -> None:
             'points in space', fontsize=10, y=0.998)
 
 
-def draw_solvers(path: Path, found: Mapping[str, Mapping[str, Evaluation]]) -> None:
+def draw_solvers(path: Path, found: Mapping[str, Mapping[str, LensEvaluation]]) -> None:
     """Draw mean errors of all solvers, a line a solver, a mark a lens."""
     place = np.arange(len(found))[::-1]
     with picture(path, 11.0, 4.2) as figure:
@@ -259,7 +259,7 @@ def _caption(panel: Panel) -> str:
             f'{panel.published_error3:.2f} mm')
 
 
-def _draw_left_image(axis: Any, found: Evaluation, measured: Measurement, style: str) -> None:
+def _draw_left_image(axis: Any, found: LensEvaluation, measured: Measurement, style: str) -> None:
     lens = found.lens
     _draw_image_frame(axis, lens)
     both = np.isfinite(measured.distance)

@@ -14,7 +14,7 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.paper.beyond import NOISES, VARIANTS, Crossings, crossings, evaluate_variant
 from fisheye_svp_ros.paper.claims import Claim, claims
-from fisheye_svp_ros.paper.evaluation import Evaluation, captions_of
+from fisheye_svp_ros.paper.lens_evaluation import LensEvaluation, captions_of
 from fisheye_svp_ros.paper.studies import Family, Stopping, load_family, load_stopping
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,
@@ -53,14 +53,14 @@ class Results(NamedTuple):
     """found: evaluations by variant and lens; family, stopping: results of longer studies."""
 
     lenses: dict[str, Lens]
-    found: dict[str, dict[str, Evaluation]]
+    found: dict[str, dict[str, LensEvaluation]]
     claims: list[Claim]
     crossings: list[Crossings]
     family: Family
     stopping: Stopping
 
     @property
-    def svp(self) -> dict[str, Evaluation]:
+    def svp(self) -> dict[str, LensEvaluation]:
         """The paper's own evaluation, by lens."""
         return self.found[SVP]
 
@@ -145,7 +145,7 @@ def tasks() -> int:
     return len(LENSES) * (len(VARIANTS) + 1)
 
 
-def _panels(found: Evaluation) -> list[Panel]:
+def _panels(found: LensEvaluation) -> list[Panel]:
     error2, error3 = found.panels('error2_px'), 1e3 * found.panels('error3_m')
     vertical, points = found.panels('error2_vertical_px'), found.panels('points')
     captions = captions_of(found.lens.name, error2, error3)

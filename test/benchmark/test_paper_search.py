@@ -16,7 +16,7 @@ from benchmark.paper.writing import (
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import lens_from_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.paper.evaluation import localize_spreads
+from fisheye_svp_ros.paper.lens_evaluation import localize_spreads
 from fisheye_svp_ros.paper.studies import load_family, load_stopping, shift_curves
 from fisheye_svp_ros.paper.tables import (
     CALIBRATION,

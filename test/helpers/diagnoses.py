@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
-from fisheye_svp_ros.diagnosis import Figures, Record
+from fisheye_svp_ros.diagnosis import Figures, SearchRecord
 
 
 def with_changes(found, **changes):
     """Return a diagnosis with other fields, those of its figures and its record among them."""
     figures = {name: changes.pop(name) for name in Figures._fields if name in changes}
-    record = {name: changes.pop(name) for name in Record._fields if name in changes}
+    record = {name: changes.pop(name) for name in SearchRecord._fields if name in changes}
     return replace(found, figures=found.figures._replace(**figures),
                    record=found.record._replace(**record), **changes)

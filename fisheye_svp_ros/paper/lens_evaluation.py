@@ -54,7 +54,7 @@ class Measurement(NamedTuple):
     metrics: dict[str, float]
 
 
-class Evaluation(NamedTuple):
+class LensEvaluation(NamedTuple):
     """All of the paper's numbers for one lens and one solver.
 
     localization, calibration (3 radii, 3 spreads or styles, 5): tables 1 and 3, or 2 and 4;
@@ -90,10 +90,10 @@ def _directions(spread: str) -> Array:
     return environment(spread, 1.0).points
 
 
-def evaluate(lens: Lens, solver: Lens | None = None) -> Evaluation:
+def evaluate(lens: Lens, solver: Lens | None = None) -> LensEvaluation:
     """Evaluate a lens with a solver that believes another one, by default the SVP lens."""
     localized = localize_spreads(lens, solver)
-    return Evaluation(
+    return LensEvaluation(
         lens,
         np.stack([spread.rows for spread in localized], axis=1),
         calibrate_rigs(lens, solver)[0],
