@@ -31,6 +31,7 @@ from fisheye_svp_ros.scene.photograph_names import photograph_names
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
     from fisheye_svp_ros.planning.plan import NextViews
+    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs
     from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 
@@ -116,7 +117,7 @@ def run(args: argparse.Namespace) -> None:
             progress('report', 0.9)
             with together():
                 _write(args, diagnosis, known, bool(names), wanted)
-    _print(diagnosis, known, args.output, wanted)
+    _print(diagnosis, known, args, wanted)
     if impossible is not None:
         raise impossible
 
@@ -159,45 +160,43 @@ def _read(
 
 
 def _print(
-    diagnosis: Diagnosis, known: Mapping[str, Comparison], folder: Path | None,
+    diagnosis: Diagnosis, known: Mapping[str, Comparison], args: argparse.Namespace,
     wanted: NextViews | None,
 ) -> None:
-    from fisheye_svp_ros.reporting import diagnosis_text as text
+    """Print what the first screen of the report says, and the photographs to take next."""
     from fisheye_svp_ros.reporting import external_text, shot_list
-    from fisheye_svp_ros.reporting.headline import headline
-    from fisheye_svp_ros.reporting.tables import print_paragraphs, print_table
+    from fisheye_svp_ros.reporting.diagnosis_report import command_to_go_on
+    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
+    from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+    from fisheye_svp_ros.reporting.tables import print_lines, print_table
 
-    external = external_text.sections(diagnosis)
-    print_paragraphs(headline(diagnosis), [
-        *text.verdict_sentences(diagnosis, known), *(one.sentence for one in external)
-    ])
-    print_table(
-        'variance budget', text.BUDGET_HEADER, text.budget_rows(diagnosis), words=text.BUDGET_WORDS
-    )
-    if diagnosis.causes:
-        print_table(
-            f'{diagnosis.observations} points in {diagnosis.frames} frames, held-out rms '
-            f'{diagnosis.figures.base.heldout_rms_px:.4f} px without any cause',
-            text.CAUSE_HEADER, text.cause_rows(diagnosis), words=text.CAUSE_WORDS,
-        )
-    for one in external:
-        if one.carried:
-            print_table(one.title, external_text.CARRIED_HEADER, one.carried,
-                        words=external_text.CARRIED_WORDS)
+    command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.intrinsics)))
+    print_lines([
+        *terminal_lines(first_screen(diagnosis, args.observations, known),
+                        command if args.output else ''),
+        *(one.sentence for one in external_text.sections(diagnosis))])
     if wanted:
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)
-    if folder:
-        lenses = [str(Path(camera) / text.EXTENDED) for camera in diagnosis.lenses]
+    if args.output:
+        lenses = [str(Path(camera) / EXTENDED) for camera in diagnosis.lenses]
         files = ', '.join([*lenses, *(['rig.yaml'] if diagnosis.rig else [])])
-        print(f'{folder}: report.html, diagnosis.json, {files}, residuals.csv')
+        print(f'{args.output}: report.html, diagnosis.json, {files}, residuals.csv')
+
+
+def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
+    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs
+
+    return ReportInputs(
+        args.observations, tuple(args.lens), args.poses, args.held_out, args.output or Path(),
+        free, search_options(args) if args.board else ())
 
 
 def _write(
     args: argparse.Namespace, diagnosis: Diagnosis, known: Mapping[str, Comparison], free: bool,
     wanted: NextViews | None,
 ) -> None:
-    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs, write_report
+    from fisheye_svp_ros.reporting.diagnosis_report import write_report
     from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
     from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
@@ -213,10 +212,7 @@ def _write(
         cameras, rig = diagnosis.rig
         save_rig(rig, folder / 'rig.yaml', cameras)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.model.data.observations)
-    write_report(diagnosis, points, known, ReportInputs(
-        args.observations, ' '.join(args.lens), args.poses, args.held_out, folder, free,
-        search_options(args) if args.board else (),
-    ), wanted)
+    write_report(diagnosis, points, known, _inputs(args, free), wanted)
 
 
 def _write_residuals(path: Path, points: PointResiduals, table: Observations) -> None:

@@ -11,7 +11,7 @@
 Other rooms import what stands here, and nothing else.
 """
 
-from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, Advice
+from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, USE_EXTENDED, Advice
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
@@ -21,6 +21,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     compare_errors,
     predict_other_data,
 )
+from fisheye_svp_ros.diagnosis.decision import Decision
 from fisheye_svp_ros.diagnosis.diagnosis import (
     Diagnosis,
     Figures,
@@ -58,10 +59,12 @@ __all__ = [
     'NAMES',
     'SIGNIFICANCE',
     'STAGE_OF',
+    'USE_EXTENDED',
     'Advice',
     'Cause',
     'Comparison',
     'Component',
+    'Decision',
     'Diagnosis',
     'DiagnosisOptions',
     'EffectTests',

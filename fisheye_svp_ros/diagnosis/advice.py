@@ -19,6 +19,8 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 
 DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
                 'that: the lens was off in air')
+USE_EXTENDED = 'solve with the extended lens file'
+RETAKE, UNLIKE = 'retake', 'unlike'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
 
@@ -27,7 +29,8 @@ _MAX_LISTED = 8
 class Advice:
     """One thing to do: what, to which frames, landmarks and boards; gain: of held-out misfit.
 
-    photographs: the files of the frames, as far as they are known.
+    photographs: the files of the frames, as far as they are known; kind: RETAKE, or UNLIKE where
+    the other frames do not predict these.
     """
 
     what: str
@@ -36,6 +39,7 @@ class Advice:
     landmarks: list[int] = field(default_factory=list)
     boards: list[int] = field(default_factory=list)
     gain: float = 0.0
+    kind: str = ''
 
 
 def advise(
@@ -67,7 +71,7 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
     gains, advice = evaluation.gains, []
     stages = {cause.effect_class.budget_stage() for cause in causes}
     if 'lens' in stages and gains['lens'].value > 0:
-        advice.append(Advice('solve with the extended lens file', gain=gains['lens'].value))
+        advice.append(Advice(USE_EXTENDED, gain=gains['lens'].value))
     target = gains['named'].value - max(gains['lens'].value, 0.0)
     if 'target' in stages and target > 0:
         boards = sorted({board for cause in causes if cause.effect_class.budget_stage() == 'target'
@@ -91,7 +95,7 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
             evaluation.null.linear.data.observations,
             'take more photographs like these: the others do not predict them, since they '
             'alone show some of the image, or since something is wrong with them; the '
-            'held-out rms is that of the others', alone.tolist())] if len(alone) else []
+            'held-out rms is that of the others', alone.tolist(), UNLIKE)] if len(alone) else []
     table = test.data.observations
     advice = _check_photographs(table, test.outliers, 'held-out ')
     if test.another_target:
@@ -166,7 +170,7 @@ def _retake_frames(evaluation: Evaluation) -> list[Advice]:
         advice.append(_about_frames(
             evaluation.null.linear.data.observations,
             'take these photographs again: they scatter more than the others',
-            [int(numbers[i]) for i in order],
+            [int(numbers[i]) for i in order], RETAKE,
         ))
     return advice
 
@@ -182,16 +186,19 @@ def _check_photographs(table: Observations, outliers: Outliers, where: str = '')
     off = {reason: sorted({int(table.frame[row]) for row, why in
                            zip(outliers.rows, outliers.why, strict=True) if why == reason})
            for reason in (VIEW, FRAME)}
-    return [_about_frames(table, f'look at these {where}photographs: {reason}', frames)
+    return [_about_frames(table, f'look at these {where}photographs: {reason}', frames,
+                          '' if where else RETAKE)
             for reason, frames in off.items() if frames]
 
 
-def _about_frames(table: Observations, what: str, frames: list[int]) -> Advice:
+def _about_frames(
+    table: Observations, what: str, frames: list[int], kind: str = ''
+) -> Advice:
     """Return what to do about frames of a table, with the photographs that they are."""
     known = {frame for frame, _, _ in table.photographs}
     names = [name for frame in dict.fromkeys(frames) if frame in known
              for name in frame_names(table, frame)]
-    return Advice(what, frames=frames, photographs=names)
+    return Advice(what, frames=frames, photographs=names, kind=kind)
 
 
 def _shared_frames(table: Observations) -> list[int]:

@@ -56,18 +56,22 @@ def selected_causes(
     causes = []
     for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
         name = effect.name
-        parameters = {
-            p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
-            for p, v, e in zip(
-                effect.parameters, effect.reported(values), errors[columns], strict=True)
-        }
+        parameters = parameters_of(effect, values, errors[columns])
         causes.append(Cause(
             name, effect.key, parameters,
             tests.test_removal(tests.null.included_columns, columns, effect).p_value,
             shares[name], _survives(tests, effect, columns), rms, gain,
-            _confounded_effects(tests, name, columns), effect.to_separate,
+            confounded_effects(tests, name, columns), effect.to_separate,
         ))
     return causes
+
+
+def parameters_of(effect: Effect, values: Array, errors: Array) -> dict[str, dict[str, Any]]:
+    """Return value, standard error and unit of each parameter (P,) of an effect, by name."""
+    return {
+        p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
+        for p, v, e in zip(effect.parameters, effect.reported(values), errors, strict=True)
+    }
 
 
 def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
@@ -82,7 +86,7 @@ def _survives(tests: EffectTests, effect: Effect, columns: Index) -> bool:
     return True
 
 
-def _confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
+def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[str]:
     """Return the effects with which in the model this one would no longer be needed."""
     if CATALOGUE[name].asked_last:
         return []

@@ -91,11 +91,15 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
 
 def held_out_gain(before: HeldOut, after: HeldOut, noise: float) -> Comparison:
     """Return 1 - (held-out misfit above noise after) / (before), with a bootstrap interval."""
-    rows = _resample_frames(len(before.squares))
-    low, high = np.quantile(_excess_gain(before, after, noise, rows), (0.025, 0.975))
+    low, high = np.quantile(bootstrap_gains(before, after, noise), (0.025, 0.975))
     whole = np.arange(len(before.squares))[None]
     value = float(_excess_gain(before, after, noise, whole)[0])
     return Comparison(before.rms, after.rms, value, float(low), float(high))
+
+
+def bootstrap_gains(before: HeldOut, after: HeldOut, noise: float) -> Array:
+    """Return gains (B,) of frames drawn with replacement, the same draws every time."""
+    return _excess_gain(before, after, noise, _resample_frames(len(before.squares)))
 
 
 def compare_errors(base: Array, extended: Array) -> Comparison:
@@ -134,7 +138,7 @@ def predict_other_data(
         data = replace(data, views=data.views._replace(uv=data.views.uv - repeating))
         fitted = adjust_poses(data, fitted)
     linear = Linearization(data, fitted, ())
-    return _sum_squares(linear, linear.residual)
+    return sum_squares(linear, linear.residual)
 
 
 def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str]) -> RigState:
@@ -143,7 +147,7 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
     By one linear step; where that is too long to be linear, step by step.
     """
     linear = null.linear
-    kept, change, _ = _refit_shared(null, null.information, names, ())
+    kept, change, _ = refit_shared(null, null.information, names, ())
     shared = np.zeros(null.column_count)
     shared[kept] = change
     moves = (linear.shared_columns @ shared)[linear.row_mask] / linear.row_weight[linear.row_mask]
@@ -154,7 +158,7 @@ def fit_without_causes(null: NullModel, names: Sequence[str], free: Sequence[str
     return linear.state.retract(free, frame, shared).without_effects(names)
 
 
-def _refit_shared(
+def refit_shared(
     null: NullModel, information: Array, names: Collection[str], held: Collection[str]
 ) -> tuple[Index, Array, Array]:
     """Return the columns that are fitted, their change, and (m,) what is left.
@@ -191,7 +195,7 @@ def cross_validate(
     without: causes that are left out; offsets: random effects to predict, each frame's from the
     others; held: causes that are not fitted anew.
     """
-    linear, ratio = null.linear, _noise_ratio(null.linear)
+    linear, ratio = null.linear, noise_ratio(null.linear)
     residual = np.zeros_like(linear.residual)
     repeating = np.zeros_like(residual)
     if offsets is not None and offsets.views is not None:
@@ -199,23 +203,24 @@ def cross_validate(
         repeating = linear.data.blocks(offsets.views.cross_predictions * weight)
     at = null.columns_and_residual(null.included_columns)
     for frame, information in enumerate(null.information_without_frames(at)):
-        _, _, combination = _refit_shared(null, information, without, held)
+        _, _, combination = refit_shared(null, information, without, held)
         rows = null.fixed.border if offsets is None else null.leave_one_out.rows
         left, poses = rows[frame][:, at] @ combination * ratio[frame], linear.frame_columns[frame]
         left -= repeating[frame]
         poses = poses * ratio[frame][:, None]
         residual[frame] = left - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ left)
-    return _sum_squares(linear, residual / ratio)
+    return sum_squares(linear, residual / ratio)
 
 
-def _noise_ratio(linear: Linearization) -> Array:
+def noise_ratio(linear: Linearization) -> Array:
     """Return what takes the weights (F, M) of uneven noise out of whitened rows."""
     weight = linear.data.blocks(linear.data.views.weight[..., None] * np.ones(2))
     own = linear.row_weight
     return np.where(own > 0, weight / np.maximum(own, 1e-300), 1.0)
 
 
-def _sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
+def sum_squares(linear: Linearization, whitened: Array) -> HeldOut:
+    """Return the figures of whitened residuals (F, M)."""
     weight = linear.row_weight
     px = np.where(weight > 0, whitened / np.maximum(weight, 1e-12), 0.0)
     return HeldOut((px**2).sum(axis=1), (weight > 0).sum(axis=1) / 2)

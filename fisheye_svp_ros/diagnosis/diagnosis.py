@@ -20,7 +20,10 @@ from fisheye_svp_ros.diagnosis.checks.two_datasets import (
     TwoDatasets,
     compare_datasets,
 )
+from fisheye_svp_ros.diagnosis.conclusion import Conclusion, advice_on_lens, conclude
+from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause, confirm
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison
+from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
@@ -44,6 +47,7 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.scene.photograph_names import photograph_names
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
@@ -92,6 +96,7 @@ class Diagnosis:
     advice: list[Advice]
     lenses: dict[str, Lens]
     record: SearchRecord
+    conclusion: Conclusion
 
     @property
     def problem(self) -> Problem:
@@ -101,9 +106,26 @@ class Diagnosis:
     @property
     def verdict(self) -> str:
         """Whether the simulation is adequate, (partly) explained or unexplained."""
-        if self.causes:
+        if self.causes or self.decision['lens'].say == 'recalibrate':
             return 'partly_explained' if self.remaining else 'explained'
-        return 'unexplained' if self.remaining else 'adequate'
+        # Local offsets of the target alone leave the simulation of the lens adequate.
+        rest = {one.variable for one in self.remaining} - {'landmark'}
+        return 'unexplained' if rest else 'adequate'
+
+    @property
+    def decision(self) -> dict[str, Decision]:
+        """What to do about lens, target and photographs."""
+        return self.conclusion.decision
+
+    @property
+    def candidates(self) -> list[UnconfirmedCause]:
+        """Effects that are significant, and not confirmed."""
+        return self.conclusion.candidates
+
+    @property
+    def file(self) -> FileFigure:
+        """What the lens file is worth."""
+        return self.conclusion.file
 
     @property
     def noise_px(self) -> float:
@@ -152,8 +174,8 @@ class Diagnosis:
 
     @property
     def model(self) -> Linearization:
-        """The extended model, for whoever draws it."""
-        return self.evaluation.null.linear
+        """The extended model without random effects, for whoever draws it."""
+        return self.evaluation.fixed_model
 
     @property
     def errors(self) -> ModelErrors:
@@ -223,8 +245,13 @@ class Diagnosis:
             'components': [part._asdict() for part in self.components],
             'causes': [asdict(cause) for cause in self.causes],
             'named': entry(self.figures.named),
-            'lens': entry(self.figures.lens_only),
+            'lens': entry(self.figures.lens_only) | {
+                'ray_error_mrad': self.conclusion.ray_error_mrad()},
             'extended': entry(self.figures.extended),
+            **self.conclusion.to_dict(),
+            'photographs': [
+                {'frame': frame, 'camera': camera, 'name': name}
+                for (frame, camera), name in photograph_names(self.problem.observations).items()],
             'gross': self.gross,
             'advice': [asdict(advice) for advice in self.advice],
             'remaining': {'structure': [s._asdict() for s in self.remaining]},
@@ -315,12 +342,14 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
         selection = select_causes(behind_port(problem, medium), progress)
     selection, cameras = agree_on_target(selection, progress)
     progress('measuring the gain on held-out data', 0.8)
-    fitted = FittedModel.solve_null_model(selection.null)
-    evaluation = Evaluation.of_selection(selection, fitted, medium)
-    return _conclude(evaluation, cameras)
+    evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
+        one, FittedModel.solve_null_model(one.null), medium))
+    return _conclude(evaluation, candidates, cameras)
 
 
-def _conclude(evaluation: Evaluation, cameras: list[TwoCameras]) -> Diagnosis:
+def _conclude(
+    evaluation: Evaluation, candidates: list[UnconfirmedCause], cameras: list[TwoCameras]
+) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
     selection, linear = evaluation.selection, evaluation.null.linear
     problem, observations = selection.problem, selection.problem.observations
@@ -329,19 +358,26 @@ def _conclude(evaluation: Evaluation, cameras: list[TwoCameras]) -> Diagnosis:
     components = evaluation.components({c.effect: c.p_value for c in noise_causes})
     causes = evaluation.causes(components) + noise_causes
     significant = significant_components(components)
+
+    def lenses_of(state: RigState) -> dict[str, Lens]:
+        return extended_lenses(problem.inputs.lenses, state, observations)
+
     lenses = with_uncertainty(
         evaluation.model_errors, linear, evaluation.noise_px,
-        evaluation.uncertainty['image_px']['misfit'],
-        lambda state: extended_lenses(problem.inputs.lenses, state, observations))
+        evaluation.uncertainty['image_px']['misfit'], lenses_of)
+    advice = advise(evaluation, causes, significant)
+    conclusion = conclude(
+        evaluation, causes, components, advice, candidates, problem.inputs.lenses, lenses_of,
+        any(pair.verdict == 'contradict' for pair in cameras))
     return Diagnosis(
         evaluation,
         Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,
                 evaluation.extended_quality,
                 evaluation.gain),
         components, causes, _remaining(evaluation, noise_causes, significant),
-        advise(evaluation, causes, significant), lenses,
+        advice_on_lens(advice, conclusion), lenses,
         SearchRecord(list(selection.trace), EffectTests(selection.first).untestable,
-               _outliers(evaluation), cameras))
+                     _outliers(evaluation), cameras), conclusion)
 
 
 def _outliers(evaluation: Evaluation) -> list[dict[str, Any]]:

@@ -38,10 +38,11 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     variance_budget,
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import is_another_target
-from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
 from fisheye_svp_ros.solve.rig_checks import has_no_rig, rig_differs, unpair_cameras
@@ -52,6 +53,8 @@ from fisheye_svp_ros.solve.rig_state import (
     group_by_frame,
     rms_px,
 )
+
+_SAME_RMS = 1 - 1e-9  # rounding
 
 
 @dataclass(frozen=True)
@@ -176,7 +179,7 @@ class Evaluation:
     @cached_property
     def uncertainty(self) -> dict[str, dict[str, float]]:
         """How far off poses and image points are by the extended model: a summary."""
-        return self.model_errors.summary(self.null.linear)
+        return self.model_errors.summary(self.fixed_model)
 
     @cached_property
     def errors(self) -> Array:
@@ -257,17 +260,46 @@ class Evaluation:
         return self.selection.problem.linear if self.medium is None else self.medium.air
 
     @cached_property
+    def fixed_model(self) -> Linearization:
+        """The causes without random effects: poses, which these had moved, are fitted anew."""
+        linear = self.null.linear
+        if linear.data.poses is not None:
+            return linear
+        return Linearization(linear.data, adjust_poses(linear.data, linear.state), linear.free)
+
+    @property
+    def falling(self) -> bool:
+        """Whether the rms of the fitted frames falls from base to named to extended."""
+        sizes = [self.base_quality.rms_px, self.named_quality.rms_px, self.extended_quality.rms_px]
+        return all(one >= _SAME_RMS * other for one, other in pairwise(sizes))
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (K, K) of what is shared, with its standard errors (`errors`)."""
+        own = self.null.included_columns
+        inverse, _ = pseudo_inverse(self.null.information[np.ix_(own, own)], 1e-13)
+        scale = self.null.scale[own]
+        known = np.sqrt(np.diag(inverse)) / scale
+        larger = np.nan_to_num(self.errors) / np.maximum(known, 1e-300)
+        larger = np.where(known > 0, np.maximum(larger, 1.0), 0.0) / scale
+        return np.asarray(inverse * np.outer(larger, larger))
+
+    @cached_property
     def base_quality(self) -> FitQuality:
         """The simulation as it was fitted."""
         linear, full = self.simulation, self.null.full
         freedom = full.rows - full.group_rank - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
-        return FitQuality(rms_px(linear), self._given_prediction.rms, chi2)
+        # Of the points that the causes were fitted to: figures before and after are comparable.
+        views = self.fixed_model.data.views
+        squares = ((views.uv - linear.linear.uv) ** 2).sum(axis=-1)[views.used]
+        return FitQuality(
+            float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
 
     @cached_property
     def named_quality(self) -> FitQuality:
         """All causes, without random effects."""
-        return FitQuality(rms_px(self.null.linear), self._cause_predictions[-1].rms)
+        return FitQuality(rms_px(self.fixed_model), self._cause_predictions[-1].rms)
 
     @cached_property
     def lens_quality(self) -> FitQuality:

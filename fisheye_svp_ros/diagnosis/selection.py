@@ -16,15 +16,18 @@ import numpy as np
 from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
 from fisheye_svp_ros.diagnosis.null_model import (
+    FINEST_FIELD,
     NullModel,
     PlacedEffect,
     with_ordinary_landmarks,
 )
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
+from fisheye_svp_ros.diagnosis.random_effects import NAMES
 from fisheye_svp_ros.diagnosis.stepwise import (
     TraceStep,
     add_effects,
@@ -238,6 +241,17 @@ def _finish(
             search, state=_change_state(null, included, gone, ()), variances=null.variances,
             trace=(*search.trace, *steps))
         null = search.estimate_null_model(problem)
+
+
+def without_cause(selection: Selection, name: str) -> Selection:
+    """Return a selection without one of its causes: fitted, and its variances found, anew."""
+    null, problem = selection.null, selection.problem
+    free, left_out = problem.free, problem.options.left_out
+    data, finest = null.linear.data, bool(null.variances.alive[NAMES.index(FINEST_FIELD)])
+    state = fit_without_causes(null, [name], free)
+    null = NullModel.estimate(data, state, free, null.variances, left_out, finest)
+    state = refit(data, state, free, null.variances)
+    return replace(selection, null=null.relinearize(data, state, free, left_out, finest))
 
 
 def _known_effects(problem: Problem) -> tuple[str, ...]:

@@ -24,16 +24,23 @@ from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
+from fisheye_svp_ros.nodes.set_collection import (
+    CollectedSet,
+    collected_set,
+    is_repeated,
+    scenario_of,
+    table_of,
+)
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import posable_observations
 from fisheye_svp_ros.study.settings import RigSettings
 
 T = TypeVar('T')
 
+_ALARMING = {'recalibrate', 'use_extended', 'retake'}  # decisions that warn
 _MOST = 24  # parameters of a cause that are worth a topic each
 
 
@@ -86,6 +93,8 @@ class ModelCritic(SolverNode):
         self._question = 0
         self._frames: dict[int, CollectedSet] = {}
         self._new = 0
+        self._repeated = 0
+        self._announced: tuple[str, ...] = ()
         self._judged = False
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
@@ -123,9 +132,12 @@ class ModelCritic(SolverNode):
         self.lens(stamp, items)  # raises where nobody names one
         scenario = scenario_of(items)
         if scenario != self._scenario:
-            self._scenario, self._frames = scenario, {}
+            self._scenario, self._frames, self._repeated = scenario, {}, 0
             self._ask_anew()
         self._latest = stamp, items
+        if is_repeated(seen, list(self._frames.values())):
+            self._repeated += 1
+            return
         self._new += stamp not in self._frames
         self._frames[stamp] = seen
         for old in list(self._frames)[: -self.settings.max_frames]:
@@ -169,26 +181,42 @@ class ModelCritic(SolverNode):
             if name not in self._metrics:
                 self._metrics[name] = self.announce(Float64, f'~/metrics/{name}', LATCHED)
             self._metrics[name].publish(messages.number_message(value))
-        self.get_logger().info(' '.join(verdict_sentences(found)))
+        said = tuple(one.say for one in found.decision.values())
+        if said != self._announced:
+            self._announced = said
+            self.get_logger().info(' '.join(_lines(found)))
         self._result.publish(self._verdict_message(found, done.stamp, numbers))
         self._publish_diagnostics()
 
     def _verdict_message(
         self, found: Diagnosis, stamp: int, numbers: Mapping[str, float]
     ) -> Any:
-        words = {'verdict': found.verdict, 'causes': ' '.join(c.effect for c in found.causes)}
+        words = {'verdict': found.verdict, 'causes': ' '.join(c.effect for c in found.causes),
+                 'candidates': ' '.join(c.effect for c in found.candidates), **decisions(found)}
         return messages.key_values_message(
             f'{self.get_fully_qualified_name()}: verdict', {**words, **numbers}, stamp,
-            ' '.join(verdict_sentences(found)),
-            DiagnosticStatus.OK if found.verdict == 'adequate' else DiagnosticStatus.WARN,
+            ' '.join(_lines(found)),
+            DiagnosticStatus.WARN if _ALARMING & {one.say for one in found.decision.values()}
+            else DiagnosticStatus.OK,
         )
 
     def _publish_diagnostics(self) -> None:
         super()._publish_diagnostics()
+        if self._repeated and len(self._frames) < self.settings.min_frames:
+            self._publish_too_few()
         if self._verdict is not None:
             now = self.get_clock().now().nanoseconds
             numbers = figures(self._verdict)
             self._diagnostics.publish(self._verdict_message(self._verdict, now, numbers))
+
+    def _publish_too_few(self) -> None:
+        views = {'views': len(self._frames), 'repeated': self._repeated,
+                 'min_frames': self.settings.min_frames}
+        self._diagnostics.publish(messages.key_values_message(
+            f'{self.get_fully_qualified_name()}: views', views,
+            self.get_clock().now().nanoseconds,
+            f'too few different views: {views["views"]} of {views["min_frames"]}, '
+            f'{self._repeated} repeated; move the camera or the target', DiagnosticStatus.WARN))
 
     def _write_extended_lens(self, request: Any, response: Any) -> Any:
         response.success = False
@@ -211,6 +239,26 @@ def judge(table: Observations, lens: Lens, free_intrinsics: bool) -> Diagnosis:
     """Diagnose the frames that can be posed; raise FisheyeSvpError where none can."""
     usable, _ = posable_observations(table, lens)
     return diagnose(usable, lens, free_intrinsics=free_intrinsics)
+
+
+def _lines(found: Diagnosis) -> list[str]:
+    """Return the first screen of a report as sentences."""
+    return [line.rstrip('.') + '.' for line in terminal_lines(
+        first_screen(found, 'image_points'), '')]
+
+
+def decisions(found: Diagnosis) -> dict[str, object]:
+    """Return what to do about lens, target and photographs, each with its figure, and bounds."""
+    words: dict[str, object] = {}
+    for name, one in found.decision.items():
+        unit = _suffix(one.figure.unit)
+        words |= {f'decision_{name}': one.say, f'decision_{name}_why': one.why,
+                  f'decision_{name}_{one.figure.name}{unit}': one.figure.value}
+        if one.confidence is not None:
+            words[f'decision_{name}_confidence'] = one.confidence
+        words |= {f'bound_{bound.effect}{_suffix(bound.unit)}': bound.value
+                  for bound in one.bound}
+    return words
 
 
 def figures(found: Diagnosis) -> dict[str, float]:

@@ -12,6 +12,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes.solver import Items, known_points
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
+_STILL = 1.0  # px: what image points of a still camera move by at most
 # What tells the sets of one scenario from each other; all else tells scenarios apart.
 _WITHIN_SCENARIO = ('set', 'frame')
 
@@ -41,6 +42,27 @@ def collected_set(
         np.concatenate([known_points(landmarks, seen) for seen in sets]),
         np.repeat(np.arange(len(sets)), [len(seen.landmark) for seen in sets]),
     )
+
+
+def is_repeated(seen: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
+    """Say whether a set is no new view.
+
+    It is the last one again, the camera having stood still, or an earlier one to the last digit.
+    """
+    if not earlier:
+        return False
+    copies = any(np.array_equal(seen.landmark, one.landmark) and np.array_equal(seen.uv, one.uv)
+                 for one in earlier)
+    return copies or _median_move(seen, earlier[-1]) < _STILL
+
+
+def _median_move(one: CollectedSet, other: CollectedSet) -> float:
+    """Return how far, px, the image points that two sets share moved; infinite for none."""
+    mine, theirs = (2 ** 32 * seen.camera + seen.landmark for seen in (one, other))
+    _, mine, theirs = np.intersect1d(mine, theirs, return_indices=True)
+    if not len(mine):
+        return float('inf')
+    return float(np.median(np.linalg.norm(one.uv[mine] - other.uv[theirs], axis=1)))
 
 
 def table_of(window: Sequence[CollectedSet], cameras: Sequence[str]) -> Observations:

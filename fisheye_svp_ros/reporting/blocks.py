@@ -78,4 +78,9 @@ def data_uri(path: Path) -> str:
 
 def png_uri(data: bytes) -> str:
     """Return a PNG picture as part of a page."""
-    return 'data:image/png;base64,' + base64.b64encode(data).decode('ascii')
+    return image_uri(data, 'png')
+
+
+def image_uri(data: bytes, form: str) -> str:
+    """Return a picture as part of a page; form: png, jpeg."""
+    return f'data:image/{form};base64,' + base64.b64encode(data).decode('ascii')

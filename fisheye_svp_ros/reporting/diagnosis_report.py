@@ -19,7 +19,8 @@ from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
-from fisheye_svp_ros.reporting.headline import headline
+from fisheye_svp_ros.reporting.first_screen import first_screen, next_command
+from fisheye_svp_ros.reporting.headline import VERDICTS
 from fisheye_svp_ros.reporting.outlier_rows import outlier_rows
 from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
@@ -55,7 +56,7 @@ class ReportInputs(NamedTuple):
     """
 
     observations: str
-    lens: str
+    lens: tuple[str, ...]
     poses: str | None
     held_out: str | None
     folder: Path
@@ -83,7 +84,8 @@ def write_report(
     report = inputs.folder / 'report.html'
     write_text(report, page(
         'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED_P,
-        headline=headline(diagnosis),
+        screen=first_screen(diagnosis, inputs.observations, known),
+        command=command_to_go_on(diagnosis, inputs), verdict=VERDICTS[diagnosis.verdict],
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
                   **{p.stem: data_uri(p) for p in pictures}},
@@ -95,6 +97,13 @@ def write_report(
         extended=_extended(diagnosis, inputs),
     ))
     return [report, *pictures]
+
+
+def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
+    """Return the command to go on with, as a shell takes it."""
+    words = _extended(diagnosis, inputs)
+    lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
+    return next_command(diagnosis, words['observations'], words['options'], lenses)
 
 
 def _extended(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:

@@ -8,12 +8,27 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis import DIAGNOSE_AIR, Advice, Cause, Comparison, Diagnosis
+from fisheye_svp_ros.diagnosis import (
+    DIAGNOSE_AIR,
+    USE_EXTENDED,
+    Advice,
+    Cause,
+    Comparison,
+    Diagnosis,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.reporting.headline import only_gross
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
 
 EXTENDED = 'extended_lens.yaml'
+LENS = {
+    'keep': 'Keep the lens',
+    'use_extended': f'Use {EXTENDED}',
+    'recalibrate': f'Do not use the lens as given: calibrate again, or use {EXTENDED}',
+    'undecided': 'Do not decide on the lens yet',
+}
+_OF_RIG = {'keep': 'Keep the lenses', 'undecided': 'Do not decide on the lenses yet',
+           'recalibrate': 'Do not use these lenses as given: calibrate again, or use the extended '
+           'lenses', 'use_extended': 'Use the extended lenses'}
 VARIABLES = {
     'image': 'the place in the image',
     'theta': 'the incidence angle',
@@ -68,9 +83,18 @@ _NAMED = 3  # causes that one sentence can bear
 _UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
 _NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
 _MOST = 6  # names in one sentence
-_ELSEWHERE = 6.0  # standard errors by which the intrinsics given are not those of the data
 _ABOVE = 1.5  # times the noise, from which an error is more than that
 _FEW = 4  # parameters that are read one by one
+
+
+def lens_words(d: Diagnosis) -> str:
+    """Return what to do about the lens, or the lenses of several cameras."""
+    return (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
+
+
+def only_gross(d: Diagnosis) -> bool:
+    """Say whether all that remains is points that were rejected, by name."""
+    return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
 
 
 def what(effect: str) -> str:
@@ -172,7 +196,7 @@ def verdict_sentences(
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if d.verdict == 'adequate':
-        but = [what for what, told in (('the intrinsics as given', _elsewhere(d)),
+        but = [what for what, told in (('the intrinsics as given', _is_off(d)),
                                        ('where the cameras stand', _loose(d))) if told]
         nothing = f'Nothing but {listed(but)}' if but else 'Nothing'
         return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
@@ -224,7 +248,7 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
                 'predict others; --next N says which are wanted')
         if d.causes:
             why = 'the cause is in the table of image points, not in the lens'
-        which = 'The lens, fitted to these data,' if _elsewhere(d) else 'The lens as it is'
+        which = 'The lens, fitted to these data,' if _is_off(d) else 'The lens as it is'
         return f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}.'
     if named >= before:
         return (f'Held-out data do not bear it out: {named:.3g} px rms instead of {before:.3g}; '
@@ -235,11 +259,9 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         value, low, high = map(percent, d.figures.gain.interval.values())
         text += (f', which takes away {value} (95 % interval {low} to {high}) of the error above '
                  'the noise')
-    lens = d.figures.lens_only.heldout_rms_px
     if 'target' in {c.effect_class.budget_stage() for c in moving}:
-        better = lens < before
-        text += (f'; the lens alone, on the target as it is said to be, '
-                 f'{"reaches" if better else "does not help:"} {lens:.3g} px')
+        text += (f'; on the same corrected target {EXTENDED} leaves {d.file.extended_px:.3g} px, '
+                 f'the lens as given {d.file.given_px:.3g} px')
     for (label, base, extended, _), compared in zip(
         known_rows(known), known.values(), strict=True
     ):
@@ -249,20 +271,9 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     return text + '.'
 
 
-def _elsewhere(d: Diagnosis) -> str:
-    """Return that the lens was given other intrinsics than the data have; empty if it was not."""
-    # What is wrong besides moves one of the two: the fit without causes, or the one with them.
-    off = {name: min(abs(value.given - found) / math.hypot(value.given_stderr, error)
-                     for found, error in ((value.before, value.before_stderr),
-                                          (value.after, value.after_stderr)))
-           for name, value in d.intrinsics.items()
-           if min(value.before_stderr, value.after_stderr) > 0}
-    names = [name for name in off if off[name] > _ELSEWHERE]
-    if not names:
-        return ''
-    return (f'Take {EXTENDED}, not the lens as given: {listed(names[:_MOST])} there '
-            f'{"are" if len(names) > 1 else "is"} up to {max(off.values()):.0f} standard errors '
-            'off what these data say (another focus, day or camera?)')
+def _is_off(d: Diagnosis) -> bool:
+    """Say whether the lens as given is another one than the data show."""
+    return d.decision['lens'].say == 'recalibrate'
 
 
 def _loose(d: Diagnosis) -> list[str]:
@@ -273,26 +284,24 @@ def _loose(d: Diagnosis) -> list[str]:
 
 
 def _next(d: Diagnosis) -> str:
-    elsewhere = _elsewhere(d)
+    lens = lens_words(d)
     if d.verdict == 'adequate':
         blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
-        return '; '.join([elsewhere or 'Keep the lens as it is', *_loose(d)]) + f'{blind}.'
-    steps = [*([elsewhere] if elsewhere else []), *_loose(d)]
-    if not d.causes and not steps and only_gross(d):
-        steps.append('keep the lens as it is')
+        return '; '.join([lens, *_loose(d)]) + f'{blind}.'
+    steps = [lens, *_loose(d)]
     steps += [
         f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
         'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
         'it until then' for pair in d.cameras if pair.verdict == 'contradict'
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
-    steps += [advice_text(one) for one in d.advice if one.gain > 0][:_NAMED]
+    steps += [advice_text(one) for one in d.advice
+              if one.gain > 0 and one.what != USE_EXTENDED][:_NAMED]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
             if c.effect_class.budget_stage() == 'frame' and c.effect in d.lens.corrections]
-    refuted = d.figures.named.heldout_rms_px >= d.figures.base.heldout_rms_px
-    if held and not refuted and f'solve with {EXTENDED}' not in steps:
-        steps.append(f'solve with {EXTENDED}, which holds {listed(held)}')
+    if held and d.decision['lens'].say == 'use_extended':
+        steps.append(f'it holds {listed(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
@@ -304,8 +313,7 @@ def _next(d: Diagnosis) -> str:
         steps += filter(None, (CATALOGUE[name].when_untestable for name in d.untestable))
     if d.remaining:
         steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
-    text = '; '.join(steps) or 'keep the lens as it is'
-    return text[0].upper() + text[1:] + '.'
+    return '; '.join(dict.fromkeys(steps)) + '.'
 
 
 def advice_text(advice: Advice) -> str:

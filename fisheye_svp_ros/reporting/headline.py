@@ -1,28 +1,83 @@
-"""The verdict of a diagnosis in one line."""
+"""A diagnosis in one line: the largest cause, and what to do about the lens."""
 
 from __future__ import annotations
 
-from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED, lens_words, only_gross, size, what
 
 VERDICTS = {
-    'adequate': 'Adequate: the simulation describes these data',
-    'explained': 'Explained: what is wrong has a name',
-    'partly_explained': 'Partly explained: something remains without a name',
-    'unexplained': 'Unexplained: something is wrong that no effect accounts for',
+    'adequate': 'Adequate: the simulation of the lens describes these data',
+    'explained': 'Explained: the model error is identified',
+    'partly_explained': 'Partly explained: some of the residual error is unexplained',
+    'unexplained': 'Unexplained: no effect of the catalogue accounts for the residual error',
+}
+TARGET = {
+    'keep': 'Keep the target',
+    'correct': f'Correct it by {EXTENDED} (this target alone), or flatten or replace it',
+    'measure_again': 'Measure the board, flatten or replace it',
+}
+PHOTOGRAPHS = {
+    'enough': 'Enough photographs', 'more': 'Take more photographs',
+    'retake': 'Take photographs again',
+}
+_SHORT = {
+    'viewpoint_shift': 'The viewpoint of the lens moves',
+    'radial_profile': 'The image-height curve of the lens is another one',
+    'focal_length': 'The focal length is wrong',
+    'principal_point': 'The principal point is wrong',
+    'aspect': 'The aspect of the pixels is wrong',
+    'skew': 'The image axes are not at right angles',
+    'decentering': 'The lens is decentered',
+    'sensor_tilt': 'The sensor is tilted',
+    'flat_port': 'The camera looks through a port',
+    'focal_drift': 'The focal length drifts',
+    'session_step': 'The intrinsics jump between groups of frames',
+    'landmark_survey': 'Single landmarks are not where they are said to be',
+    'landmark_scale': 'The target is stretched or of another size',
+    'board_pose': 'The boards stand otherwise than said',
+    'rolling_shutter': 'Rows are exposed one after the other',
+    'rig_flex': 'The rig bends',
 }
 
 
 def headline(d: Diagnosis) -> str:
-    """Return the verdict; points that are set aside and nothing else are no riddle."""
-    if not only_gross(d):
-        return VERDICTS[d.verdict]
-    count = len(d.gross)
-    rest = f'{count} points lie far off' if count > 1 else 'a point lies far off'
+    """Return the largest cause and the decision about the lens."""
+    return f'{largest_cause(d)}. {lens_words(d)}.'
+
+
+def largest_cause(d: Diagnosis) -> str:
+    """Return the cause of the largest share of the variance, or what stands in its place."""
     if d.causes:
-        return f'Partly explained: {rest}, all else that is wrong has a name'
-    return f'Unexplained: {rest}, and these data show nothing else wrong'
+        return _sentence(d, max(d.causes, key=lambda cause: (cause.share, -cause.p_value)))
+    if d.decision['lens'].say == 'recalibrate':
+        return _capital(d.decision['lens'].why)
+    if only_gross(d):
+        count = len(d.gross)
+        return (f'{count} image points are outliers; nothing else is wrong' if count > 1 else
+                'An image point is an outlier; nothing else is wrong')
+    if d.decision['target'].say == 'measure_again' or (
+            d.verdict == 'adequate' and d.decision['target'].figure.value > 0):
+        sound = 'Lens sound, target imperfect' if d.verdict == 'adequate' else 'Target imperfect'
+        return f'{sound}: {d.decision["target"].why}'
+    if d.verdict == 'adequate':
+        return 'No model error shows in these data'
+    return 'The residual error has no cause that the catalogue holds'
 
 
-def only_gross(d: Diagnosis) -> bool:
-    """Say whether all that remains is points that were set aside, by name."""
-    return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
+def _sentence(d: Diagnosis, cause: Cause) -> str:
+    """Return a cause as a sentence, its size in it."""
+    if cause.effect == 'target_shape':
+        worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
+        which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'
+        return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
+    words = _SHORT.get(cause.effect, _capital(what(cause.effect)))
+    how = size(d, cause).partition(', ')[0]
+    return f'{words} ({how})' if how else words
+
+
+def _boards(d: Diagnosis) -> set[int]:
+    return {*d.problem.observations.board.tolist()}
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -47,13 +47,13 @@ def print_table(
     out.print(table, crop=False, overflow='ignore')
 
 
-def print_paragraphs(title: str, texts: Iterable[str]) -> None:
-    """Print a title and numbered paragraphs below it."""
+def print_lines(lines: Iterable[str]) -> None:
+    """Print sentences, the first as a title, those that are too long for a line hanging."""
     out = console()
+    title, *rest = lines
     out.print(title)
-    for number, text in enumerate(texts, start=1):
-        out.print(Padding(f'{number}. {text}', (0, 2)))
-    out.print()
+    for line in rest:
+        out.print(Padding(line, (0, 0, 0, 2)))
 
 
 def console() -> Console:

@@ -24,7 +24,6 @@ from fisheye_svp_ros.rectify.errors import (
 )
 from fisheye_svp_ros.rectify.maps import Rectification
 from fisheye_svp_ros.rectify.stereo import RectifiedPair
-from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 from fisheye_svp_ros.reporting.tables import print_table, range_text
 
 _LINES = 16  # across a drawn pair
@@ -110,6 +109,8 @@ def remaining_document(left: Remaining) -> dict[str, Any]:
 
 def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) -> None:
     """Draw the errors over the range, and over the image where the table has the largest."""
+    from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture  # not for --help
+
     with picture(path, 10.0, 4.0) as figure:
         curve, image = figure.subplots(1, 2)
         near = np.isfinite(left.curve_ranges)

@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.lens import Lens
 
 RANGES = (0.3, 1.0, 5.0)  # m
 _STEP = 1e-3  # of a standard error
-_SAMPLES = 400
+_SAMPLES = 1000
 _POINTS = 300  # image points that stand for all
 
 
@@ -27,6 +27,11 @@ class RayError(NamedTuple):
     value: float
     low: float
     high: float
+
+    def in_mrad(self) -> dict[str, float]:
+        """Return the numbers by name, angles in mrad."""
+        return {'range_m': self.range_m, 'value': 1e3 * self.value, 'low': 1e3 * self.low,
+                'high': 1e3 * self.high}
 
 
 class RayModel(NamedTuple):
@@ -52,17 +57,20 @@ class RayModel(NamedTuple):
 
         difference (R, G, 3), rad: of a lens to this one; None for this lens itself.
         """
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
-        rng = np.random.default_rng(0)
-        drawn = root @ rng.standard_normal((len(root), _SAMPLES))
-        off = self.columns @ drawn
+        off = self.sample()
         if difference is not None:
             off = off + difference[..., None]
         rms = np.sqrt((off**2).sum(axis=2).mean(axis=1))
         return [RayError(range_m, float(np.sqrt((one**2).mean())),
                          *(float(q) for q in np.quantile(one, (0.025, 0.975))))
                 for range_m, one in zip(RANGES, rms, strict=True)]
+
+    def sample(self, seed: int = 0) -> Array:
+        """Return errors (R, G, 3, samples), rad, as the covariance of the parameters has them."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        normal = np.random.default_rng(seed).standard_normal((len(root), _SAMPLES))
+        return np.asarray(self.columns @ (root @ normal))
 
 
 def typical_points(uv: Array) -> Array:
@@ -92,7 +100,9 @@ def ray_model(
         one, other = (points_on_rays(lens_of(sign * step), uv) for sign in (1, -1))
         there &= np.isfinite(one).all(axis=(0, 2)) & np.isfinite(other).all(axis=(0, 2))
         sides.append((one - other) / (2 * step[k]))
-    columns = np.stack([without_motion(base[:, there], side[:, there]) for side in sides], axis=-1)
+    columns = np.zeros((*base[:, there].shape, count))
+    for k, side in enumerate(sides):
+        columns[..., k] = without_motion(base[:, there], side[:, there])
     return RayModel(base[:, there], columns, covariance), np.asarray(there)
 
 

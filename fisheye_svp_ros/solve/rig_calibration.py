@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError
@@ -126,6 +125,8 @@ def _with_lenses(
         if 'covariance' in stated and 'stderr' in stated:
             free += [f'{name}.{parameter}' for parameter in stated['stderr']]
             parts.append(np.array(stated['covariance'], dtype=float))
+    from scipy.linalg import block_diag  # not while --help waits
+
     stated_by_all = block_diag(*parts) if parts else np.zeros((0, 0))
     return Linearization(linear.data, linear.state, free), sigma, stated_by_all
 

@@ -1,0 +1,250 @@
+"""What to do about lens, target and photographs, each judged by itself, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from math import erf
+from typing import Any, Literal, NamedTuple
+
+LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
+TargetAnswer = Literal['keep', 'correct', 'measure_again']
+PhotographsAnswer = Literal['enough', 'more', 'retake']
+
+_OFF_P = 0.02  # of the ray error by what is stated: below, the lens is another one
+_OFF_PX = 0.2  # of the noise: a difference that matters
+_HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
+_ENOUGH = 8  # frames
+_MANY = 0.1  # of the frames
+
+
+class Figure(NamedTuple):
+    """The number behind a decision."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Bound:
+    """The largest size of an effect that these data do not exclude (95 %).
+
+    z: the estimate over its standard error; edge_px, edge_mrad: what that size costs at the edge
+    of what was photographed, poses fitted anew.
+    """
+
+    effect: str
+    value: float
+    unit: str
+    z: float
+    edge_px: float
+    edge_mrad: float
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One answer: what to do, why, the figure behind it; confidence: 0 to 1, if measured."""
+
+    say: str
+    why: str
+    figure: Figure
+    confidence: float | None
+    bound: list[Bound] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        found = asdict(self) | {'figure': self.figure._asdict()}
+        if not self.bound:
+            del found['bound']
+        return found
+
+
+class LensOffset(NamedTuple):
+    """How far the lens as given is off what the data say.
+
+    mrad: rms of the rays at 1 m, of the fit with causes or of that without, whichever is nearer;
+    expected: what the stated errors and those of the fit let expect, p_value: of so much by them;
+    px: mrad in the image; stated: whether the lens file states errors.
+    """
+
+    mrad: float
+    expected: float
+    p_value: float
+    px: float
+    stated: bool = True
+
+    @property
+    def ratio(self) -> float:
+        """Times the expected one."""
+        return self.mrad / max(self.expected, 1e-9)
+
+    def matters(self, noise_px: float) -> bool:
+        """Say whether the lens is another one; of a lens without errors only what costs counts."""
+        least = _OFF_PX if self.stated else 1.0
+        return self.p_value < _OFF_P and self.px > least * noise_px
+
+
+class FileFigure(NamedTuple):
+    """Held-out rms, px, with the lens as given and the extended lens, the same target in both.
+
+    gain, low, high: of the error above noise, with its 95 % interval; sure: how often it is above
+    zero in the bootstrap over frames.
+    """
+
+    given_px: float
+    extended_px: float
+    gain: float
+    low: float
+    high: float
+    sure: float
+
+
+class LensFacts(NamedTuple):
+    """What the lens is judged by.
+
+    lens_causes, causes: confirmed ones of the lens, and all that move predictions; named_gain:
+    value, low of what all causes gain held out; offset: None where intrinsics were not fitted;
+    refitted: intrinsics that only a change of the lens explains, confirmed as causes;
+    falling: whether no error rises with the causes on the fitted frames.
+    """
+
+    lens_causes: Sequence[str]
+    causes: Sequence[str]
+    named_gain: tuple[float, float]
+    file: FileFigure
+    offset: LensOffset | None
+    refitted: Sequence[str]
+    bounds: list[Bound]
+    noise_px: float
+    falling: bool
+
+
+def decide_lens(facts: LensFacts) -> Decision:
+    """Return what to do about the lens."""
+    file, bounds = facts.file, facts.bounds
+    gained = Figure('file_gain', file.gain, '1')
+    if not facts.falling:
+        return Decision('undecided', 'the error on the fitted frames rises with the causes in the '
+                        'model, so that nothing is recommended', gained, 0.0, bounds)
+    if (off := facts.offset) is not None and off.matters(facts.noise_px):
+        return Decision(
+            'recalibrate', f'the lens as given is off by {off.mrad:.2g} mrad ({off.px:.2g} px), '
+            f'{off.ratio:.1f} times its expected error',
+            Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
+    if facts.refitted:
+        names = ', '.join(facts.refitted)
+        return Decision('recalibrate', f'{names} of the lens as given is wrong', gained, file.sure)
+    if facts.causes and file.low > 0 and facts.named_gain[0] > 0:
+        return Decision(
+            'use_extended', f'on held-out frames it leaves {file.extended_px:.3g} px, the lens as '
+            f'given {file.given_px:.3g} px, on the same target', gained, file.sure)
+    hint = max((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
+               key=lambda one: one.edge_px, default=None)
+    if facts.causes and file.high < 0 < facts.named_gain[1]:
+        why = ('all causes together predict held-out frames better, the extended lens alone worse '
+               f'({file.extended_px:.3g} px, as given {file.given_px:.3g} px)')
+        return Decision('undecided', why, gained, 1 - file.sure, bounds)
+    if facts.lens_causes:
+        names = ', '.join(facts.lens_causes)
+        return Decision(
+            'undecided', f'{names} is confirmed, but the extended lens does not '
+            f'predict held-out frames better beyond chance ({file.extended_px:.3g} px, as '
+            f'given {file.given_px:.3g} px)', gained, file.sure, bounds)
+    if hint is not None:
+        sure = erf(hint.z / 2**0.5)
+        return Decision(
+            'undecided', f'{hint.effect} is likely but not confirmed: it may cost up to '
+            f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
+    return Decision('keep', _kept(bounds, off), gained, 0.95, bounds)
+
+
+def _kept(bounds: Sequence[Bound], off: LensOffset | None) -> str:
+    worst = max(bounds, key=lambda one: one.edge_px, default=None)
+    cost = '' if worst is None else (
+        f'; what these data do not exclude costs at most {worst.edge_px:.2g} px '
+        f'({worst.edge_mrad:.2g} mrad) at the edge')
+    fit = '' if off is None else ' and its parameters agree with these data within their errors'
+    return f'no cause in the lens is confirmed{fit}{cost}'
+
+
+class TargetFacts(NamedTuple):
+    """What the target is judged by.
+
+    causes: confirmed ones of the target; size: of the largest, in words; gain, low: what they take
+    away of the held-out error above noise, and the low end of that; named_px, local_px, noise_px:
+    standard deviations of a coordinate by causes, by offsets without a name, and of noise;
+    local_m: rms of those offsets; local_p: p-value of the least sure of their components;
+    contradicted: whether the cameras of a rig contradict each other about the target.
+    """
+
+    causes: Sequence[str]
+    size: str
+    gain: tuple[float, float, float]
+    named_px: float
+    local_px: float
+    local_m: float
+    local_p: float
+    noise_px: float
+    contradicted: bool
+
+
+def decide_target(facts: TargetFacts) -> Decision:
+    """Return what to do about the target."""
+    gain, low, sure = facts.gain
+    local = (f'landmarks are off by {1e3 * facts.local_m:.2g} mm rms, which costs '
+             f'{facts.local_px:.2g} px' if facts.local_m else
+             f'local offsets cost {facts.local_px:.2g} px')
+    if facts.contradicted:
+        return Decision('measure_again', 'the cameras contradict each other about its shape',
+                        Figure('local_offsets', facts.local_px, 'px'), None)
+    if facts.causes:
+        figure = Figure('gain', gain, '1')
+        if low > 0 and facts.local_px <= facts.named_px:
+            return Decision('correct', f'{facts.size}; the correction takes away '
+                            f'{100 * gain:.0f} % of the held-out error', figure, sure)
+        return Decision('measure_again', f'{facts.size}; beyond that {local}', figure, sure)
+    figure = Figure('local_offsets', facts.local_px, 'px')
+    if facts.local_px > facts.noise_px:
+        return Decision('measure_again', f'{local}, more than the noise of '
+                        f'{facts.noise_px:.2g} px', figure, 1 - facts.local_p)
+    if facts.local_px > 0:
+        return Decision('keep', f'it is imperfect but does no harm: {local}', figure,
+                        1 - facts.local_p)
+    return Decision('keep', 'no error of it shows beyond the noise', figure, 0.95)
+
+
+class PhotographsFacts(NamedTuple):
+    """What the photographs are judged by.
+
+    frames: how many there are; bad: names of those that are wrong as a whole; unlike: that the
+    others do not predict; heldout_px: by all causes; scatter_px: what noise leaves of it; lens:
+    the answer about the lens.
+    """
+
+    frames: int
+    bad: Sequence[str]
+    unlike: Sequence[str]
+    heldout_px: float
+    scatter_px: float
+    lens: str
+
+
+def decide_photographs(facts: PhotographsFacts) -> Decision:
+    """Return what to do about the photographs."""
+    times = facts.heldout_px / max(facts.scatter_px, 1e-9)
+    figure = Figure('held_out_over_noise', times, '1')
+    if facts.bad and len(facts.bad) >= _MANY * facts.frames:
+        return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
+                        'others or are wrong as a whole', figure, None)
+    if facts.frames < _ENOUGH:
+        return Decision('more', f'{facts.frames} frames are few; take {_ENOUGH} or more',
+                        figure, None)
+    if facts.lens == 'undecided':
+        return Decision('more', 'the lens is undecided; --next 6 says which views decide it',
+                        figure, None)
+    if len(facts.unlike) >= _MANY * facts.frames:
+        return Decision('more', f'{len(facts.unlike)} of {facts.frames} show what no other does',
+                        figure, None)
+    return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times the noise',
+                    figure, None)

@@ -1,0 +1,233 @@
+"""What a lens is judged by: the lens file on held-out frames, bounds, ray errors, its offset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.cross_validation import (
+    HeldOut,
+    bootstrap_gains,
+    held_out_gain,
+    noise_ratio,
+    refit_shared,
+    sum_squares,
+)
+from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset
+from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.lens_errors import InAir, stated_parameters
+from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.effects.base import Effect
+from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.solve.ray_errors import (
+    RayError,
+    RayModel,
+    points_on_rays,
+    ray_model,
+    typical_points,
+    without_motion,
+)
+from fisheye_svp_ros.solve.rig_state import RigState
+
+_BOUNDED = ('viewpoint_shift', 'sensor_tilt', 'decentering')
+_NORMAL_95 = 1.96
+_EDGE = 0.9  # of the points by incidence angle: beyond is the edge
+_NEAR = 1  # of ray_errors.RANGES: 1 m
+
+LensesOf = Callable[[RigState], Mapping[str, Lens]]
+
+
+def lens_columns(null: NullModel) -> Mask:
+    """Return which of what is shared (K,) goes into a lens file: intrinsics, lasting effects."""
+    linear = null.linear
+    found = [np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
+             np.ones(len(linear.free), dtype=bool)]
+    found += [np.full(len(values), effect.stage != 'target' and not effect.of_recording)
+              for effect, _, values in null.terms]
+    return np.concatenate(found)
+
+
+def compare_lens_files(evaluation: Evaluation) -> FileFigure:
+    """Predict frames left out in turn with the lens as given and the extended one.
+
+    The target and the offsets of its landmarks are those that the other frames predict with the
+    extended lens, for both lenses; that favours the extended one.
+    """
+    noise = evaluation.noise_px
+    if evaluation.medium is not None:  # the lens as given is one in air
+        gain = evaluation.gains['named']
+        return FileFigure(gain.before, gain.after, gain.value, gain.low, gain.high,
+                          float(gain.low > 0))
+    kept = evaluation.counted_frames
+    before, after = (one.take(kept) for one in _predict_with_files(evaluation))
+    gain = held_out_gain(before, after, noise)
+    sure = float((bootstrap_gains(before, after, noise) > 0).mean())
+    return FileFigure(before.rms, after.rms, gain.value, gain.low, gain.high, sure)
+
+
+def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
+    null = evaluation.null
+    linear, ratio = null.linear, noise_ratio(null.linear)
+    of_lens, (now, given) = lens_columns(null), _shared_values(evaluation)
+    at, scale = null.columns_and_residual(null.included_columns), null.scale[null.included_columns]
+    residual = np.zeros((2, *linear.residual.shape))
+    for frame, information in enumerate(null.information_without_frames(at)):
+        kept, change, combination = refit_shared(null, information, (), ())
+        new = now.copy()
+        new[kept] += change
+        off = np.where(of_lens, (new - given) * scale, 0.0)
+        extended = null.leave_one_out.rows[frame][:, at] @ combination
+        other = null.fixed.border[frame][:, null.included_columns] @ off
+        poses = linear.frame_columns[frame] * ratio[frame][:, None]
+        inverse = np.linalg.pinv(poses, rcond=1e-9)
+        for i, whitened in enumerate((extended + other, extended)):
+            left = whitened * ratio[frame]
+            residual[i, frame] = left - poses @ (inverse @ left)
+    before, after = (sum_squares(linear, one / ratio) for one in residual)
+    return before, after
+
+
+def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
+    """Return what is shared (K,), zeros for the rig, as it was found and as the lenses have it."""
+    null, problem = evaluation.null, evaluation.selection.problem
+    start, known = 6 * (null.linear.data.cameras - 1), null.linear.state.parameters
+    now = np.concatenate([np.zeros(start), [known[name] for name in null.linear.free],
+                          *(values for _, _, values in null.terms)])
+    stated, given = stated_parameters(problem.inputs.lenses), now.copy()
+    given[start:start + len(null.linear.free)] = [stated[n][0] for n in null.linear.free]
+    before = {effect.name: values for effect, values in problem.base.terms}
+    for effect, columns, values in null.terms:
+        held = before.get(effect.name)
+        given[columns] = 0.0 if held is None or len(held) != len(values) else held
+    return now, given
+
+
+def find_bounds(null: NullModel) -> list[Bound]:
+    """Return how large effects that are not in the model may be, the target free as well."""
+    columns, prior = [null.included_columns], [np.zeros(null.column_count)]
+    smallest: dict[str, tuple[Effect, Index]] = {}
+    for form, effect in enumerate(null.fixed.forms.effects):
+        mine = null.form_columns(form)
+        if effect.budget_stage() == 'target':
+            columns.append(mine)
+            prior.append(null.prior_precision(mine, effect))
+        elif effect.name in _BOUNDED and not null.effect_kinds & set(effect.kinds) and (
+                effect.name not in smallest or len(mine) < len(smallest[effect.name][1])):
+            smallest[effect.name] = effect, mine
+    return [_bound(null, effect, mine, np.concatenate([*columns, mine]),
+                   np.concatenate([*prior, null.prior_precision(mine, effect)]))
+            for effect, mine in smallest.values()]
+
+
+def _bound(null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array) -> Bound:
+    information, count, scale = null.information, len(mine), null.scale[mine]
+    inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
+    value = (inverse @ information[every, -1])[-count:] / scale
+    covariance = inverse[-count:, -count:] / np.outer(scale, scale)
+    spread, vectors = np.linalg.eigh(covariance)
+    size, error = float(np.linalg.norm(value)), float(np.sqrt(max(spread[-1], 0.0)))
+    z = float(np.sqrt(max(value @ np.linalg.pinv(covariance) @ value / count, 0.0)))
+    largest = size + _NORMAL_95 * error
+    way = value / size if size > error else vectors[:, -1]
+    px, mrad = _edge_cost(null, (null.fixed.border[..., mine] * scale) @ (largest * way))
+    return Bound(effect.name, largest, effect.parameters[0].unit, z, px, mrad)
+
+
+def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
+    """Return what whitened moves (F, M) are at the edge once poses took up theirs, px and mrad."""
+    linear = null.linear
+    left = np.stack([move - columns @ np.linalg.lstsq(columns, move, rcond=1e-9)[0]
+                     for move, columns in zip(moves, linear.frame_columns, strict=True)])
+    weight = np.where(linear.row_weight > 0, linear.row_weight, np.inf)
+    px = np.hypot(*np.moveaxis((left / weight).reshape(len(left), -1, 2), -1, 0))
+    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))[:, ::2]
+    seen = linear.row_mask[:, ::2]
+    edge = seen & (theta >= np.quantile(theta[seen], _EDGE))
+    cost = float(np.sqrt((px[edge] ** 2).mean()))
+    lens = linear.state.lens
+    slope = lens.fx * float(np.mean(lens.image_height.value_and_slope(theta[edge])[1]))
+    return cost, 1e3 * cost / max(slope, 1e-9)
+
+
+@dataclass(frozen=True)
+class LensRays:
+    """Ray errors of each camera's lens as given and as extended, by range; the furthest offset."""
+
+    errors: dict[str, dict[str, list[RayError]]]
+    offset: LensOffset | None
+
+
+def find_lens_rays(
+    evaluation: Evaluation, lenses: Mapping[str, Lens], lenses_of: LensesOf
+) -> LensRays:
+    """Compare the rays of lenses as given and as extended.
+
+    lenses: as given, by camera; lenses_of: makes extended ones of a state.
+    """
+    if evaluation.medium is not None:
+        return LensRays({}, None)
+    null, of_lens = evaluation.null, lens_columns(evaluation.null)
+    linear, covariance = null.linear, evaluation.covariance[np.ix_(of_lens, of_lens)]
+    frames = np.zeros((linear.data.frames, 6))
+    before, views = lenses_of(evaluation.simulation.state), linear.data.views
+    errors, offsets = {}, []
+    for number, (name, given) in enumerate(lenses.items()):
+        mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
+
+        def extended(step: Array, name: str = name) -> Lens:
+            shared = np.zeros(null.column_count)
+            shared[of_lens] = step
+            return lenses_of(linear.state.retract(linear.free, frames, shared))[name]
+
+        uv = typical_points(views.uv[mine])
+        model, there = ray_model(extended, covariance, uv)
+        off = _difference(model, points_on_rays(given, uv[there]))
+        errors[name] = {'given': model.errors(off), 'extended': model.errors()}
+        fitted = _difference(model, points_on_rays(before[name], uv[there]))
+        offsets.append(_offset(model, (off, off - fitted), given, uv[there]))
+    return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))
+
+
+def _difference(model: RayModel, points: Array) -> Array:
+    """Return by what angles (R, G, 3), rad, other rays differ; 0 where there are none."""
+    change = points - model.points
+    there = np.isfinite(change).all(axis=(0, 2))
+    found = np.zeros_like(change)
+    found[:, there] = without_motion(model.points[:, there], change[:, there])
+    return found
+
+
+def _offset(model: RayModel, off: Sequence[Array], given: Lens, uv: Array) -> LensOffset:
+    """Return how far a lens is off the nearer of two fits, and how often chance does as much."""
+    nearer = min(_rms(one[_NEAR]) for one in off)
+    expected = model.sample()[_NEAR]
+    stated = _stated_sample(given, uv)
+    if stated is not None and stated.shape == expected.shape:
+        expected = expected + stated
+    drawn = np.sqrt((expected**2).sum(axis=1).mean(axis=0))
+    p_value = float((1 + (drawn >= nearer).sum()) / (1 + len(drawn)))
+    return LensOffset(1e3 * nearer, 1e3 * float(np.sqrt((drawn**2).mean())), p_value,
+                      nearer * float(np.sqrt(given.fx * given.fy)), stated is not None)
+
+
+def _rms(angles: Array) -> float:
+    return float(np.sqrt((angles**2).sum(axis=-1).mean()))
+
+
+def _stated_sample(lens: Lens, uv: Array) -> Array | None:
+    """Return ray errors (G, 3, samples), rad, at 1 m as a lens file states; None for nothing."""
+    stated = InAir.from_lens(lens)
+    if stated is None:
+        return None
+    known = {'f': lens.fx, **lens.parameters}
+    values = np.array([known[name] for name in stated.names])
+
+    def changed(step: Array) -> Lens:
+        return lens.with_parameters(stated.names, [*(values + step).tolist()])
+
+    sample: Array = ray_model(changed, stated.covariance, uv)[0].sample(seed=1)[_NEAR]
+    return sample

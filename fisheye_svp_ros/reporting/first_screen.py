@@ -1,0 +1,183 @@
+"""The first screen of a report, and the ten lines of the terminal: the same words for both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+
+from fisheye_svp_ros.diagnosis import Comparison, Decision, Diagnosis
+from fisheye_svp_ros.reporting.blocks import image_uri
+from fisheye_svp_ros.reporting.diagnosis_text import known_rows, lens_words, size
+from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, TARGET, headline
+from fisheye_svp_ros.scene.photograph_names import photograph_names
+
+_SHOWN = 4  # photographs, and candidates, by name
+_CERTAIN = 0.99  # more cannot be said of a bootstrap
+_THUMBNAIL = 96  # px, the longer side
+
+
+class Photo(NamedTuple):
+    """A photograph by its name; uri: a small picture of it, '' where the file is not at hand."""
+
+    name: str
+    uri: str
+
+
+class Action(NamedTuple):
+    """One line: about what, what to do, why, what it gains and how sure that is, photographs."""
+
+    about: str
+    do: str
+    why: str
+    sure: str
+    photographs: tuple[Photo, ...]
+    more: int
+
+
+class Screen(NamedTuple):
+    """What is read first; warning: '' unless an error rises with the causes in the model."""
+
+    headline: str
+    facts: str
+    warning: str
+    actions: tuple[Action, ...]
+    causes: str
+    candidates: str
+    bound: str
+    truth: str
+
+
+def first_screen(
+    d: Diagnosis, source: str, known: Mapping[str, Comparison] | None = None
+) -> Screen:
+    """Return the first screen; source: what was diagnosed; known: errors against the truth."""
+    paths = _paths(d)
+    names = {kind: list(dict.fromkeys(
+        name for one in d.advice if one.kind == kind
+        for name in (one.photographs or [f'frame {n}' for n in one.frames])))
+        for kind in ('retake', 'unlike')}
+    about = names['retake'] or names['unlike']
+    answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
+        ('Lens', lens_words(d), d.decision['lens'], []),
+        ('Target', TARGET[d.decision['target'].say], d.decision['target'], []),
+        ('Photographs', PHOTOGRAPHS[d.decision['photographs'].say], d.decision['photographs'],
+         about),
+    )
+    return Screen(
+        headline(d), _facts(d, source), _warning(d),
+        tuple(Action(title, do, decision.why[:1].upper() + decision.why[1:], _sure(decision),
+                     tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_SHOWN]),
+                     max(len(some) - _SHOWN, 0))
+              for title, do, decision, some in answers),
+        _causes(d), _candidates(d), _bound(d.decision['lens']),
+        '; '.join(f'{name} {before} → {after}'
+                  for name, before, after, _ in known_rows(known or {})))
+
+
+def terminal_lines(screen: Screen, command: str) -> list[str]:
+    """Return the screen as at most ten lines."""
+    lines = [screen.headline, screen.facts]
+    lines += [f'Warning: {screen.warning}'] if screen.warning else []
+    for one in screen.actions:
+        names = ', '.join(photo.name for photo in one.photographs)
+        names += f' and {one.more} more' if one.more else ''
+        lines.append(f'{one.about}: {one.do}. {one.why}{one.sure and f" ({one.sure})"}.'
+                     + (f' {names}.' if names else ''))
+    lines += [f'Causes: {screen.causes}'] if screen.causes else []
+    lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
+    lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
+    lines += [f'Not excluded: {screen.bound}'] if screen.bound else []
+    return [*lines, f'Next: {command}'] if command else lines
+
+
+def _facts(d: Diagnosis, source: str) -> str:
+    kind = 'photographs' if d.problem.observations.photographs else 'frames'
+    figures = d.figures
+    base, named, extended = (
+        one.heldout_rms_px for one in (figures.base, figures.named, figures.extended))
+    return (f'{source}: {d.observations} points in {d.frames} {kind}; held-out error '
+            f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
+            f'noise {d.noise_px:.2g} px')
+
+
+def _warning(d: Diagnosis) -> str:
+    """Return which error is larger after than before."""
+    base, named, extended = d.figures.base, d.figures.named, d.figures.extended
+    pairs = (
+        ('rms on the fitted frames, with the causes', base.rms_px, named.rms_px),
+        ('rms on the fitted frames, with local offsets', named.rms_px, extended.rms_px),
+        ('held-out rms, with the causes', base.heldout_rms_px, named.heldout_rms_px),
+        ('held-out rms, with the extended lens on one target', d.file.given_px,
+         d.file.extended_px))
+    rising = [f'{name}: {before:.3g} → {after:.3g} px' for name, before, after in pairs
+              if after > before * (1 + 1e-6)]
+    return ('an error rises: ' + '; '.join(rising)) if rising else ''
+
+
+def _sure(decision: Decision) -> str:
+    if decision.confidence is None:
+        return ''
+    sure = f'{100 * decision.confidence:.0f} % sure'
+    if decision.confidence > _CERTAIN:
+        sure = f'more than {100 * _CERTAIN:.0f} % sure'
+    if decision.say == 'use_extended':
+        return f'takes away {100 * decision.figure.value:.0f} % of the error, {sure}'
+    return sure
+
+
+def _causes(d: Diagnosis) -> str:
+    """Return the confirmed causes by name, what is not told apart from each, and their sizes."""
+    return '; '.join(
+        f'{" or ".join([one.effect, *one.indistinguishable_from])} ({size(d, one)})'
+        for one in d.causes)
+
+
+def _candidates(d: Diagnosis) -> str:
+    words = [f'{one.effect} ({one.why})' for one in d.candidates[:_SHOWN]]
+    more = len(d.candidates) - _SHOWN
+    return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
+
+
+def _bound(decision: Decision) -> str:
+    human = {'m': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg')}
+    words = []
+    for one in decision.bound:
+        factor, unit = human.get(one.unit, (1.0, ''))
+        words.append(f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
+                     + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)')
+    return '; '.join(words)
+
+
+def _paths(d: Diagnosis) -> dict[str, str]:
+    table = d.problem.observations
+    by = {(frame, camera): path for frame, camera, path in table.photographs}
+    return {name: by[key] for key, name in photograph_names(table).items()}
+
+
+def _thumbnail(path: str | None) -> str:
+    if path is None or not Path(path).is_file():
+        return ''
+    image = cv2.imread(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        return ''
+    zoom = _THUMBNAIL / max(image.shape)
+    small = cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA)
+    return image_uri(cv2.imencode('.jpg', small)[1].tobytes(), 'jpeg')
+
+
+def next_command(d: Diagnosis, observations: str, options: str, lenses: Sequence[str]) -> str:
+    """Return the command to go on with, as a shell takes it.
+
+    observations: with the options that find the board; options: of the extended lenses; lenses:
+    as given.
+    """
+    if d.decision['lens'].say == 'keep':
+        return f'fisheye-svp localize {observations} {" ".join(lenses)} -o poses'
+    boards = {*d.problem.observations.board.tolist()}
+    if d.decision['lens'].say == 'undecided' and len(d.lenses) == len(boards) == 1:
+        return f'fisheye-svp diagnose {observations} {" ".join(lenses)} --next 6 -o next'
+    return f'fisheye-svp localize {observations} {options} -o poses'

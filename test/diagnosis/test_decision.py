@@ -1,0 +1,96 @@
+"""Decisions about lens, target and photographs from the figures behind them."""
+
+from __future__ import annotations
+
+import pytest
+
+from fisheye_svp_ros.diagnosis.decision import (
+    Bound,
+    FileFigure,
+    LensFacts,
+    LensOffset,
+    PhotographsFacts,
+    TargetFacts,
+    decide_lens,
+    decide_photographs,
+    decide_target,
+)
+
+BETTER = FileFigure(0.123, 0.081, 0.75, 0.6, 0.84, 1.0)
+WORSE = FileFigure(0.337, 0.345, -0.4, -0.8, -0.05, 0.03)
+SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
+SMALL = Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
+LIKELY = Bound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
+SOUND = LensFacts(
+    [], [], (0.0, 0.0), SAME, LensOffset(0.3, 0.4, 0.6, 0.1), [], [SMALL], 0.05, True)
+
+
+def test_a_sound_lens_is_kept_with_the_bound() -> None:
+    found = decide_lens(SOUND)
+    assert found.say == 'keep' and found.bound == [SMALL] and found.confidence == 0.95
+    assert 'costs at most 0.02 px (0.05 mrad) at the edge' in found.why
+
+
+@pytest.mark.parametrize('causes', [[], ['target_shape']])
+def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: list[str]) -> None:
+    """It was silently fitted anew, and called adequate."""
+    off = SOUND._replace(offset=LensOffset(1.2, 0.4, 0.001, 1.5), causes=causes, file=BETTER)
+    found = decide_lens(off)
+    assert found.say == 'recalibrate' and '3.0 times its expected error' in found.why
+    assert found.confidence is not None and found.confidence > 0.99
+
+
+def test_a_lens_that_is_off_by_less_than_matters_is_not() -> None:
+    little = LensOffset(0.02, 0.005, 0.001, 0.004)
+    assert decide_lens(SOUND._replace(offset=little)).say == 'keep'
+    unstated = LensOffset(0.15, 0.07, 0.01, 0.045, stated=False)
+    assert decide_lens(SOUND._replace(offset=unstated)).say == 'keep'
+
+
+def test_the_extended_lens_is_used_where_it_predicts_better_on_the_same_target() -> None:
+    facts = SOUND._replace(causes=['target_shape'], named_gain=(0.8, 0.7), file=BETTER)
+    found = decide_lens(facts)
+    assert found.say == 'use_extended' and found.figure == ('file_gain', 0.75, '1')
+
+
+def test_figures_that_disagree_leave_it_undecided() -> None:
+    facts = SOUND._replace(causes=['target_shape'], named_gain=(0.24, 0.1), file=WORSE)
+    assert decide_lens(facts).say == 'undecided'
+    assert decide_lens(facts._replace(bounds=[LIKELY])).bound == [LIKELY]
+
+
+def test_what_is_likely_and_not_confirmed_keeps_the_lens_from_being_kept() -> None:
+    found = decide_lens(SOUND._replace(bounds=[LIKELY]))
+    assert found.say == 'undecided' and 'up to 0.32 px at the edge' in found.why
+
+
+def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
+    facts = SOUND._replace(causes=['target_shape'], named_gain=(0.8, 0.7), file=BETTER,
+                           falling=False)
+    found = decide_lens(facts)
+    assert found.say == 'undecided' and found.confidence == 0.0
+
+
+TARGET = TargetFacts(['target_shape'], 'board 0 is bent by 0.81 mm', (0.82, 0.76, 1.0), 0.137,
+                     0.05, 4e-5, 1e-6, 0.043, False)
+
+
+def test_the_target_is_judged_apart() -> None:
+    assert decide_target(TARGET).say == 'correct'
+    assert decide_target(TARGET._replace(local_px=0.2)).say == 'measure_again'
+    assert decide_target(TARGET._replace(contradicted=True)).say == 'measure_again'
+    alone = TARGET._replace(causes=[], size='')
+    assert decide_target(alone).say == 'measure_again'
+    harmless = decide_target(alone._replace(local_px=0.03))
+    assert harmless.say == 'keep' and 'landmarks are off by 0.04 mm rms' in harmless.why
+    assert decide_target(alone._replace(local_px=0.0, local_m=0.0)).say == 'keep'
+
+
+def test_photographs_are_enough_or_not() -> None:
+    facts = PhotographsFacts(26, [], [], 0.1, 0.09, 'keep')
+    assert decide_photographs(facts).say == 'enough'
+    assert decide_photographs(facts._replace(bad=['1.jpg', '2.jpg', '3.jpg'])).say == 'retake'
+    assert decide_photographs(facts._replace(bad=['1.jpg'])).say == 'enough'
+    assert decide_photographs(facts._replace(frames=5)).say == 'more'
+    assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
+    assert decide_photographs(facts._replace(unlike=['1', '2', '3', '4'])).say == 'more'

@@ -1,0 +1,63 @@
+"""Ray errors: what a motion of the camera frame does is none, and samples agree with errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fisheye_svp_ros.optics.curves import Equidistant, Gennery
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import rotation_from_vector
+from fisheye_svp_ros.solve.ray_errors import (
+    RANGES,
+    points_on_rays,
+    ray_model,
+    without_motion,
+)
+
+LENS = Lens('made', 1280, 960, 400.0, 400.0, 640.0, 480.0, Equidistant(), 1.5)
+UV = np.stack(np.meshgrid(np.linspace(250, 1030, 12), np.linspace(90, 870, 12)),
+              axis=-1).reshape(-1, 2)
+
+
+def focal(step: np.ndarray) -> Lens:
+    return replace(LENS, fx=LENS.fx + step[0], fy=LENS.fy + step[0])
+
+
+def test_points_lie_at_their_ranges_also_where_the_viewpoint_moves() -> None:
+    shifted = replace(LENS, viewpoint_shift=Gennery(0.0, 0.005, 0.0, 0.0))
+    points = points_on_rays(shifted, UV)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=-1),
+                               np.broadcast_to(np.array(RANGES)[:, None], points.shape[:2]))
+
+
+def test_a_motion_of_the_camera_frame_is_no_error() -> None:
+    points = points_on_rays(LENS, UV)
+    turned = points @ rotation_from_vector(np.array([1e-5, -2e-5, 3e-5])).T + (1e-5, 2e-5, -1e-5)
+    assert np.abs(without_motion(points, turned - points)).max() < 1e-8
+
+
+def test_a_focal_length_off_by_one_percent_costs_a_radial_angle() -> None:
+    model, there = ray_model(focal, np.array([[16.0]]), UV)
+    assert there.all()
+    theta = np.linalg.norm(UV - (640, 480), axis=1) / 400
+    # A motion along the axis takes up some of it at the nearest range.
+    np.testing.assert_allclose(model.sd[-1], 0.01 * theta, rtol=0.06)
+    error = model.errors()[-1]
+    expected = np.sqrt(np.mean((0.01 * theta) ** 2))
+    assert error.value == pytest.approx(expected, rel=0.1)
+    assert error.low < error.value < error.high
+    off = without_motion(model.points, points_on_rays(focal(np.array([8.0])), UV) - model.points)
+    both = model.errors(off)[-1]
+    assert both.value == pytest.approx(5**0.5 * expected, rel=0.1)
+
+
+def test_a_viewpoint_shift_costs_more_the_nearer_the_landmark_is() -> None:
+    def shifted(step: np.ndarray) -> Lens:
+        return replace(LENS, viewpoint_shift=Gennery(0.0, float(step[0]), 0.0, 0.0))
+
+    model, _ = ray_model(shifted, np.array([[1e-6]]), UV)
+    near, middle, far = (one.value for one in model.errors())
+    assert near > 2.5 * middle > 5 * far
