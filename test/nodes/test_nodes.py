@@ -401,8 +401,8 @@ def test_a_lens_that_is_wrong_in_every_set_is_not_searched_for_gross_errors_in_e
 ) -> None:
     sets = Sets(graph('lens:=fish214', 'patience:=0.2', 'sigma_px:=0.3'))
     sets.tell_landmarks(0, 2.0)
-    search, searched = reliability._agreed, []
-    monkeypatch.setattr(reliability, '_agreed', lambda *arguments: (
+    search, searched = reliability._consensus_pose, []
+    monkeypatch.setattr(reliability, '_consensus_pose', lambda *arguments: (
         searched.append(stamp), search(*arguments))[1])
     seen = simulate_scenario(Scenario(radius=2.0, noise_px=0.3)).observations
     for stamp in range(1, 22):
