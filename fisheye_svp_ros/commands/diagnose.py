@@ -174,7 +174,7 @@ def _print(
     print_lines([
         *terminal_lines(first_screen(diagnosis, args.observations, known),
                         command if args.output else ''),
-        *(one.sentence for one in external_text.sections(diagnosis))])
+        *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis))])
     if wanted:
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)
