@@ -342,7 +342,7 @@ class TestCalibrate:
         def trust(*_):
             raise np.linalg.LinAlgError('SVD did not converge')
 
-        monkeypatch.setattr('fisheye_svp_ros.diagnosis.assess_lens', trust)
+        monkeypatch.setattr('fisheye_svp_ros.study.lens_trust.assess_lens', trust)
         assert 'observations.csv: the lens found has no rays to points that were seen' in refused(
             capsys, 'calibrate', scene[0] / 'observations.csv', '--image-size', '1280x960')
 

@@ -15,6 +15,8 @@ from fisheye_svp_ros.io.csv_table import CsvTable
 
 SHARED = ROOT.parent / 'shared'
 FAULTS, DATA = SHARED / 'faults', SHARED / 'data'
+# One process makes each diagnosis once.
+pytestmark = pytest.mark.xdist_group('one_answer')
 SETS = {
     'after_residuals': (FAULTS / 'after_residuals', 'observations.csv', False),
     'sound_lens': (FAULTS / 'sound_lens', 'train.csv', True),
@@ -45,6 +47,8 @@ def diagnosed(results: dict[str, Path], name: str) -> tuple[Path, dict[str, Any]
             assert cli.main(['calibrate', str(folder / file), '--image-size', '1280x800',
                              '-o', str(lens)]) == 0
         more = ['--held-out', str(folder / 'test.csv')] if held_out else []
+        if folder.parent == DATA:
+            more.append('--quick')  # with all rounds it takes minutes
         assert cli.main(['diagnose', str(folder / file), '--lens', str(lens), *more,
                          '-o', str(out)]) == 0
     return out, json.loads((out / 'diagnosis.json').read_text())
