@@ -51,11 +51,12 @@ def test_importing_loads_nothing_else() -> None:
 def test_names_are_there_and_typed_and_no_modules() -> None:
     modules = {module.name for module in pkgutil.iter_modules(fsvp.__path__)}
     stub = (ROOT / 'fisheye_svp_ros' / '__init__.pyi').read_text()
-    assert set(re.findall(r' as (\w+)$', stub, re.MULTILINE)) == set(fsvp.__all__)
-    assert not modules & set(fsvp.__all__)
+    # The room `detect` can be called: it is module and function in one, which no stub can say.
+    assert set(re.findall(r' as (\w+)$', stub, re.MULTILINE)) == set(fsvp.__all__) - {'detect'}
+    assert modules & set(fsvp.__all__) == {'detect'} and callable(fsvp.detect)
     assert set(fsvp.__all__) <= set(dir(fsvp))
     for name in fsvp.__all__:
-        assert getattr(fsvp, name).__name__ == name
+        assert getattr(fsvp, name).__name__.rpartition('.')[2] == name
     with pytest.raises(AttributeError, match='nonsense'):
         _ = fsvp.nonsense
 

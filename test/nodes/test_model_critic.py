@@ -104,7 +104,7 @@ def test_the_verdict_is_published(graph: Callable[..., Graph], scene: Path) -> N
     status, = g.until(lambda: [
         m.status[0] for m in diagnostics if m.status[0].name == '/model_critic: verdict'][:1])
     assert status.level == status.WARN
-    assert 'viewpoint_shift: e0 = ' in status.message and 'mm' in status.message
+    assert 'viewpoint_shift (e0 = ' in status.message and 'mm' in status.message
 
 
 def test_a_right_lens_is_adequate_and_another_scenario_starts_anew(

@@ -427,7 +427,7 @@ def test_the_covariance_of_a_pose_with_the_lens_s_own_errors(
         sets.graph.until(lambda: len(sets.poses) == stamp)  # noqa: B023
         found.append(np.reshape(sets.poses[-1].pose.covariance, (6, 6)))
     sigma = replace(seen, sigma=np.full(len(seen), NOISE))
-    _, parts = localize_with_errors(LensErrors.of(lens), sigma)
+    _, parts = localize_with_errors(LensErrors.from_lens(lens), sigma)
     np.testing.assert_allclose(found[0], parts.noise[0], rtol=1e-3, atol=1e-12)
     np.testing.assert_allclose(found[1], parts.total[0], rtol=1e-3, atol=1e-12)
     assert np.trace(found[1]) > 4 * np.trace(found[0])

@@ -22,7 +22,7 @@ from fisheye_svp_ros.commands import watch
 
 @pytest.mark.parametrize(('width', 'shown'), [
     (24, 'a terminal 64 columns wide is needed; this one has 24'),
-    (64, '-1.23457e-05 -1.23457e-05 1.23457e-05')])
+    (64, '-0.0123457 -0.0123457 0.0123457')])
 def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
     from fisheye_svp_ros.nodes.watcher import Followed, Results
 
