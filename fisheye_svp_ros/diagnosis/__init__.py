@@ -11,10 +11,17 @@
 Other rooms import what stands here, and nothing else.
 """
 
-from fisheye_svp_ros.diagnosis.advice import DIAGNOSE_AIR, USE_EXTENDED, Advice
+from fisheye_svp_ros.diagnosis.advice import (
+    DIAGNOSE_AIR,
+    RETAKE,
+    UNLIKE,
+    USE_EXTENDED,
+    Advice,
+)
 from fisheye_svp_ros.diagnosis.causes import CONFOUNDED_P, Cause
 from fisheye_svp_ros.diagnosis.checks.two_cameras import Transfer, TwoCameras, deviations
 from fisheye_svp_ros.diagnosis.checks.two_datasets import SharedParameter, TwoDatasets
+from fisheye_svp_ros.diagnosis.conclusion import frames_of
 from fisheye_svp_ros.diagnosis.cross_validation import (
     Comparison,
     HeldOut,
@@ -33,10 +40,7 @@ from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
-from fisheye_svp_ros.diagnosis.lens_errors import (
-    InAir,
-    LensErrors,
-)
+from fisheye_svp_ros.diagnosis.lens_errors import InAir, LensErrors
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
@@ -57,8 +61,10 @@ __all__ = [
     'DIAGNOSE_AIR',
     'NAMED_P',
     'NAMES',
+    'RETAKE',
     'SIGNIFICANCE',
     'STAGE_OF',
+    'UNLIKE',
     'USE_EXTENDED',
     'Advice',
     'Cause',
@@ -91,11 +97,10 @@ __all__ = [
     'TwoDatasets',
     'can_be_included',
     'compare_errors',
-
     'deviations',
     'diagnose',
     'diagnose_against',
-
+    'frames_of',
     'pose_maps',
     'pose_summary',
     'predict_other_data',

@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.diagnosis.advice import RETAKE, UNLIKE, USE_EXTENDED, Advice
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
-from fisheye_svp_ros.diagnosis.cross_validation import bootstrap_gains, held_out_gain
+from fisheye_svp_ros.diagnosis.cross_validation import gain_and_confidence
 from fisheye_svp_ros.diagnosis.decision import (
     Decision,
     FileFigure,
@@ -121,8 +121,7 @@ def _target_facts(
     gain = (0.0, 0.0, 0.0)
     if mine:
         both = evaluation.predict([cause.effect for cause in mine]), evaluation.predict()
-        found = held_out_gain(*both, evaluation.noise_px)
-        sure = float((bootstrap_gains(*both, evaluation.noise_px) > 0).mean())
+        found, sure = gain_and_confidence(*both, evaluation.noise_px)
         gain = found.value, found.low, sure
     of_target = [part for part in components if part.stage == 'target']
     local = [part for part in of_target

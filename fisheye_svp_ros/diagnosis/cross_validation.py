@@ -91,15 +91,19 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
 
 def held_out_gain(before: HeldOut, after: HeldOut, noise: float) -> Comparison:
     """Return 1 - (held-out misfit above noise after) / (before), with a bootstrap interval."""
-    low, high = np.quantile(bootstrap_gains(before, after, noise), (0.025, 0.975))
+    return gain_and_confidence(before, after, noise)[0]
+
+
+def gain_and_confidence(
+    before: HeldOut, after: HeldOut, noise: float
+) -> tuple[Comparison, float]:
+    """Return `held_out_gain`, and the share of the bootstrap in which it is above zero."""
+    gains = _excess_gain(before, after, noise, _resample_frames(len(before.squares)))
+    low, high = np.quantile(gains, (0.025, 0.975))
     whole = np.arange(len(before.squares))[None]
     value = float(_excess_gain(before, after, noise, whole)[0])
-    return Comparison(before.rms, after.rms, value, float(low), float(high))
-
-
-def bootstrap_gains(before: HeldOut, after: HeldOut, noise: float) -> Array:
-    """Return gains (B,) of frames drawn with replacement, the same draws every time."""
-    return _excess_gain(before, after, noise, _resample_frames(len(before.squares)))
+    gain = Comparison(before.rms, after.rms, value, float(low), float(high))
+    return gain, float((gains > 0).mean())
 
 
 def compare_errors(base: Array, extended: Array) -> Comparison:

@@ -46,7 +46,7 @@ class Bound:
 class Decision:
     """One answer: what to do, why, the figure behind it; confidence: 0 to 1, if measured."""
 
-    say: str
+    say: LensAnswer | TargetAnswer | PhotographsAnswer
     why: str
     figure: Figure
     confidence: float | None

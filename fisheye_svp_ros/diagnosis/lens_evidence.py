@@ -10,8 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
-    bootstrap_gains,
-    held_out_gain,
+    gain_and_confidence,
     noise_ratio,
     refit_shared,
     sum_squares,
@@ -57,15 +56,13 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
     The target and the offsets of its landmarks are those that the other frames predict with the
     extended lens, for both lenses; that favours the extended one.
     """
-    noise = evaluation.noise_px
     if evaluation.medium is not None:  # the lens as given is one in air
         gain = evaluation.gains['named']
         return FileFigure(gain.before, gain.after, gain.value, gain.low, gain.high,
                           float(gain.low > 0))
     kept = evaluation.counted_frames
     before, after = (one.take(kept) for one in _predict_with_files(evaluation))
-    gain = held_out_gain(before, after, noise)
-    sure = float((bootstrap_gains(before, after, noise) > 0).mean())
+    gain, sure = gain_and_confidence(before, after, evaluation.noise_px)
     return FileFigure(before.rms, after.rms, gain.value, gain.low, gain.high, sure)
 
 

@@ -337,10 +337,6 @@ def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]
                '-' if part.name == 'noise' else bare_probability(part.p_value))
 
 
-BUDGET_HEADER = ('part', 'stage', 'sd px', 'share', 'p')
-BUDGET_WORDS = ('part', 'stage')
-
-
 def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
     """Yield what noise, parameters and remaining misfit make uncertain, and all together."""
     for name, parts in diagnosis.uncertainty.items():
@@ -386,10 +382,6 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
         same += '' if c.survives else ' (not needed with another cause out)'
         share = percent(c.share) if c.share else '-'
         yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
-
-
-CAUSE_HEADER = ('cause', 'size', 'p', 'share', 'held-out rms px', 'gain', 'may as well be')
-CAUSE_WORDS = ('size', 'may as well be')
 
 
 def listed(names: Sequence[str], word: str = 'and') -> str:

@@ -10,7 +10,6 @@ from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCamera
 from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quantity
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
-CARRIED_WORDS = ('found in', 'tried on', 'what')
 _APART, _MOST = 3.0, 4
 _ALONE = ('; they do not keep their places, or were not photographed at the same moments, so that '
           'each view was posed by itself: nothing rests on their rig')

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import cv2
 
-from fisheye_svp_ros.diagnosis import Comparison, Decision, Diagnosis
+from fisheye_svp_ros.diagnosis import (
+    RETAKE,
+    UNLIKE,
+    Comparison,
+    Decision,
+    Diagnosis,
+    frames_of,
+)
 from fisheye_svp_ros.reporting.blocks import image_uri
 from fisheye_svp_ros.reporting.diagnosis_text import known_rows, lens_words, size
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, TARGET, headline
@@ -56,11 +63,7 @@ def first_screen(
 ) -> Screen:
     """Return the first screen; source: what was diagnosed; known: errors against the truth."""
     paths = _paths(d)
-    names = {kind: list(dict.fromkeys(
-        name for one in d.advice if one.kind == kind
-        for name in (one.photographs or [f'frame {n}' for n in one.frames])))
-        for kind in ('retake', 'unlike')}
-    about = names['retake'] or names['unlike']
+    about = frames_of(d.advice, RETAKE) or frames_of(d.advice, UNLIKE)
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         ('Lens', lens_words(d), d.decision['lens'], []),
         ('Target', TARGET[d.decision['target'].say], d.decision['target'], []),

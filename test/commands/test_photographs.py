@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.commands import refused
 from helpers.kalibr import write_camchain
 from helpers.nodes import SHARED
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
@@ -37,14 +38,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     images = [photograph(where.take(i), seed=i) for i in range(10)]
     write(folder, [*images, np.full_like(images[0], 90)])
     return folder
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert cli.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    return said[0]
 
 
 def test_beside_photographs_a_table_is_a_table(tmp_path: Path) -> None:

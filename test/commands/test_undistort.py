@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.commands import refused
 from helpers.photographs import LENS, PRINTED, photograph, poses
 from numpy.typing import NDArray
 
@@ -26,14 +27,6 @@ RIGHT = replace(LENS, name='other', fx=144.0, fy=144.0)
 
 def run(*arguments: object) -> None:
     assert cli.main(['undistort', *map(str, arguments)]) == 0
-
-
-def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    capsys.readouterr()
-    assert cli.main([str(argument) for argument in arguments]) == 2
-    said = capsys.readouterr().err.strip().splitlines()
-    assert len(said) == 1
-    return said[0]
 
 
 @pytest.fixture(scope='module')
