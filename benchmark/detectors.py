@@ -22,7 +22,7 @@ import numpy as np
 from benchmark.prints import printed
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.detection import detect
-from fisheye_svp_ros.detect.finders import AS_FOUND, default_detector
+from fisheye_svp_ros.detect.finders import UNFITTED_DETECTORS, default_detector
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.detect.points import find_points
@@ -131,7 +131,7 @@ def by_angle(results: dict[tuple[str, str], Corners], count: int) -> list[str]:
                 bias = np.linalg.norm(error[own].mean(axis=0))
                 scatter = np.sqrt((error[own] ** 2).mean())
                 over = np.sqrt(((error[own] / sigma[own, None]) ** 2).mean())
-                stated = '' if name in AS_FOUND else f' / {over:.2f}'
+                stated = '' if name in UNFITTED_DETECTORS else f' / {over:.2f}'
                 cells.append(f'{bias:.4f} / {scatter:.4f}{stated} ({own.sum()})')
             share = 100 * len(error) / seen.points
             lines.append(f'| `{name}` | {seen.found} of {count} | {share:.0f} % | '

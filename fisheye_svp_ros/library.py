@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects import forward
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
-from fisheye_svp_ros.io.parameters import SWEEP, changed, rows
+from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.poses_csv import pose_columns
 from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.result_files import Columns, Result
@@ -360,7 +360,7 @@ def simulate_scenario(**scenario: Any) -> Simulated:
     _check_names(sweeps.CAMERA, scenario)
     lens = scenario.pop('lens', None)
     named = {} if lens is None or isinstance(lens, Lens) else {'lens': str(lens)}
-    seen = scenarios.simulate_scenario(changed(scenarios.Scenario(), {**scenario, **named}),
+    seen = scenarios.simulate_scenario(with_values(scenarios.Scenario(), {**scenario, **named}),
                                        lens=lens if isinstance(lens, Lens) else None)
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 

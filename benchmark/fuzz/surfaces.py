@@ -21,14 +21,14 @@ from fisheye_svp_ros import library
 from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.detect.photographs import decoded, exif_turned
+from fisheye_svp_ros.detect.photographs import decode_image, exif_turned
 from fisheye_svp_ros.io.bags import Bag, BagWriter
-from fisheye_svp_ros.io.columns import Parts, arrow, read_columns, write_columns
+from fisheye_svp_ros.io.columns import TableParts, arrow, read_columns, write_columns
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
 from fisheye_svp_ros.io.observations_bag import read as read_observations_bag
-from fisheye_svp_ros.io.parameters import changed, rows, sweep_of
+from fisheye_svp_ros.io.parameters import rows, sweep_of, with_values
 from fisheye_svp_ros.io.readers import (
     read_observations,
     read_poses,
@@ -249,7 +249,7 @@ def _photographs(folder: Path) -> Trial:
     def trial(rng: Random) -> str:
         data = mutated(rng.choice(seeds), rng, binary=True)
         exif_turned(data)
-        return '' if decoded(data, 'photograph').size < 1 << 27 else 'a huge image'
+        return '' if decode_image(data, 'photograph').size < 1 << 27 else 'a huge image'
 
     return trial
 
@@ -269,7 +269,7 @@ def _settings(folder: Path) -> Trial:
             sweep = sweep_of(table, swept)
             last = sweep.point(len(sweep) - 1)
             return 'no value' if None in last.values() else ''
-        new = changed(table(), values)
+        new = with_values(table(), values)
         for name, row in chosen.items():
             value = getattr(new, name)
             if type(value) is not type(row.default) or row.check(value) != value:
@@ -286,7 +286,7 @@ def _value(default: Any, rng: Random) -> Any:
 
 
 def _parts(folder: Path) -> Trial:
-    parts = Parts(folder, {'n': int, 'x': float, 'name': str})
+    parts = TableParts(folder, {'n': int, 'x': float, 'name': str})
     parts.write(0, {'n': [1, 2], 'x': [0.5, None], 'name': ['a', None]})
     data = (folder / '000000000.json').read_bytes()
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import write_together
 
 # Limits by quantity: option, unit, factor from the unit to SI.
 _LIMITS = {
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
     )
     print(f'  {answer(points, asked)}')
     if args.output:
-        with together():
+        with write_together():
             draw(args.output / 'budget.png', budget, points, asked)
             write_json(args.output / 'budget.json', document(budget, points, asked))
 

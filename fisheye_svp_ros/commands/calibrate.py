@@ -25,7 +25,7 @@ from fisheye_svp_ros.commands.photographs import (
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
@@ -96,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     if args.output:
         from fisheye_svp_ros.reporting.calibration_report import write_calibration_report
 
-        with together():
+        with write_together():
             paths = {}
             for camera, one in found.items():
                 alone = not camera or (len(found) == 1 and args.output.suffix)

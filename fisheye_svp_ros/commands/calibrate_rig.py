@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.files import together, write_json, write_text
+from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_formats import kalibr, transforms
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
@@ -45,7 +45,7 @@ def calibrate_cameras(
         say('rig: left out, since no rig explains them: frames '
             + ', '.join(map(str, found.left_out)))
     if folder:
-        with together():
+        with write_together():
             _write(found, [lenses[name] for name in found.cameras], folder)
     _print(found)
 

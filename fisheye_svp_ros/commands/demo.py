@@ -16,7 +16,7 @@ from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
-from fisheye_svp_ros.io.files import together, write_json, write_text
+from fisheye_svp_ros.io.files import write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.recording import (
     Columns,
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> None:
     with progress('rectifying a pair'):
         pair, images = rectified_pair(load_lens(lens_path(args.lenses[0])))
         apart = rows_left(pair)
-    with together():
+    with write_together():
         write_columns(args.output / 'table', columns)
         write_json(args.output / 'demo.json', {
             'recording': bag and str(bag), 'rows': [row._asdict() for row in rows],

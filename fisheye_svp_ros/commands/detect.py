@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fisheye_svp_ros.commands.photographs import add_board_arguments, search
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_observations
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> None:
 
     detection = search(args.photographs, args)
     _print(detection, args.board)
-    with together():
+    with write_together():
         if args.output:
             write_observations(args.output, detection.observations)
             write_json(args.output.with_suffix('.detect.json'), _document(detection, args.board))

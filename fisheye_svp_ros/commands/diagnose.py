@@ -20,7 +20,7 @@ from fisheye_svp_ros.commands.photographs import (
 from fisheye_svp_ros.commands.plan import view_limits
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> None:
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
-            with together():
+            with write_together():
                 _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args, wanted)
     if impossible is not None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.commands.render import parabola, write_photographs
-from fisheye_svp_ros.io.files import together, write_text
+from fisheye_svp_ros.io.files import write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> None:
     printed = Print(9, 6, 0.025, bow=parabola(printed.corners, 0.0015))
     poses = board_views(lens, printed, 30, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
-    with together():
+    with write_together():
         write_photographs({'': (lens, identity())}, board(printed), poses, Exposure(), 0,
                           args.output / 'photographs', truth)
         save_lens(lens, truth / 'lens.yaml')

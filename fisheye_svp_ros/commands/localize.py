@@ -13,7 +13,7 @@ from fisheye_svp_ros.commands.photographs import add_observation_arguments, chec
 from fisheye_svp_ros.commands.photographs import read_input as read
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.csv_table import write_table
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
         note_left_out(table, measured.left_out)
         note_doubtful(table, measured.views.frame.tolist(), measured.reasons)
         if args.output:
-            with together():
+            with write_together():
                 _write(args.output / name, model, table, measured, uncertainty)
 
 

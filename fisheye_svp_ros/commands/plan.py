@@ -15,7 +15,7 @@ from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import incidence
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> None:
                    args.noise)
     wanted = planned.wanted
     if args.output:
-        with together():
+        with write_together():
             shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
             write_poses(args.output / 'poses.csv', np.arange(args.count), wanted.shots.camera)
             write_json(args.output / 'plan.json',

@@ -10,7 +10,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import OutputError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import read_columns
-from fisheye_svp_ros.io.files import together
+from fisheye_svp_ros.io.files import write_together
 from fisheye_svp_ros.io.recording import (
     NAMESPACE,
     ResidualSet,
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Draw what the source is good for."""
     table = _table_in(args.source)
-    with together():
+    with write_together():
         files = _of_table(table, args.output) if table else _of_bag(args)
     if not files:
         raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '

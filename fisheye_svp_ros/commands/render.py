@@ -15,7 +15,7 @@ from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.files import together, write_bytes
+from fisheye_svp_ros.io.files import write_bytes, write_together
 from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
 from fisheye_svp_ros.io.rig_files import cameras_in_first, rigs_of_lenses
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> None:
         poses = read_poses(args.poses).pose
     else:
         poses = _random_poses(cameras, boards, args, rng)
-    with together():
+    with write_together():
         count = write_photographs(cameras, boards, poses,
                                   Exposure(blur=args.blur, noise=args.noise), args.seed,
                                   args.output, args.output)

@@ -10,9 +10,9 @@ from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.notes import note_formats, say
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
-from fisheye_svp_ros.io.columns import Parts, as_numbers, read_columns
+from fisheye_svp_ros.io.columns import TableParts, as_numbers, read_columns
 from fisheye_svp_ros.io.documents import read_json
-from fisheye_svp_ros.io.files import read_text, together, write_json, write_text, written
+from fisheye_svp_ros.io.files import read_text, write_json, write_text, write_together, written
 from fisheye_svp_ros.io.share import sweep_path
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.reporting.progress import progress
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> None:
         lengths = ' x '.join(f'{len(v)} {name}' for name, v in plan.sweep.lists.items())
         raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); --large if that '
                              'is meant')
-    parts = Parts(args.output / _PARTS, column_types(plan))
+    parts = TableParts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
     if args.resume and _is_complete(args.output, mine):
         say(f'{args.output} holds this sweep already')
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> None:
         if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
             raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are gone; '
                               '--resume computes them anew')
-        with together():
+        with write_together():
             parts.join(args.output / 'sweep')
             _report(path, args.output, plan, mine)
         note_formats()
@@ -74,7 +74,7 @@ def _is_complete(folder: Path, mine: str) -> bool:
     return summary.exists() and read_json(summary, OutputError).get('fingerprint') == mine
 
 
-def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
+def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:
     """Make the folder of the parts this sweep's own; refuse that of another sweep.
 
     Return the engine for all of the sweep: the one that it was begun with.
@@ -94,7 +94,7 @@ def _claim(parts: Parts, mine: str, resume: bool, points: int) -> str:
     return engine
 
 
-def _solve(args: argparse.Namespace, plan: Plan, parts: Parts, engine: str) -> None:
+def _solve(args: argparse.Namespace, plan: Plan, parts: TableParts, engine: str) -> None:
     done = parts.numbers()
     remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
     count = sum(map(len, remaining))

@@ -11,7 +11,7 @@ from fisheye_svp_ros.commands.notes import note_formats, say
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
-from fisheye_svp_ros.io.files import together, write_json
+from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.recording import STAMP, Columns, is_tabulated, tabulate
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import console, print_table
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
                        '`fisheye-svp record` or `ros2 bag record`')
     _print(args.bag, columns)
     if args.output:
-        with together():
+        with write_together():
             write_columns(args.output / 'table', columns)
             write_json(args.output / 'table.json', {
                 'bag': str(args.bag), 'rows': rows, 'columns': list(columns),

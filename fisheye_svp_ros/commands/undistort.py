@@ -20,7 +20,7 @@ from fisheye_svp_ros.detect.photographs import (
     find_photographs,
 )
 from fisheye_svp_ros.errors import ObservationError, ParameterError
-from fisheye_svp_ros.io.files import together, write_bytes, write_json, write_text
+from fisheye_svp_ros.io.files import write_bytes, write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.map_files import save_maps
 from fisheye_svp_ros.io.rig_files import load_rig, rig_of_lenses
@@ -78,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Map the photographs, write maps and cameras, say what is left at other ranges."""
     sides, pair, paths = _rectifications(args)
-    with together(), progress('undistorting', count_photographs(paths)) as done:
+    with write_together(), progress('undistorting', count_photographs(paths)) as done:
         counts = _write_photographs(sides, pair, paths, args.output, done)
         left = {name: shift_left(side) for name, side in sides.items() if _has_shift(side.lens)}
         rows = rows_left(pair) if pair and left else None

@@ -22,9 +22,9 @@ from fisheye_svp_ros.detect.windows import IN_SILENCE, PIXEL, WindowProblem, Win
 # Of the lens that fits one photograph, as far as that determines it
 _FREE = (('f', 'cx', 'cy', 'k1', 'k2', 'k3'), ('f', 'cx', 'cy', 'k1'), ('f', 'k1', 'k2', 'k3'))
 _ROUNDS = 2  # the neighbours' centres are fitted, too
-_WITHIN = 0.7  # of the way from the circle's edge to the next circle's
-_LARGEST = 48.0  # px from the middle of one to the edge of the next; the image is halved then
-_SMALLEST = 3.0  # px, of a circle's lesser half axis
+_WINDOW_SHARE = 0.7  # of the way from the circle's edge to the next circle's
+_MAX_CLEARANCE = 48.0  # px from a center to the next edge; beyond, the image is halved
+_MIN_HALF_AXIS = 3.0  # px, of a circle's lesser half axis
 _UNKNOWNS = 10  # u, v; ellipse (3); log blur; brightness, contrast, its gradient
 _ROOT = float(np.sqrt(2 / np.pi))
 
@@ -44,8 +44,8 @@ def fit_circles(
     apart = float(np.sort(distance, axis=1)[:, 1].min())
     axes = local_axes(points[:, :2], start)
     longest = np.linalg.norm(axes, axis=(1, 2)).max()
-    if 0.5 * apart * longest > _LARGEST:
-        return _halved(pixels, start, points, censored)
+    if 0.5 * apart * longest > _MAX_CLEARANCE:
+        return _fit_halved_image(pixels, start, points, censored)
     radius = _radius(pixels, start, axes, 0.5 * apart)
     nothing = np.full(len(start), np.nan)
     found = Corners(start, nothing, nothing, nothing, np.zeros(len(start), dtype=bool))
@@ -53,12 +53,12 @@ def fit_circles(
         return found
     for _ in range(_ROUNDS):
         axes, bend = _bends(points, found.uv, pixels.shape, radius)
-        fitted = _fitted(pixels, found.uv, axes, bend, radius, apart, censored)
+        fitted = _fit_circles(pixels, found.uv, axes, bend, radius, apart, censored)
         found = fitted._replace(uv=np.where(fitted.ok[:, None], fitted.uv, found.uv))
     return found
 
 
-def _halved(pixels: Pixels, start: Array, points: Array, censored: bool) -> Corners:
+def _fit_halved_image(pixels: Pixels, start: Array, points: Array, censored: bool) -> Corners:
     height, width = (side // 2 * 2 for side in pixels.shape)
     half = cv2.resize(pixels[:height, :width], (width // 2, height // 2),
                       interpolation=cv2.INTER_AREA)
@@ -107,11 +107,11 @@ def _radius(pixels: Pixels, start: Array, axes: Array, reach: float) -> float:
     return float(np.median(radii or [0.0]))
 
 
-def _fitted(
+def _fit_circles(
     pixels: Pixels, start: Array, axes: Array, bend: Array, radius: float, apart: float,
     censored: bool,
 ) -> Corners:
-    reach = radius + _WITHIN * (apart - 2 * radius)
+    reach = radius + _WINDOW_SHARE * (apart - 2 * radius)
     longest = np.linalg.norm(axes, axis=(1, 2)).max()
     known = np.isfinite(bend).all()
     bend = np.nan_to_num(bend)
@@ -127,7 +127,7 @@ def _fitted(
     least = 1 / np.linalg.norm(_matrix(values), ord=2, axis=(1, 2))
     ok = (
         judged.settled & (np.linalg.norm(uv - start, axis=1) < 1 + 0.7 * least)
-        & (blur < 2 * least) & (least > _SMALLEST)
+        & (blur < 2 * least) & (least > _MIN_HALF_AXIS)
         & (np.abs(contrast) > CONTRAST * judged.noise)
         & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
     )

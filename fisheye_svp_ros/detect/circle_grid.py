@@ -16,14 +16,14 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.patterns import Pattern
 
 _BLOCKS = (31, 91, 271)  # px, of the local threshold
-_BELOW = 8  # grey levels from the mean there
-_SOFTENED = (1.0, 2.0)  # px, the least that leaves noise without contours
+_MIN_DARKNESS = 8  # grey levels from the mean there
+_SMOOTHING = (1.0, 2.0)  # px, the least that leaves noise without contours
 _LEAST, _LARGEST = 12.0, 0.02  # px^2; of the image: area of a circle
-_FILLED = 0.1  # how far its area may be from its ellipse's
+_AREA_TOLERANCE = 0.1  # how far its area may be from its ellipse's
 _RING, _EVEN = 1.3, 0.4  # of its size, where all must be another brightness; of the most
-_AROUND = np.arange(16) * np.pi / 8
+_AZIMUTHS = np.arange(16) * np.pi / 8
 _NEIGHBOUR = 1.22  # times the usual distance; diagonal neighbours are at 1.41
-_ALONG = 0.8  # least cosine between a step and the one before
+_MIN_STEP_COSINE = 0.8  # least cosine between a step and the one before
 _SEEDS = 8
 
 Grid = dict[tuple[int, int], int]
@@ -39,7 +39,7 @@ class Ellipses(NamedTuple):
 def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
     """Return the circles of a grid in a grey image, dark or bright; None without a whole one."""
     wanted = _lattice(pattern)
-    for soft, bright in itertools.product(_SOFTENED, (False, True)):
+    for soft, bright in itertools.product(_SMOOTHING, (False, True)):
         seen = _ellipses(np.asarray(cv2.GaussianBlur(image, (0, 0), soft), np.uint8), bright)
         if len(seen.centre) < len(wanted):
             continue
@@ -47,8 +47,8 @@ def find_circles(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
         off = np.linalg.norm(seen.centre - np.median(seen.centre, axis=0), axis=1)
         inner = np.lexsort((off, -near.sum(axis=1)))
         for seed in inner[:_SEEDS].tolist():
-            grid = _grown(seen, near, seed)
-            found = _placed(grid, wanted) if len(grid) >= len(wanted) else None
+            grid = _grow_grid(seen, near, seed)
+            found = _assign_blobs(grid, wanted) if len(grid) >= len(wanted) else None
             if found is not None:
                 return np.arange(len(found)), seen.centre[found]
     return None
@@ -67,7 +67,7 @@ def _ellipses(image: NDArray[np.uint8], bright: bool) -> Ellipses:
     contours: list[Any] = []
     for block in _BLOCKS:
         mask = cv2.adaptiveThreshold(image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, kind, block,
-                                     -_BELOW if bright else _BELOW)
+                                     -_MIN_DARKNESS if bright else _MIN_DARKNESS)
         contours += cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     every = _standing_out(image, _elliptic(contours, _LARGEST * image.size), bright)
     centres, matrices = np.empty((0, 2)), np.empty((0, 2, 2))
@@ -90,7 +90,7 @@ def _elliptic(contours: list[Any], largest: float) -> Ellipses:
     spread = np.stack(spreads, axis=-1)[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     inner = np.linalg.det(spread)
     own = inner > 0
-    own[own] = np.abs(4 * np.pi * np.sqrt(inner[own]) / area[own] - 1) <= _FILLED
+    own[own] = np.abs(4 * np.pi * np.sqrt(inner[own]) / area[own] - 1) <= _AREA_TOLERANCE
     size, turn = np.linalg.eigh(spread[own])
     matrices = (turn / (2 * np.sqrt(size))[:, None]) @ np.swapaxes(turn, 1, 2)
     return Ellipses(np.stack([u, v], axis=-1)[own], matrices)
@@ -102,13 +102,13 @@ def _standing_out(image: NDArray[np.uint8], found: Ellipses, bright: bool) -> El
     Noise is not, nor is the paper between circles.
     """
     height, width = image.shape
-    circle = _RING * np.stack([np.cos(_AROUND), np.sin(_AROUND)], axis=-1)
+    circle = _RING * np.stack([np.cos(_AZIMUTHS), np.sin(_AZIMUTHS)], axis=-1)
     ring = circle @ np.linalg.inv(found.matrix)
     places = np.concatenate([found.centre[:, None], found.centre[:, None] + ring], axis=1)
     u, v = np.moveaxis(np.round(places).astype(np.int64), -1, 0)
     level = image[v.clip(0, height - 1), u.clip(0, width - 1)].astype(float)
     step = (level[:, 1:] - level[:, :1]) * (-1 if bright else 1)
-    even = step.min(axis=1) > np.maximum(_EVEN * step.max(axis=1), _BELOW)
+    even = step.min(axis=1) > np.maximum(_EVEN * step.max(axis=1), _MIN_DARKNESS)
     return Ellipses(found.centre[even], found.matrix[even])
 
 
@@ -122,7 +122,7 @@ def _neighbours(found: Ellipses) -> Mask:
     return np.asarray((far < _NEIGHBOUR * usual) & (far > usual / _NEIGHBOUR))
 
 
-def _grown(found: Ellipses, near: Mask, seed: int) -> Grid:
+def _grow_grid(found: Ellipses, near: Mask, seed: int) -> Grid:
     """Return ellipses by column and row that can be reached from a first one, step by step."""
     move = found.centre[near[seed]] - found.centre[seed]
     if len(move) < 2:
@@ -140,7 +140,7 @@ def _grown(found: Ellipses, near: Mask, seed: int) -> Grid:
         for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
             other = (place[0] + sign * (axis == 0), place[1] + sign * (axis == 1))
             along = units @ _units(sign * own[place][axis], found.matrix[here])
-            if other in grid or not len(along) or along.max() < _ALONG:
+            if other in grid or not len(along) or along.max() < _MIN_STEP_COSINE:
                 continue
             next_one = int(others[np.argmax(along)])
             if next_one in used:
@@ -159,7 +159,7 @@ def _units(move: Array, matrix: Array) -> Array:
     return np.asarray(turned / np.linalg.norm(turned, axis=-1, keepdims=True))
 
 
-def _placed(grid: Grid, wanted: Index) -> list[int] | None:
+def _assign_blobs(grid: Grid, wanted: Index) -> list[int] | None:
     """Return the blobs (N,) of the wanted places, turned and moved to where all are; once."""
     found = []
     turned = wanted

@@ -18,7 +18,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.windows import IN_SILENCE, PIXEL, WindowProblem, Windows, windows
 
 _SMALLEST, _LARGEST = 2.5, 10.0  # radius of the window, px
-_WITHIN = 0.62  # of the distance to the next edge
+_WINDOW_SHARE = 0.62  # of the distance to the next edge
 _SKIRT = 2.5  # blurs of the next edge that stay out of the window
 _UNKNOWNS = 12  # u, v; of two edges angle, bend, log blur; brightness, contrast, its gradient
 CONTRAST = 6.0  # over the noise, below which a corner is not one
@@ -50,7 +50,7 @@ def fit_corners(
     distance to the next parallel edge, px; square: they are L corners; censored: light at the end
     of the scale may have been any beyond it.
     """
-    radius = np.clip(_WITHIN * clearance, _SMALLEST, _LARGEST)
+    radius = np.clip(_WINDOW_SHARE * clearance, _SMALLEST, _LARGEST)
     cut = windows(pixels, start, radius.max(initial=_SMALLEST))
     if square or not censored:
         # An edge of unknown height would move an L; paper as bright as pixels can be is usual.
@@ -71,10 +71,10 @@ def fit_corners(
     return Corners(uv, sigma, blur, contrast, ok)
 
 
-def room(clearance: Array, blur: Array) -> Array:
+def edge_clearance(clearance: Array, blur: Array) -> Array:
     """Return the clearance (N,), px, that leaves an edge so far away, and so blurred, outside."""
     reach = clearance - _SKIRT * np.sqrt(blur**2 + PIXEL)
-    return np.asarray(np.maximum(reach, _SMALLEST) / _WITHIN)
+    return np.asarray(np.maximum(reach, _SMALLEST) / _WINDOW_SHARE)
 
 
 class _Problem(WindowProblem):
@@ -105,7 +105,7 @@ class _Problem(WindowProblem):
         edges = [
             _edge(du, dv, *(values[:, k + i:k + i + 1] for k in (2, 4, 6))) for i in (0, 1)
         ]
-        corner = _inner if self._square else _cross
+        corner = _blurred_l if self._square else _cross
         between = values[:, 2:3] - values[:, 3:4]
         shape, *by_edge, by_cosine = corner(edges[0][0], edges[1][0], np.cos(between))
         light = 1 + values[:, 10:11] * du + values[:, 11:12] * dv
@@ -148,7 +148,7 @@ def _cross(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array
     )
 
 
-def _inner(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array]:
+def _blurred_l(a: Array, b: Array, alike: Array) -> tuple[Array, Array, Array, Array]:
     """Return a blurred L (A, P), -1 to 1, and its derivatives: the X and both edges, halved."""
     shape, by_a, by_b, by_alike = _cross(a, b, alike)
     edges = [(erf(d / np.sqrt(2)), _ROOT * np.exp(-0.5 * d * d)) for d in (a, b)]

@@ -16,12 +16,12 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.effort import Effort, Look
 from fisheye_svp_ros.detect.extent import goes_on
 from fisheye_svp_ros.detect.finders import FIRST_LOOKS, at_inverted, default_detector
-from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turned
+from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import OVER_EXPOSED, Points, find_points, full_scale_share
-from fisheye_svp_ros.detect.workers import Late, bounded_map
+from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
 from fisheye_svp_ros.pose import Pose
@@ -29,17 +29,17 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 SECONDS = 30.0  # a photograph
-_BLURRED = 1.5  # times the median blur, and px
-_SAME_PLACE = 0.3  # px
-_FEWEST = 3  # frames of two cameras that say how they stand
+_BLUR_LIMITS = 1.5  # times the median blur, and px
+_STANDSTILL_PX = 0.3  # px
+_MIN_RIG_FRAMES = 3  # frames of two cameras that say how they stand
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
-_UNTURNED = 'asks to be shown turned; taken as the sensor lay'
+_ROTATION_NOTE = 'asks to be shown turned; taken as the sensor lay'
 LARGER_BOARD = 'the board looks larger: its squares go on beyond the corners looked for'
-_DAMAGED = 'damaged: the JPEG decodes in part; fetch it again'
+_DAMAGE_NOTE = 'damaged: the JPEG decodes in part; fetch it again'
 
 
 @dataclass(frozen=True, eq=False)
-class Searched:
+class SearchedPhotograph:
     """One photograph after the search; points: None where there is no board, `reason` says why.
 
     notes: what is odd about it; bright: share of the board's pixels at the end of the scale;
@@ -68,7 +68,7 @@ class Detection(NamedTuple):
     """
 
     observations: Observations
-    searched: tuple[Searched, ...]
+    searched: tuple[SearchedPhotograph, ...]
     frames: Index
     image_sizes: dict[str, tuple[int, int]]
     certainty: Array
@@ -107,7 +107,7 @@ def detect(
     """
     detector = detector or default_detector(pattern)
     effort, begun = Effort(detector in FIRST_LOOKS), list[_Task]()
-    results: dict[int, Searched] = {}
+    results: dict[int, SearchedPhotograph] = {}
 
     def tasks() -> Iterator[_Task]:
         for number, photograph in enumerate(photographs):
@@ -121,11 +121,11 @@ def detect(
     def search(todo: Iterable[_Task], numbers: Sequence[int] | None = None) -> None:
         for index, result in bounded_map(examine, todo, SECONDS):
             number = index if numbers is None else numbers[index]
-            if isinstance(result, Late):
+            if isinstance(result, TimedOut):
                 one = begun[number].photograph
                 why = (f'no board within {SECONDS:g} s' if result.timed_out
                        else 'the search crashed')
-                result = Searched(one.name, one.key, one.camera, one.t, reason=why)
+                result = SearchedPhotograph(one.name, one.key, one.camera, one.t, reason=why)
             results[number] = result
             effort.note(result.points is not None, result.inverted)
             if numbers is None:
@@ -137,7 +137,7 @@ def detect(
     if effort.found:
         search((begun[number]._replace(look=effort.look(number, True))
                 for number in postponed), postponed)
-    searched = _noted(_one_size([results[number] for number in sorted(results)]))
+    searched = _add_notes(_one_size([results[number] for number in sorted(results)]))
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
@@ -150,8 +150,8 @@ def detect(
 
 
 def _moments(
-    searched: tuple[Searched, ...], sync: float | None
-) -> tuple[tuple[Searched, ...], Pairing]:
+    searched: tuple[SearchedPhotograph, ...], sync: float | None
+) -> tuple[tuple[SearchedPhotograph, ...], Pairing]:
     """Return photographs with the time that their names say, and equal keys for one moment."""
     t = np.array([one.t for one in searched])
     stamps = [stamp for one in searched if (stamp := stamp_of(one.key)) is not None]
@@ -166,16 +166,16 @@ def _moments(
                  for one, key in zip(searched, pairing.keys, strict=True)), pairing
 
 
-def examine(task: _Task) -> Searched:
+def examine(task: _Task) -> SearchedPhotograph:
     """Search one photograph; what is wrong with it becomes its reason."""
     photograph, pattern = task.photograph, task.pattern
-    blank = Searched(photograph.name, photograph.key, photograph.camera, photograph.t)
+    blank = SearchedPhotograph(photograph.name, photograph.key, photograph.camera, photograph.t)
     try:
         with caught_stderr() as said:
             pixels = photograph.pixels()
-        notes = (_UNTURNED,) if _turned(photograph) else ()
+        notes = (_ROTATION_NOTE,) if _is_rotated(photograph) else ()
         if any(line.startswith('Corrupt JPEG') for line in said):
-            notes = (*notes, _DAMAGED)
+            notes = (*notes, _DAMAGE_NOTE)
         points, inverted = _look(pixels, task)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
         text = str(cause).removeprefix(f'{photograph.name}: ')
@@ -207,14 +207,14 @@ def _look(pixels: Pixels, task: _Task) -> tuple[Points | str, bool]:
     return points, isinstance(own, str) and isinstance(inverted, Points)
 
 
-def _turned(photograph: Photograph) -> bool:
+def _is_rotated(photograph: Photograph) -> bool:
     data = photograph.data
     if isinstance(data, Path):
         data = read_bytes(data, ObservationError)
     return isinstance(data, bytes) and exif_turned(data)
 
 
-def _one_size(searched: list[Searched]) -> list[Searched]:
+def _one_size(searched: list[SearchedPhotograph]) -> list[SearchedPhotograph]:
     """Leave out boards in photographs of another size than most with a board of their camera."""
     sizes = {
         camera: Counter(one.size for one in searched if one.camera == camera and one.points)
@@ -229,16 +229,16 @@ def _one_size(searched: list[Searched]) -> list[Searched]:
     ]
 
 
-def _noted(searched: list[Searched]) -> tuple[Searched, ...]:
+def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, ...]:
     """Leave out copies; name photographs that are blurred, burnt out or from the same place."""
     blur = float(np.median([one.points.blur for one in searched if one.points] or [0.0]))
-    done: list[Searched] = []
+    done: list[SearchedPhotograph] = []
     for one in searched:
         if one.points is None:
             done.append(one)
             continue
         notes = list(one.notes)
-        if one.points.blur > max(_BLURRED, _BLURRED * blur):
+        if one.points.blur > max(_BLUR_LIMITS, _BLUR_LIMITS * blur):
             notes.append(f'blurred by {one.points.blur:.1f} px')
         if one.bright > OVER_EXPOSED:
             notes.append(f'over-exposed: {100 * one.bright:.0f} % of the board at full scale')
@@ -246,23 +246,23 @@ def _noted(searched: list[Searched]) -> tuple[Searched, ...]:
             if one.digest == other.digest:
                 one = replace(one, points=None, reason=f'a copy of {other.name}')
                 break
-            if _together(one, other):
+            if _is_same_moment(one, other):
                 notes.append(f'from the same place as {Path(other.name).name}')
                 break
         done.append(replace(one, notes=tuple(notes)))
     return tuple(done)
 
 
-def _together(one: Searched, other: Searched) -> bool:
+def _is_same_moment(one: SearchedPhotograph, other: SearchedPhotograph) -> bool:
     a, b = one.points, other.points
     if a is None or b is None:
         return False
     _, mine, theirs = np.intersect1d(a.ids, b.ids, return_indices=True)
-    return len(mine) > 3 and float(np.abs(a.uv[mine] - b.uv[theirs]).max()) < _SAME_PLACE
+    return len(mine) > 3 and float(np.abs(a.uv[mine] - b.uv[theirs]).max()) < _STANDSTILL_PX
 
 
 def _table(
-    searched: tuple[Searched, ...], pairing: Pairing, pattern: Pattern, source: str
+    searched: tuple[SearchedPhotograph, ...], pairing: Pairing, pattern: Pattern, source: str
 ) -> Detection:
     keys = sorted({one.key for one in searched}, key=[o.key for o in searched].index)
     number = {key: i for i, key in enumerate(keys)}
@@ -270,7 +270,7 @@ def _table(
     found = [one for one in searched if one.points is not None]
     certainty = np.ones(len(searched))
     if len(pattern.symmetries) > 1:
-        found, sure = _agreed(found, pattern, cameras, number, source)
+        found, sure = _agree_on_order(found, pattern, cameras, number, source)
         certainty[[one.points is not None for one in searched]] = sure
         again = iter(found)
         searched = tuple(next(again) if one.points is not None else one for one in searched)
@@ -280,10 +280,10 @@ def _table(
     return Detection(observations, searched, frames, sizes, certainty, pairing)
 
 
-def _agreed(
-    found: list[Searched], pattern: Pattern, cameras: tuple[str, ...], number: dict[str, int],
-    source: str,
-) -> tuple[list[Searched], Array]:
+def _agree_on_order(
+    found: list[SearchedPhotograph], pattern: Pattern, cameras: tuple[str, ...],
+    number: dict[str, int], source: str,
+) -> tuple[list[SearchedPhotograph], Array]:
     """Return the photographs with their corners in one order, and how sure that is."""
     table = _observations(found, pattern, cameras, number, source)
     field = np.full((len(found), len(pattern.points), 2), np.nan)
@@ -308,10 +308,10 @@ def _agreed(
     sure = np.full(len(found), np.nan)
     if seen.sum() < 3:
         return found, sure
-    leader, own = _led(found, cameras, poses, pattern)
+    leader, own = _order_by_left(found, cameras, poses, pattern)
     together = np.zeros_like(field)
     for i in np.flatnonzero(seen):
-        together[leader[i]] += np.nan_to_num(turned(field[i], pattern.symmetries[own[i]]))
+        together[leader[i]] += np.nan_to_num(turn_field(field[i], pattern.symmetries[own[i]]))
     leaders = np.unique(leader[seen])
     agreement: Agreement = agree(together[leaders], pattern.symmetries)
     done = list(found)
@@ -325,8 +325,8 @@ def _agreed(
     return done, sure
 
 
-def _led(
-    found: list[Searched], cameras: tuple[str, ...], poses: Pose, pattern: Pattern
+def _order_by_left(
+    found: list[SearchedPhotograph], cameras: tuple[str, ...], poses: Pose, pattern: Pattern
 ) -> tuple[Index, Index]:
     """Return with which photograph (S,) each one is turned, and how it is turned to fit that.
 
@@ -340,7 +340,7 @@ def _led(
             i for i in posed if found[i].camera == name and found[i].key in first), dtype=int)
         theirs = np.array([first[found[i].key] for i in mine], dtype=int)
         turns = of_rig(poses.take(theirs), poses.take(mine), pattern.points[:, :2],
-                       pattern.symmetries) if len(mine) >= _FEWEST else None
+                       pattern.symmetries) if len(mine) >= _MIN_RIG_FRAMES else None
         if turns is not None:
             leader[mine], own[mine] = theirs, turns
     return leader, own
@@ -354,8 +354,8 @@ def _turned_points(points: Points, turn: Turn) -> Points:
 
 
 def _observations(
-    found: list[Searched], pattern: Pattern, cameras: tuple[str, ...], number: dict[str, int],
-    source: str,
+    found: list[SearchedPhotograph], pattern: Pattern, cameras: tuple[str, ...],
+    number: dict[str, int], source: str,
 ) -> Observations:
     points = [one.points for one in found if one.points is not None]
     count = [len(one.ids) for one in points]

@@ -25,9 +25,9 @@ Found = tuple[Index, Array]
 Finder = Callable[[Grey, Pattern], Found | None]
 
 _ARUCO: Any = getattr(cv2, 'aruco', None)  # of opencv-contrib alone before 4.7
-_SEARCHED = 1600  # px; larger images are searched smaller first
-_MANY = 0.5  # of all points
-_SHARPENED = 2.0  # px of blur, which makes squares and cells of tags run into one another
+_SEARCH_SIZE = 1600  # px; larger images are searched smaller first
+_MIN_SHARE = 0.5  # of all points
+_SHARPENING_BLUR = 2.0  # px of blur, which makes squares and cells of tags run into one another
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _SB = cv2.CALIB_CB_ACCURACY
 _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
@@ -36,7 +36,7 @@ _SB_HARD = _SB | cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE
 def _at_small_scale(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale."""
     def search(image: Grey, pattern: Pattern) -> Found | None:
-        scale = _SEARCHED / max(image.shape)
+        scale = _SEARCH_SIZE / max(image.shape)
         if scale >= 1:
             return find(image, pattern)
         small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -46,11 +46,11 @@ def _at_small_scale(find: Finder) -> Finder:
     return search
 
 
-def _smaller(find: Finder) -> Finder:
+def _search_scaled(find: Finder) -> Finder:
     """Return a finder that searches large images at a smaller scale first."""
     def search(image: Grey, pattern: Pattern) -> Found | None:
         found = _at_small_scale(find)(image, pattern)
-        return find(image, pattern) if found is None and max(image.shape) > _SEARCHED else found
+        return find(image, pattern) if found is None and max(image.shape) > _SEARCH_SIZE else found
 
     return search
 
@@ -64,9 +64,9 @@ def _sharper(find: Finder) -> Finder:
     """Return a finder that looks again, at the sharpened image, where it finds few points."""
     def search(image: Grey, pattern: Pattern) -> Found | None:
         found = find(image, pattern)
-        if found is not None and len(found[0]) >= _MANY * len(pattern.points):
+        if found is not None and len(found[0]) >= _MIN_SHARE * len(pattern.points):
             return found
-        soft = cv2.GaussianBlur(image, (0, 0), _SHARPENED)
+        soft = cv2.GaussianBlur(image, (0, 0), _SHARPENING_BLUR)
         more = find(np.asarray(cv2.addWeighted(image, 3.0, soft, -2.0, 0.0), np.uint8), pattern)
         return max(found, more, key=lambda one: 0 if one is None else len(one[0]))
 
@@ -76,7 +76,7 @@ def _sharper(find: Finder) -> Finder:
 def classic(image: Grey, pattern: Pattern) -> Found | None:
     """cv2.findChessboardCorners."""
     ok, corners = cv2.findChessboardCorners(image, (pattern.columns, pattern.rows), flags=_CLASSIC)
-    return _all(ok, corners)
+    return _all_corners(ok, corners)
 
 
 def sector_based(image: Grey, pattern: Pattern) -> Found | None:
@@ -86,7 +86,7 @@ def sector_based(image: Grey, pattern: Pattern) -> Found | None:
             image, (pattern.columns, pattern.rows), flags=flags
         )
         if ok:
-            return _all(ok, corners)
+            return _all_corners(ok, corners)
     return None
 
 
@@ -98,7 +98,7 @@ def classic_subpixel(image: Grey, pattern: Pattern) -> Found | None:
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     corners = found[1].astype(np.float32).reshape(-1, 1, 2)
     refined = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), criteria)
-    return _all(True, refined)
+    return _all_corners(True, refined)
 
 
 def chessboard(image: Grey, pattern: Pattern) -> Found | None:
@@ -141,7 +141,7 @@ def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     return index, uv.astype(float)
 
 
-def why_none(image: Grey, pattern: Pattern) -> str:
+def explain_failure(image: Grey, pattern: Pattern) -> str:
     """Return why a board was not found, as far as the image tells."""
     if pattern.kind == 'aprilgrid' and _tags(image, pattern, 1):
         return ('no board found: its tags have a border of one cell; print the target of Kalibr, '
@@ -165,18 +165,18 @@ def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
 
 # Which patterns a detector is for, and its finder
 DETECTORS = Registry[tuple[tuple[str, ...], Finder]]('detectors', {
-    'saddle': (('chessboard',), _smaller(chessboard)),
-    'quick': (('chessboard',), _smaller(classic)),
+    'saddle': (('chessboard',), _search_scaled(chessboard)),
+    'quick': (('chessboard',), _search_scaled(classic)),
     'sb': (('chessboard',), sector_based),
     'classic': (('chessboard',), classic_subpixel),
     'charuco': (('charuco',), _sharper(charuco)),
     'aprilgrid': (('aprilgrid',), _sharper(aprilgrid)),
-    'circles': (('circles', 'asymmetric_circles'), _smaller(find_circles)),
+    'circles': (('circles', 'asymmetric_circles'), _search_scaled(find_circles)),
     'squares': (('squares',), find_squares),
 }, tuple)
 # What a detector does first, alone
 FIRST_LOOKS: dict[str, Finder] = {'saddle': _at_small_scale(classic)}
-AS_FOUND = ('sb', 'classic')  # keep their own points; the others are fitted
+UNFITTED_DETECTORS = ('sb', 'classic')  # keep their own points; the others are fitted
 
 
 def default_detector(pattern: Pattern) -> str:
@@ -184,7 +184,7 @@ def default_detector(pattern: Pattern) -> str:
     return next(name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds)
 
 
-def _all(ok: bool, corners: Any) -> Found | None:
+def _all_corners(ok: bool, corners: Any) -> Found | None:
     if not ok:
         return None
     uv = np.asarray(corners, dtype=float).reshape(-1, 2)

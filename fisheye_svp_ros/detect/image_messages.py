@@ -82,7 +82,7 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
     """Return the encoding of an Image and its numbers, (H, W) or (H, W, C)."""
     encoding = _ENCODINGS.get(message.encoding)
     if encoding is None:
-        raise ObservationError(f'{name}: encoding {_why_not(message.encoding)}')
+        raise ObservationError(f'{name}: encoding {_encoding_error(message.encoding)}')
     dtype = np.dtype(encoding.kind).newbyteorder('>' if message.is_bigendian else '<')
     data, height, step = bytes(message.data), message.height, message.step
     width = message.width * encoding.channels * dtype.itemsize
@@ -97,7 +97,7 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
     return encoding, pixels
 
 
-def _why_not(encoding: str) -> str:
+def _encoding_error(encoding: str) -> str:
     reason = 'unknown'
     if encoding.rstrip('0123456789') in _NO_BRIGHTNESS:
         reason = 'not of brightness: depth, vectors or signed numbers, say'

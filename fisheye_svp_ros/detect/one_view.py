@@ -12,7 +12,7 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
-_FITS = 0.6  # px rms; rough places are off by less, as far as no lens explains it
+_MAX_RMS = 0.6  # px rms; rough places are off by less, as far as no lens explains it
 
 
 def imaging(
@@ -29,7 +29,7 @@ def imaging(
         fitted = calibrate(table, 'kannala_brandt', (shape[1], shape[0]), free).adjusted
     except FisheyeSvpError:
         return None
-    if np.sqrt((fitted.residual**2).sum(axis=-1).mean()) > _FITS:
+    if np.sqrt((fitted.residual**2).sum(axis=-1).mean()) > _MAX_RMS:
         return None
     pose = fitted.pose.take(0)
     return lambda places: project(fitted.lens, pose.into_body(places), limited=False).uv

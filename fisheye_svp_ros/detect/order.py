@@ -18,8 +18,8 @@ from fisheye_svp_ros.pose import Pose
 
 _ROUNDS = 30
 _SHUFFLES = 8
-_TRIED = 50  # frames, each of which may say how two cameras stand
-_ALIKE = 0.1  # rad, and of the distance of the board, by which half of the frames may differ
+_MAX_FRAMES = 50  # frames, each of which may say how two cameras stand
+_MAX_SPREAD = 0.1  # rad, and of the distance of the board, by which half of the frames may differ
 
 
 class Agreement(NamedTuple):
@@ -35,7 +35,7 @@ def board_residuals(points: Array, uv: Array, residual: Array) -> Array:
     return np.asarray(np.linalg.solve(np.swapaxes(axes, -1, -2), residual[..., None])[..., 0])
 
 
-def turned(field: Array, turn: Turn) -> Array:
+def turn_field(field: Array, turn: Turn) -> Array:
     """Return residuals (..., N, 2) on the board as they are once the board is turned."""
     return np.asarray(field[..., turn.source, :] @ turn.matrix.T)
 
@@ -52,14 +52,14 @@ def of_rig(one: Pose, other: Pose, points: Array, turns: tuple[Turn, ...]) -> In
         rotation[i, 0, :2, :2] = turn.matrix
         place[i, 0, :2] = (points - points[turn.source] @ turn.matrix.T).mean(axis=0)
     between = one.inverse().compose(Pose(rotation, place).compose(other))
-    tried = Pose(*(part[:, :_TRIED].reshape(-1, *part.shape[2:]) for part in between))
+    tried = Pose(*(part[:, :_MAX_FRAMES].reshape(-1, *part.shape[2:]) for part in between))
     cosine = np.einsum('hij,gfij->hgf', tried.rotation, between.rotation) / 2 - 0.5
     away = np.linalg.norm(one.position - [*points.mean(axis=0), 0.0], axis=-1)
     off = np.arccos(np.clip(cosine, -1, 1)) + np.linalg.norm(
         tried.position[:, None, None] - between.position, axis=-1) / away
     typical = np.median(off.min(axis=1), axis=-1)
     best = int(typical.argmin())
-    return off[best].argmin(axis=0) if typical[best] < _ALIKE else None
+    return off[best].argmin(axis=0) if typical[best] < _MAX_SPREAD else None
 
 
 def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
@@ -68,29 +68,29 @@ def agree(field: Array, turns: tuple[Turn, ...]) -> Agreement:
     turns: those that nothing in the print tells apart, the first of them none.
     """
     field = np.nan_to_num(field)
-    choice, margin = _agreed(field, turns)
+    choice, margin = _best_turns(field, turns)
     # Views can be turned to agree a little on anything: as much as they do once mixed up.
     rng = np.random.default_rng(0)
     mixed = [np.stack([rng.permutation(view) for view in field]) for _ in range(_SHUFFLES)]
-    chance = float(np.mean([_agreed(one, turns)[1].mean() for one in mixed]))
+    chance = float(np.mean([_best_turns(one, turns)[1].mean() for one in mixed]))
     return Agreement(choice, _certainty(margin, chance))
 
 
-def _agreed(field: Array, turns: tuple[Turn, ...]) -> tuple[Index, Array]:
+def _best_turns(field: Array, turns: tuple[Turn, ...]) -> tuple[Index, Array]:
     """Return the best turns (V,) and how much better each is than the next, (V,)."""
-    ways = np.stack([turned(field, turn) for turn in turns])
+    ways = np.stack([turn_field(field, turn) for turn in turns])
     ways = ways.reshape(len(turns), len(field), -1)
     ways -= ways.mean(axis=0)  # what looks the same in all turns tells nothing
     ways /= np.maximum(np.linalg.norm(ways, axis=-1, keepdims=True), 1e-30)
     # Views alike in all turns say nothing: start from each view in turn, keep the best agreement.
-    found = [_settled(ways, ways[0, seed]) for seed in range(len(field))]
+    found = [_resolve_turns(ways, ways[0, seed]) for seed in range(len(field))]
     choice = max(found, key=lambda one: _likeness(ways, one)[one, np.arange(len(one))].sum())
     likeness = _likeness(ways, choice)
     ranked = np.sort(likeness, axis=0)
     return choice, np.asarray(ranked[-1] - ranked[-2]) / 2
 
 
-def _settled(ways: Array, first: Array) -> Index:
+def _resolve_turns(ways: Array, first: Array) -> Index:
     choice: Index = (ways @ first).argmax(axis=0)
     for _ in range(_ROUNDS):
         better = _likeness(ways, choice).argmax(axis=0)

@@ -18,10 +18,10 @@ from fisheye_svp_ros.io.documents import read_yaml
 _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
 _SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
-_LARGEST = 10_000  # points
+_MAX_POINTS = 10_000  # points
 _TAGS = 587  # of the family 36h11
 _NEIGHBOURS = 6
-_FURTHEST = 10.0  # m; a larger spacing is a slip of the unit
+_MAX_SPACING = 10.0  # m; a larger spacing is a slip of the unit
 
 
 class Turn(NamedTuple):
@@ -159,8 +159,8 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     if sides != [columns, rows] or columns * rows > _TAGS:
         raise ParameterError(f'{path}: tagCols x tagRows is {sides[0]:g} x {sides[1]:g}; whole '
                              f'numbers, and at most {_TAGS} tags, are needed')
-    tag = _positive(document, 'tagSize', path, _FURTHEST)
-    ratio = _positive(document, 'tagSpacing', path, _FURTHEST)
+    tag = _positive(document, 'tagSize', path, _MAX_SPACING)
+    ratio = _positive(document, 'tagSpacing', path, _MAX_SPACING)
     # As Kalibr has it: x right, y up, tags and the corners of each from the lower left.
     corner = np.array([[0.0, 0.0], [1, 0], [1, 1], [0, 1]])
     tiles = _grid(columns, rows, tag * (1 + ratio))[:, None, :2] + tag * corner
@@ -188,9 +188,9 @@ def _numbers(
         raise ParameterError(f'board {spec!r}: columns x rows and {lengths} '
                              f'length{"s"[:lengths - 1]} are needed, as in chessboard:9x6:24mm')
     columns, rows = int(size[1]), int(size[2])
-    if min(columns, rows) < least or columns * rows > _LARGEST:
+    if min(columns, rows) < least or columns * rows > _MAX_POINTS:
         raise ParameterError(f'board {spec!r}: {words[0]} points; at least {least} each way and '
-                             f'{_LARGEST} in all are needed')
+                             f'{_MAX_POINTS} in all are needed')
     return (columns, rows), [_length(spec, word) for word in words[1:]]
 
 
@@ -200,9 +200,9 @@ def _length(spec: str, word: str) -> float:
         value = float(match[1]) * _UNITS[match[2].lower()] if match else 0.0
     except ValueError:
         value = 0.0
-    if not 0 < value < _FURTHEST:
+    if not 0 < value < _MAX_SPACING:
         raise ParameterError(f'board {spec!r}: {word!r} is not a length above 0 and below '
-                             f'{_FURTHEST:g} m with its unit, as in 24.23mm')
+                             f'{_MAX_SPACING:g} m with its unit, as in 24.23mm')
     return value
 
 

@@ -28,7 +28,7 @@ IMAGES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.ppm', '.we
 VIDEOS = ('.mp4', '.avi', '.mov', '.mkv', '.webm', '.m4v')
 # Files of a rig in one folder: left01.png, right01.png; cam0_0001.png, cam1_0001.png
 _PREFIX = re.compile(r'(left|right|cam\d+)[_-]?(.+)', re.IGNORECASE)
-_COMPRESSED = '/compressed'
+_COMPRESSED_SUFFIX = '/compressed'
 _MOST_SCANS = 32  # of a JPEG, each of which may take as long as the whole image; ten are usual
 _PNG = b'\x89PNG\r\n\x1a\n'
 # Tag 0x0112 of type 3 among the twelve-byte entries of an Exif block, in either byte order
@@ -59,7 +59,7 @@ class Photograph:
         data = self.data
         if isinstance(data, Path):
             data = read_bytes(data, ObservationError)
-        return decoded(data, self.name, color)
+        return decode_image(data, self.name, color)
 
 
 def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograph]:
@@ -121,7 +121,7 @@ def is_photographs(path: Path) -> bool:
     return path.suffix.lower() in (*IMAGES, *VIDEOS)
 
 
-def decoded(data: bytes, name: str, color: bool = False) -> Pixels:
+def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
     """Return an image file in grey, at its own depth and as its sensor lay: unturned.
 
     color: of a colored one blue, green and red, (H, W, 3).
@@ -189,7 +189,7 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
     Raises ObservationError for an encoding without brightness, or data that are too short.
     """
     if typename.endswith('CompressedImage'):
-        return decoded(bytes(message.data), name)
+        return decode_image(bytes(message.data), name)
     return image_pixels(message, name)
 
 
@@ -254,7 +254,7 @@ def _recording(path: Path) -> Iterator[Photograph]:
     bag = Bag(path)
     topics = {topic for topic, kind in bag.topics() if kind in kinds}
     for record in bag.records(lambda _, kind: kind in kinds):
-        if record.topic.removesuffix(_COMPRESSED) in topics - {record.topic}:
+        if record.topic.removesuffix(_COMPRESSED_SUFFIX) in topics - {record.topic}:
             continue  # the same images once more
         stamp = record.message.header.stamp
         t = stamp.sec + 1e-9 * stamp.nanosec
@@ -266,7 +266,7 @@ def _recording(path: Path) -> Iterator[Photograph]:
 
 def _camera(topic: str, topics: set[str]) -> str:
     """Return the part of a topic that tells its camera from the recording's others."""
-    words = topic.removesuffix(_COMPRESSED).split('/')
-    others = [other.removesuffix(_COMPRESSED).split('/') for other in topics]
+    words = topic.removesuffix(_COMPRESSED_SUFFIX).split('/')
+    others = [other.removesuffix(_COMPRESSED_SUFFIX).split('/') for other in topics]
     own = [word for word in words if not all(word in other for other in others)]
     return '_'.join(own) or next((word for word in words if word in STEREO), '')

@@ -10,26 +10,33 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.detect.circle_fit import fit_circles
-from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners, room
-from fisheye_svp_ros.detect.finders import AS_FOUND, DETECTORS, Finder, Found, Grey, why_none
+from fisheye_svp_ros.detect.corner_fit import Corners, edge_clearance, fit_corners
+from fisheye_svp_ros.detect.finders import (
+    DETECTORS,
+    UNFITTED_DETECTORS,
+    Finder,
+    Found,
+    Grey,
+    explain_failure,
+)
 from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 
 OVER_EXPOSED = 0.02  # of a board's pixels at the end of the scale
-_ENOUGH = 0.5  # of the points found must turn out to be what the pattern says
+_MIN_SHARE = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _GLANCE = 350  # px, of these surroundings; without a board larger ones take up to half a second
 _SHORTEST, _LONGEST = 24, 32_766  # px, of an image that OpenCV searches
-_LEAST = 4
-_ODD = 6.0  # times the median sigma
-_ROOM = 30.0  # px to the next edge, three times the largest window
+_MIN_POINTS = 4
+_OUTLIER_SIGMAS = 6.0  # times the median sigma
+_MAX_CLEARANCE = 30.0  # px to the next edge, three times the largest window
 _NARROW, _NARROWEST = 0.6, 9.0  # of the way to the next edge, which rough points tell badly; px
 _ROUNDS, _STILL = 2, 0.3  # px that a corner may be from the middle of its window
 _STEP = 1.05  # of the size of a tag or square, to points that are looked for next
-_GROWN = 1.5  # times as many points, and the lens that says where they are is fitted anew
+_REFIT_GROWTH = 1.5  # times as many points, and the lens that says where they are is fitted anew
 _FREE = ('f', 'k1')  # of that lens
-_SOFT = 2.0  # px of blur; the window must reach well beyond it
+_SOFT_BLUR = 2.0  # px of blur; the window must reach well beyond it
 
 
 class Points(NamedTuple):
@@ -59,28 +66,28 @@ def find_points(
     if not _SHORTEST <= min(height, width) <= max(height, width) <= _LONGEST:
         return f'no board found: the image is {width} x {height} px'
     try:
-        return _found(pixels, pattern, detector, near, finder or DETECTORS[detector][1])
+        return _search(pixels, pattern, detector, near, finder or DETECTORS[detector][1])
     except cv2.error as cause:
         return f'no board found: {cause.err}'
 
 
-def _found(
+def _search(
     pixels: Pixels, pattern: Pattern, detector: str, near: Array | None, finder: Finder
 ) -> Points | str:
     grey = _eight_bit(pixels)
-    found = _near(grey, pattern, finder, near) if near is not None else None
+    found = _search_near(grey, pattern, finder, near) if near is not None else None
     found = found or finder(grey, pattern)
     if found is None:
-        return why_none(grey, pattern)
+        return explain_failure(grey, pattern)
     index, uv = found
-    if len(index) < _LEAST:
-        return f'{len(index)} points found; {_LEAST} are needed'
+    if len(index) < _MIN_POINTS:
+        return f'{len(index)} points found; {_MIN_POINTS} are needed'
     if pattern.marker:
         # Where the board was a moment ago time counts.
-        if near is None or len(index) < _ENOUGH * len(pattern.points):
-            index, uv = _completed(pixels, index, uv, pattern)
+        if near is None or len(index) < _MIN_SHARE * len(pattern.points):
+            index, uv = _complete_tags(pixels, index, uv, pattern)
     elif len(index) == len(pattern.points):
-        uv = _right_handed(uv, pattern)
+        uv = _fix_handedness(uv, pattern)
     measured = _measure(pixels, index, uv, pattern, detector, censored=True)
     if isinstance(measured, str) and full_scale_share(pixels, uv) > OVER_EXPOSED:
         # Where little light is left within the scale, only its end tells where an edge is: too far
@@ -105,11 +112,11 @@ def _measure(
     """Fit the points found at uv (M, 2), px; censored: see `corner_fit.fit_corners`."""
     if detector == 'circles':
         circles = fit_circles(pixels, uv, pattern.points[index], censored)
-        return _checked(index, circles, pattern, _surroundings(index, uv, pattern)[1])
-    corners, reach = _fitted(pixels, index, uv, pattern, detector == 'quick', censored)
-    if detector in AS_FOUND:
+        return _order_points(index, circles, pattern, _surroundings(index, uv, pattern)[1])
+    corners, reach = _fit_corners(pixels, index, uv, pattern, detector == 'quick', censored)
+    if detector in UNFITTED_DETECTORS:
         corners = corners._replace(uv=uv)
-    return _checked(index, corners, pattern, reach)
+    return _order_points(index, corners, pattern, reach)
 
 
 def search(task: tuple[Pixels, Pattern, str, Array | None]) -> Points | str | Exception:
@@ -131,7 +138,7 @@ def _surroundings(index: Index, uv: Array, pattern: Pattern) -> tuple[Array, Arr
     return axes * (pattern.inward[index, :, None] if square else 1.0), reach
 
 
-def _completed(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Found:
+def _complete_tags(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Found:
     """Return the points that a finder of tags found, and those of tags that it missed.
 
     Tags that are small, or bent through a fisheye, are not decoded.  A lens fitted to the points
@@ -154,7 +161,7 @@ def _completed(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Fou
         far, _ = cKDTree(points[found]).query(points)
         new = np.flatnonzero(missing & (far < _STEP * pattern.size))
         missing[new] = False
-        if len(new) and len(found) > _GROWN * known:
+        if len(new) and len(found) > _REFIT_GROWTH * known:
             image_of, known = imaging(points[found], where, pixels.shape, _FREE), len(found)
         if image_of is None:
             break
@@ -167,7 +174,7 @@ def _completed(pixels: Pixels, index: Index, uv: Array, pattern: Pattern) -> Fou
     return found[order], where[order]
 
 
-def _fitted(
+def _fit_corners(
     pixels: Pixels, index: Index, start: Array, pattern: Pattern, live: bool, censored: bool
 ) -> tuple[Corners, Array]:
     """Fit corners, and again where the first fit puts them; return how far (M,) is left, px.
@@ -182,20 +189,20 @@ def _fitted(
     axes, reach = _surroundings(index, start, pattern)
     first = reach if live else np.minimum(_NARROW * reach, _NARROWEST)
     corners = fit_corners(pixels, start, axes, first, square, censored)
-    wrong = _off(corners, start) if live else np.ones(len(start), dtype=bool)
+    wrong = _off_center(corners, start) if live else np.ones(len(start), dtype=bool)
     for _ in range(_ROUNDS):
         if not wrong.any():
             break
         start = np.where(corners.ok[:, None], corners.uv, start)
         axes, reach = _surroundings(index, start, pattern)
         # The next edge has its blur, too.
-        free = np.where(corners.ok, np.minimum(reach, room(reach, corners.blur)), reach)
+        free = np.where(corners.ok, np.minimum(reach, edge_clearance(reach, corners.blur)), reach)
         off = np.flatnonzero(wrong) if live else np.arange(len(start))
         again = fit_corners(pixels, start[off], axes[off], free[off], square, censored)
         for whole, part in zip(corners, again, strict=True):
             whole[off] = part
-        wrong = _off(corners, start)
-    soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT)) & (reach > _ROOM))
+        wrong = _off_center(corners, start)
+    soft = np.flatnonzero((~corners.ok | (corners.blur > _SOFT_BLUR)) & (reach > _MAX_CLEARANCE))
     if not len(soft):
         return corners, reach
     height, width = (side // 2 * 2 for side in pixels.shape)
@@ -210,7 +217,7 @@ def _fitted(
     return corners, reach
 
 
-def _off(corners: Corners, start: Array) -> Mask:
+def _off_center(corners: Corners, start: Array) -> Mask:
     """Return which corners (M,) are not in the middle of their window."""
     return np.asarray(corners.ok & (np.linalg.norm(corners.uv - start, axis=1) >= _STILL))
 
@@ -238,7 +245,7 @@ def _least_square(uv: Array, pattern: Pattern) -> Array:
         [height[:-1, :-1], height[1:, :-1], height[:-1, 1:], height[1:, 1:]]).ravel())
 
 
-def _near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | None:
+def _search_near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | None:
     low, high = near.min(axis=0), near.max(axis=0)
     margin = _MARGIN * float((high - low).max()) + 10
     height, width = grey.shape
@@ -254,7 +261,7 @@ def _near(grey: Grey, pattern: Pattern, finder: Finder, near: Array) -> Found | 
     return None if found is None else (found[0], (found[1] + 0.5) / scale - 0.5 + (left, top))
 
 
-def _right_handed(uv: Array, pattern: Pattern) -> Array:
+def _fix_handedness(uv: Array, pattern: Pattern) -> Array:
     """Return image points of a whole grid, mirrored where its columns run the wrong way."""
     if np.median(np.linalg.det(local_axes(pattern.points[:, :2], uv))) > 0:
         return uv
@@ -264,18 +271,18 @@ def _right_handed(uv: Array, pattern: Pattern) -> Array:
     return uv.reshape(pattern.rows, pattern.columns, 2)[:, ::-1].reshape(-1, 2)
 
 
-def _checked(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> Points | str:
+def _order_points(index: Index, corners: Corners, pattern: Pattern, reach: Array) -> Points | str:
     """Turn the points into the pattern's order; leave out those that are not what they must be."""
     ok, tint = corners.ok, np.sign(corners.contrast) * pattern.tint[index]
-    if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
+    if ok.sum() < max(_MIN_POINTS, _MIN_SHARE * len(ok)):
         return f'{int(ok.sum())} of {len(ok)} points are corners that can be fitted'
     if np.isfinite(corners.sigma).all():
         # One by the edge of the field, or half hidden, is not as its neighbours.
-        ok &= corners.sigma < _ODD * np.median(corners.sigma[ok])
+        ok &= corners.sigma < _OUTLIER_SIGMAS * np.median(corners.sigma[ok])
     if pattern.kind == 'chessboard' or pattern.marker:
         agreed = np.sign(tint[ok].sum())
         ok &= tint == agreed
-        if ok.sum() < max(_LEAST, _ENOUGH * len(ok)):
+        if ok.sum() < max(_MIN_POINTS, _MIN_SHARE * len(ok)):
             return 'bright and dark squares do not take turns; check the size of the board'
     if not pattern.marker and len(index) == len(pattern.points):
         grid = ok.reshape(-1, pattern.columns)

@@ -12,11 +12,11 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.patterns import Pattern
 
 _BLOCKS = (31, 61, 121, 241)  # px, of the local threshold
-_BELOW = (10, 30, 60)  # grey levels below the mean there
+_DARKNESS_LEVELS = (10, 30, 60)  # grey levels below the mean there
 _ROUNDNESS = 0.04  # of its perimeter, what a side through a fisheye may bend
-_NEAR = 0.3  # of the step to the next square, how far off its centre may be
+_MAX_OFFSET = 0.3  # of the step to the next square, how far off its centre may be
 _GROWTH = 4.0  # of the area, from square to square
-_SMALLEST = 40  # px^2
+_MIN_AREA = 40  # px^2
 
 
 def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Array] | None:
@@ -26,24 +26,24 @@ def find_squares(image: NDArray[np.uint8], pattern: Pattern) -> tuple[Index, Arr
     """
     step = 1 + float(np.linalg.norm(pattern.points[4] - pattern.points[1])
                      / pattern.size if pattern.columns > 1 else 1)
-    tries = (_quads(image, block, below) for block, below in product(_BLOCKS, _BELOW))
+    tries = (_quads(image, block, below) for block, below in product(_BLOCKS, _DARKNESS_LEVELS))
     together = np.empty((0, 4, 2))
     for quads in tries:
         # The edge of a shadow spoils some squares at each threshold, and not the same ones.
-        together = _joined(together, quads)
+        together = _merge_quads(together, quads)
         for squares in (quads, together):
             for first in range(len(squares)):
-                found = _whole(_grown(squares, first, step), pattern)
+                found = _complete_corners(_grow_grid(squares, first, step), pattern)
                 if found is not None:
                     return np.arange(4 * pattern.columns * pattern.rows), found
     return None
 
 
-def _joined(quads: Array, more: Array) -> Array:
+def _merge_quads(quads: Array, more: Array) -> Array:
     """Return quadrilaterals and those of `more` that lie elsewhere."""
     distance = np.linalg.norm(more.mean(axis=1)[:, None] - quads.mean(axis=1), axis=-1)
     size = np.linalg.norm(more[:, 2] - more[:, 0], axis=-1)
-    return np.concatenate([quads, more[distance.min(axis=1, initial=np.inf) > _NEAR * size]])
+    return np.concatenate([quads, more[distance.min(axis=1, initial=np.inf) > _MAX_OFFSET * size]])
 
 
 def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
@@ -53,7 +53,7 @@ def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
     contours, _ = cv2.findContours(dark, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     quads = []
     for contour in contours:
-        if cv2.contourArea(contour) < _SMALLEST:
+        if cv2.contourArea(contour) < _MIN_AREA:
             continue
         corners = cv2.approxPolyDP(contour, _ROUNDNESS * cv2.arcLength(contour, True), True)
         if len(corners) == 4 and cv2.isContourConvex(corners):
@@ -64,7 +64,7 @@ def _quads(image: NDArray[np.uint8], block: int, below: int) -> Array:
     return np.array(quads).reshape(-1, 4, 2)
 
 
-def _grown(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array]:
+def _grow_grid(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array]:
     """Return the squares by column and row that can be reached from the first one."""
     grid = {(0, 0): quads[first]}
     centres = quads.mean(axis=1)
@@ -79,7 +79,7 @@ def _grown(quads: Array, first: int, step: float) -> dict[tuple[int, int], Array
             move = step * (dx * sides[0] + dy * sides[1])
             distance = np.linalg.norm(centres - quad.mean(axis=0) - move, axis=1)
             nearest = int(np.argmin(distance))
-            far = distance[nearest] > _NEAR * np.linalg.norm(move)
+            far = distance[nearest] > _MAX_OFFSET * np.linalg.norm(move)
             growth = _area(quads[nearest]) / _area(quad)
             unlike = not 1 / _GROWTH < growth < _GROWTH
             if place in grid or nearest in used or far or unlike:
@@ -97,7 +97,7 @@ def _area(quad: Array) -> float:
     return abs(float(a[0] * b[1] - a[1] * b[0])) / 2
 
 
-def _whole(grid: dict[tuple[int, int], Array], pattern: Pattern) -> Array | None:
+def _complete_corners(grid: dict[tuple[int, int], Array], pattern: Pattern) -> Array | None:
     """Return the corners (N, 2) of a complete grid, turned by a quarter where need be."""
     places = np.array(list(grid))
     low, size = places.min(axis=0), np.ptp(places, axis=0) + 1

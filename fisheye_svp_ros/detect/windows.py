@@ -22,11 +22,11 @@ from fisheye_svp_ros.solve.least_squares import Arrays, dense_step, levenberg_ma
 SMOOTHING = 0.8  # px; sharpened photographs have edges that would fall between pixels
 PIXEL = 1 / 12 + SMOOTHING**2  # px^2: what pixels and smoothing add to the blur
 _ITERATIONS = 25
-_FEW = 8  # points of one photograph, whose noise tells little of each other's
+_MIN_POINTS = 8  # points of one photograph, whose noise tells little of each other's
 _MUCH, _CHANCE = 4.0, 1e-6  # so much noisier a window is not by chance
-_KEPT = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after smoothing
+_NOISE_RATIO = 1 / (4 * np.pi * SMOOTHING**2)  # of the variance of white noise, after smoothing
 _PROBES, _EACH = 64, 8  # windows of noise, and how many of them tell what one window leaves
-_TOUCHED = 0.02  # of a smoothed pixel
+_CLIP_SHARE = 0.02  # of a smoothed pixel
 _SIGHT = 4  # px that smoothing sees
 _ROUNDING = 1 / 12  # variance of a whole number
 _RIM = 2  # px along the border, where smoothing has seen the image's mirror image
@@ -54,7 +54,7 @@ class Windows(NamedTuple):
     rounding: float
 
 
-class Judged(NamedTuple):
+class FitQuality(NamedTuple):
     """How sure fits (N,) are: sigma of u and of v, px; noise, of a smoothed pixel; settled.
 
     noise2, gain2, freedom (N,): variance of a pixel, what it is multiplied by, of how many.
@@ -72,10 +72,10 @@ class Judged(NamedTuple):
 
         Something else is in the windows of the others.
         """
-        if ok.sum() < _FEW:
+        if ok.sum() < _MIN_POINTS:
             return self.sigma, ok
         sigma, ok = self.sigma.copy(), ok.copy()
-        alike, foreign = _moderated(self.noise2[ok], self.freedom[ok])
+        alike, foreign = _shrink_variances(self.noise2[ok], self.freedom[ok])
         sigma[ok] = np.sqrt(alike * self.gain2[ok])
         ok[ok] = ~foreign
         return sigma, ok
@@ -93,16 +93,16 @@ def windows(pixels: Pixels, start: Array, reach: float) -> Windows:
     inside = ((columns >= _RIM) & (columns < width - _RIM)
               & (rows >= _RIM) & (rows < height - _RIM))
     rows, columns = np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)
-    top, bottom = _seen(rows)
-    left, right = _seen(columns)
+    top, bottom = _smoothing_support(rows)
+    left, right = _smoothing_support(columns)
     around, at = pixels[top:bottom, left:right], (rows - top, columns - left)
     smooth = cv2.GaussianBlur(around.astype(np.float32), (0, 0), SMOOTHING)
     return Windows(smooth[at].astype(float), np.stack([u, v]).astype(float), place, inside,
-                   inside & _clipped(around)[at], 2 * half + 1, round_,
+                   inside & _clipped_mask(around)[at], 2 * half + 1, round_,
                    _ROUNDING if pixels.dtype.kind == 'u' else 0.0)
 
 
-def _seen(at: Index) -> tuple[int, int]:
+def _smoothing_support(at: Index) -> tuple[int, int]:
     """Return from where to where smoothing sees pixels at these places along an axis."""
     return max(int(at.min()) - _SIGHT, 0), int(at.max()) + _SIGHT + 1
 
@@ -170,7 +170,7 @@ class WindowProblem(ABC):
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         return (state[0] + step[0],)
 
-    def judge(self, values: Array, symmetric: bool) -> Judged:
+    def judge(self, values: Array, symmetric: bool) -> FitQuality:
         """Return how sure solutions (N, U) are.
 
         symmetric: of a window that looks the same from both sides of its point, only what differs
@@ -192,7 +192,7 @@ class WindowProblem(ABC):
         whole = np.zeros((len(values), 2 + _EACH, cut.side**2))
         whole[..., cut.round] = np.concatenate([weight[:, None], residual[:, None], noise], axis=1)
         if symmetric:
-            share, left = _odd(whole, values[:, :2], cut.side)
+            share, left = _odd_part(whole, values[:, :2], cut.side)
         else:
             share, left = whole[:, :1], whole[:, 1:]
         products = (share * left) @ np.swapaxes(left, -1, -2)
@@ -215,10 +215,10 @@ class WindowProblem(ABC):
         left = np.linalg.norm((covariance[:, :2] @ pull[..., None])[..., 0], axis=1)
         settled = np.isfinite(values).all(axis=1) & (sigma < 1) & (left < 0.1 * sigma + self.slack)
         settled &= weight.sum(axis=1) > values.shape[1]  # fewer pixels than unknowns fit anything
-        return Judged(sigma, np.sqrt(_KEPT * noise2), settled, noise2, gain2, freedom)
+        return FitQuality(sigma, np.sqrt(_NOISE_RATIO * noise2), settled, noise2, gain2, freedom)
 
 
-def _clipped(pixels: Pixels) -> Mask:
+def _clipped_mask(pixels: Pixels) -> Mask:
     """Return which smoothed pixels (H, W) hold some of those at the end of the scale."""
     if pixels.dtype.kind != 'u':
         return np.zeros(pixels.shape, dtype=bool)
@@ -226,10 +226,10 @@ def _clipped(pixels: Pixels) -> Mask:
     if not full.any():
         return full
     full = full.astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(full, (0, 0), SMOOTHING) > _TOUCHED)
+    return np.asarray(cv2.GaussianBlur(full, (0, 0), SMOOTHING) > _CLIP_SHARE)
 
 
-def _moderated(noise2: Array, freedom: Array) -> tuple[Array, Mask]:
+def _shrink_variances(noise2: Array, freedom: Array) -> tuple[Array, Mask]:
     """Return variances (N,), each from so few degrees of freedom, drawn towards their common one.
 
     By as much as they scatter no more than variances of one noise do (empirical Bayes).  Also
@@ -256,7 +256,7 @@ def _unit_noise(side: int) -> Array:
     return np.asarray(smooth.reshape(_PROBES, -1))
 
 
-def _odd(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
+def _odd_part(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
     """Return weights (N, 1, P), and the parts of residuals (N, K, P) odd about corners (N, 2), px.
 
     windows (N, 1 + K, P): weights, then residuals.

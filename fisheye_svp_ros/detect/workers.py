@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 
 _START = 60.0  # s a process may take to start
 # bytes; arrays come and go, and memory that glibc gave back would be cleared again, page by page
-_KEPT = {'MALLOC_MMAP_THRESHOLD_': str(2**25), 'MALLOC_TRIM_THRESHOLD_': str(2**27)}
+_MALLOC_LIMITS = {'MALLOC_MMAP_THRESHOLD_': str(2**25), 'MALLOC_TRIM_THRESHOLD_': str(2**27)}
 # No process of multiprocessing, which would run a caller's script anew from its first line.
 _PROGRAM = ('import sys; sys.path[:] = sys.argv[2:]; '
             'from fisheye_svp_ros.detect.workers import serve; serve(int(sys.argv[1]))')
 
 
-class Late(NamedTuple):
+class TimedOut(NamedTuple):
     """What comes in place of a result: the item took too long, or its process died."""
 
     timed_out: bool
@@ -37,7 +37,8 @@ class _Worker:
             with theirs:
                 self.process = subprocess.Popen(
                     [sys.executable, '-c', _PROGRAM, str(theirs.fileno()), *sys.path],
-                    env=_KEPT | os.environ, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+                    env=_MALLOC_LIMITS | os.environ, pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
         self.pipe.send(function)
@@ -77,14 +78,14 @@ def bounded_map(
                 late = time.monotonic() > worker.deadline
                 if worker.pipe not in ready and not late:
                     continue
-                result: Any = Late(late)
+                result: Any = TimedOut(late)
                 if worker.pipe in ready:
                     try:
                         result = worker.pipe.recv()
                     except (EOFError, OSError):
-                        result = Late(False)
+                        result = TimedOut(False)
                 yield worker.number, result
-                following = None if isinstance(result, Late) else next(waiting, None)
+                following = None if isinstance(result, TimedOut) else next(waiting, None)
                 if following is None:
                     busy.remove(worker)
                     worker.stop()
@@ -122,14 +123,14 @@ class BoundedCalls:
             if worker.pipe.poll():
                 result, self._busy = worker.pipe.recv(), False
         except (EOFError, OSError):
-            result = Late(False)
+            result = TimedOut(False)
         if result is None and time.monotonic() > worker.deadline:
-            result = Late(True)
-        if isinstance(result, Late):
+            result = TimedOut(True)
+        if isinstance(result, TimedOut):
             worker.stop()
             self._replace()
         # The result of the warming up is nobody's.
-        return None if worker.number == 0 and not isinstance(result, Late) else result
+        return None if worker.number == 0 and not isinstance(result, TimedOut) else result
 
     def stop(self) -> None:
         """End the process."""

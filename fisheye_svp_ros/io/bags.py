@@ -28,18 +28,18 @@ from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.databases import database_messages, database_topics
 from fisheye_svp_ros.io.mcap import RawMessage, listed_topics, whole_messages
 from fisheye_svp_ros.io.recording_files import (
+    decompress_file,
     metadata_topics,
     recording_files,
-    unpacked,
     unpacked_message,
 )
 
-_SHOWN = 3  # places of damage
+_MAX_LISTED = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _FOREVER = QosTime(9223372036, 854775807)  # as rmw has it
 
 
-class Offered(NamedTuple):
+class OfferedQos(NamedTuple):
     """The quality of service a publisher offers, as far as a player of a recording needs it."""
 
     reliable: bool = True
@@ -114,7 +114,9 @@ class BagWriter:
         except OSError as cause:
             raise BagError(f'{self.path}: cannot be completed ({cause.strerror})') from cause
 
-    def add(self, topic: str, typename: str, offered: Sequence[Offered] = (Offered(),)) -> None:
+    def add(
+        self, topic: str, typename: str, offered: Sequence[OfferedQos] = (OfferedQos(),)
+    ) -> None:
         """Begin a topic, so that whoever plays the recording offers what its publishers did.
 
         Raises BagError for a type that is not known.
@@ -191,16 +193,16 @@ class Bag:
                 continue
             yield Record(topic, typename, when, message)
         if notes:
-            more = f' and {len(notes) - _SHOWN} more' if len(notes) > _SHOWN else ''
+            more = f' and {len(notes) - _MAX_LISTED} more' if len(notes) > _MAX_LISTED else ''
             self.damage = ('it is damaged: only what is whole is read; '
-                           + '; '.join(notes[:_SHOWN]) + more)
+                           + '; '.join(notes[:_MAX_LISTED]) + more)
 
     def topics(self) -> set[tuple[str, str]]:
         """Return what topics there are, and of which types.
 
         Raises BagError where nothing can be read.
         """
-        listed = [_listed(file) for file in self._files()]
+        listed = [_list_topics(file) for file in self._files()]
         if all(listed):
             return set().union(*listed)
         return {(message.topic, message.typename) for message in self._raw(_ignore, _ignore)}
@@ -219,7 +221,7 @@ class Bag:
             note(problem)
 
         for file in self._files():
-            with unpacked(file, say) as plain:
+            with decompress_file(file, say) as plain:
                 read = database_messages if plain.suffix == '.db3' else whole_messages
                 for message in read(plain, say, passed if plain == file else _ignore):
                     count += 1
@@ -228,10 +230,10 @@ class Bag:
                 passed(file.stat().st_size)
         if problems and not count:
             raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
-                           f'({"; ".join(problems[:_SHOWN])})')
+                           f'({"; ".join(problems[:_MAX_LISTED])})')
 
 
-def _listed(file: Path) -> set[tuple[str, str]]:
+def _list_topics(file: Path) -> set[tuple[str, str]]:
     """Return the topics and types that a file, or the metadata beside it, lists; empty if not."""
     if file.suffix == '.zstd':
         return metadata_topics(file.parent)  # it is not unpacked for this alone
@@ -242,7 +244,7 @@ def _ignore(_: object) -> None:
     pass
 
 
-def _profile(offered: Offered) -> Qos:
+def _profile(offered: OfferedQos) -> Qos:
     """Return a profile as a recording holds it; discovery does not tell of the history."""
     return Qos(
         history=QosHistory.KEEP_LAST,

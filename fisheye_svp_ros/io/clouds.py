@@ -22,16 +22,16 @@ RESIDUALS = np.dtype([
     *IMAGE_POINTS.descr, ('du', '<f8'), ('dv', '<f8'), ('theta', '<f8'), ('range', '<f8')
 ])
 
-LARGEST = 1e12  # m or px; squares and products of anything larger are soon no numbers
-_LONGEST = 1 << 16  # bytes of a point
+MAX_VALUE = 1e12  # m or px; squares and products of anything larger are soon no numbers
+_MAX_POINT_BYTES = 1 << 16  # bytes of a point
 _MOST_FIELDS = 100
 
 # sensor_msgs/PointField: datatype numbers.
 DATATYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
-_KINDS = {'u': ('iu', 'a whole number'), 'f': ('f', 'a floating-point number')}
+_NUMBER_KINDS = {'u': ('iu', 'a whole number'), 'f': ('f', 'a floating-point number')}
 
 
-def structured(layout: np.dtype[np.void], landmark: Index, *columns: Array) -> Points:
+def structured_array(layout: np.dtype[np.void], landmark: Index, *columns: Array) -> Points:
     """Return an array (N,) of `layout` from ids (N,) and its other fields, each (N,)."""
     points = np.empty(len(landmark), dtype=layout)
     for name, values in zip(layout.names or (), (landmark, *columns), strict=True):
@@ -51,7 +51,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
         if name not in (raw.dtype.names or ()):
             needed = ', '.join(layout.names or ())
             raise ObservationError(f'{what}: field {name!r} is missing; needed are {needed}')
-        kinds, kind = _KINDS[layout[name].kind]
+        kinds, kind = _NUMBER_KINDS[layout[name].kind]
         if raw.dtype[name].kind not in kinds:
             given = raw.dtype[name]
             raise ObservationError(f'{what}: field {name!r} is {given}; {kind} is needed')
@@ -60,7 +60,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
             bad = int(np.argmin(usable))
             raise ObservationError(
                 f'{what}: field {name!r} of point {bad} is {raw[name][bad]}; leave out '
-                f'points without a value, or beyond {LARGEST:g}'
+                f'points without a value, or beyond {MAX_VALUE:g}'
             )
         points[name] = raw[name]
     if len(set(points['landmark'].tolist())) < len(points):
@@ -71,7 +71,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
 
 def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool_]:
     if kind.kind == 'f':
-        return np.asarray(np.abs(values) <= LARGEST)  # not so for NaN
+        return np.asarray(np.abs(values) <= MAX_VALUE)  # not so for NaN
     if values.dtype == kind:
         return np.ones(values.shape, dtype=bool)
     return np.asarray((values >= 0) & (values <= np.iinfo(kind).max))
@@ -79,10 +79,10 @@ def _representable(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[np.bool
 
 def _raw_points(cloud: Any, what: str) -> Points:
     step, count = int(cloud.point_step), int(cloud.width) * int(cloud.height)
-    if step > _LONGEST or len(cloud.fields) > _MOST_FIELDS:
+    if step > _MAX_POINT_BYTES or len(cloud.fields) > _MOST_FIELDS:
         raise ObservationError(
             f'{what}: {len(cloud.fields)} fields in a point of {step} bytes; at most '
-            f'{_MOST_FIELDS} in {_LONGEST} are read'
+            f'{_MOST_FIELDS} in {_MAX_POINT_BYTES} are read'
         )
     fields = tuple((f.name, int(f.offset), int(f.datatype), int(f.count)) for f in cloud.fields)
     layout = _layout(fields, step, bool(cloud.is_bigendian), what)

@@ -23,11 +23,11 @@ from fisheye_svp_ros.io.files import read_bytes, replacing, write_text
 
 _ROWS = 1 << 16  # of a row group
 _MOST_CELLS = 100_000_000
-_OLDEST = 15  # of pyarrow: from there on pages have checksums
-_LARGEST = 2**63 - 1  # whole number of a Parquet table
+_MIN_PYARROW = 15  # of pyarrow: from there on pages have checksums
+_MAX_INTEGER = 2**63 - 1  # whole number of a Parquet table
 _NAMES = b'fisheye_svp_ros: CRC of the names'  # the foot of a Parquet file has no checksum
 
-_WHOLE = re.compile(r'[+-]?[0-9]{1,18}')
+_INTEGER = re.compile(r'[+-]?[0-9]{1,18}')
 _NUMBER = re.compile(r'[+-]?(([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?|nan|inf)', re.IGNORECASE)
 
 Columns = Mapping[str, Sequence[Any]]
@@ -39,8 +39,8 @@ def arrow() -> tuple[Any, str]:
     try:
         pyarrow = import_module('pyarrow')
         import_module('pyarrow.parquet')
-        if int(pyarrow.__version__.partition('.')[0]) < _OLDEST:
-            raise ImportError(f'{pyarrow.__version__} is older than {_OLDEST}')
+        if int(pyarrow.__version__.partition('.')[0]) < _MIN_PYARROW:
+            raise ImportError(f'{pyarrow.__version__} is older than {_MIN_PYARROW}')
     except Exception as cause:  # beside an older NumPy it ends in more than one way
         return None, f'no Parquet file, the CSV file has it all: pyarrow is not usable ({cause})'
     return pyarrow, ''
@@ -55,7 +55,7 @@ def write_columns(path: Path, columns: Columns) -> list[Path]:
     return _write(path, list(columns), None, [columns])
 
 
-class Parts:
+class TableParts:
     """A table that grows part by part in a folder, each written whole; a part has a number.
 
     types: of the columns.  What a kill leaves behind is whole parts and nothing else.
@@ -91,8 +91,8 @@ class Parts:
             for name, kind in self._types.items():
                 if not all(type(cell) in (kind, type(None)) for cell in part[name]):
                     raise ValueError(f'{name} holds other values than {kind.__name__}')
-                if kind is int and any(abs(cell or 0) > _LARGEST for cell in part[name]):
-                    raise ValueError(f'{name} holds a number above {_LARGEST}')
+                if kind is int and any(abs(cell or 0) > _MAX_INTEGER for cell in part[name]):
+                    raise ValueError(f'{name} holds a number above {_MAX_INTEGER}')
         except (OutputError, ValueError, TypeError) as cause:
             raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
                               'compute it anew') from cause
@@ -118,7 +118,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
     """
     if path.suffix == '.csv':
         try:
-            return {name: typed(cells) for name, cells in CsvTable(path, ()).items()}
+            return {name: parse_cells(cells) for name, cells in CsvTable(path, ()).items()}
         except ObservationError as cause:
             raise OutputError(str(cause)) from cause
     pyarrow, problem = arrow()
@@ -133,7 +133,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
             raise ValueError(f'more than {_MOST_CELLS} cells')
         if (about.metadata or {}).get(_NAMES, _checksum(names)) != _checksum(names):
             raise ValueError('the names of its columns are not those that were written')
-        columns = {name: _plain(pyarrow, file.read([name]).column(name)) for name in names}
+        columns = {name: _to_python(pyarrow, file.read([name]).column(name)) for name in names}
         rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
         if {about.num_rows, rows, *map(len, columns.values())} != {rows}:
             raise ValueError('its columns do not have the rows that were written')
@@ -142,7 +142,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
         raise OutputError(f'{path}: not a table ({cause or type(cause).__name__})') from cause
 
 
-def _plain(pyarrow: Any, column: Any) -> list[Any]:
+def _to_python(pyarrow: Any, column: Any) -> list[Any]:
     """Return a column of numbers or text; None is an empty cell."""
     kinds = pyarrow.types
     if not any(test(column.type) for test in (
@@ -153,9 +153,9 @@ def _plain(pyarrow: Any, column: Any) -> list[Any]:
     return cells
 
 
-def typed(cells: Sequence[str | None]) -> list[Any]:
+def parse_cells(cells: Sequence[str | None]) -> list[Any]:
     """Return whole numbers or numbers where every cell is one or empty; the text otherwise."""
-    for kind, form in ((int, _WHOLE), (float, _NUMBER)):
+    for kind, form in ((int, _INTEGER), (float, _NUMBER)):
         if all(not cell or form.fullmatch(cell) for cell in cells):
             return [kind(cell) if cell else None for cell in cells]
     return list(cells)

@@ -20,10 +20,10 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.files import read_text, write_text
 
-_SHOWN = 60  # characters of a header
+_MAX_HEADER = 60  # characters of a header
 _RECENT = 1e9  # s since 1970, in 2001
 _PER_SECOND = {'nanoseconds': 1e9, 'microseconds': 1e6, 'milliseconds': 1e3}
-_LARGEST = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
+_MAX_VALUE = 1e12  # m, px or s; squares and products of anything larger are soon no numbers
 
 
 class CsvTable:
@@ -71,12 +71,12 @@ class CsvTable:
         """Return columns as finite numbers (N, len(names)) of at most 1e12."""
         values = np.stack([self._numbers(name) for name in names], axis=-1)
         for name, column in zip(names, values.T, strict=True):
-            needed = f'a number of at most {_LARGEST:g}'
+            needed = f'a number of at most {_MAX_VALUE:g}'
             if name == 't':
                 unit = _stamp_unit(column)
                 needed = 'a time in seconds' + (
                     f' (these are {unit}: divide by {_PER_SECOND[unit]:g})' if unit else '')
-            self.refuse(np.abs(column) > _LARGEST, name, needed)
+            self.refuse(np.abs(column) > _MAX_VALUE, name, needed)
         return values
 
     def whole(self, name: str, most: int = 2**53) -> Index:
@@ -121,7 +121,7 @@ class CsvTable:
             if name not in self._header:
                 raise ObservationError(
                     f'{self.path}: column {name!r} is missing from its header, '
-                    f'{there[:_SHOWN]!r}; needed are {wanted}'
+                    f'{there[:_MAX_HEADER]!r}; needed are {wanted}'
                 )
         twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:

@@ -14,7 +14,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.clouds import IMAGE_POINTS, LANDMARKS, LARGEST, RESIDUALS, Points, unpack
+from fisheye_svp_ros.io.clouds import IMAGE_POINTS, LANDMARKS, MAX_VALUE, RESIDUALS, Points, unpack
 from fisheye_svp_ros.pose import Pose, rotation_from_quaternion
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
@@ -110,9 +110,9 @@ def read_camera_info(message: Any, topic: str = 'camera_info') -> CameraModel:
     k, d = [float(value) for value in message.k], tuple(float(value) for value in message.d)
     if not k[0]:
         raise ObservationError(f'{topic}: k is 0, as of a camera that is not calibrated')
-    if not (np.abs([*k, *d]) <= LARGEST).all():  # not so for NaN
+    if not (np.abs([*k, *d]) <= MAX_VALUE).all():  # not so for NaN
         raise ObservationError(f'{topic}: k or d holds a value that is not a finite number, or '
-                               f'beyond {LARGEST:g}')
+                               f'beyond {MAX_VALUE:g}')
     size, roi = (int(message.width), int(message.height)), message.roi
     part = roi.x_offset or roi.y_offset or (roi.width or size[0], roi.height or size[1]) != size
     if part or max(message.binning_x, message.binning_y) > 1:
@@ -142,8 +142,8 @@ def _pose(position: Any, orientation: Any, topic: str) -> Pose:
     quaternion = np.array([orientation.x, orientation.y, orientation.z, orientation.w])
     if not (np.isfinite(place).all() and np.isfinite(quaternion).all()):
         raise ObservationError(f'{topic}: the pose holds a value that is not a finite number')
-    if np.abs(place).max() > LARGEST:
-        raise ObservationError(f'{topic}: the position is beyond {LARGEST:g} m')
+    if np.abs(place).max() > MAX_VALUE:
+        raise ObservationError(f'{topic}: the position is beyond {MAX_VALUE:g} m')
     if np.abs(quaternion).max() > 2 or abs(np.linalg.norm(quaternion) - 1) > 1e-3:
         raise ObservationError(f'{topic}: the orientation is not a unit quaternion')
     return Pose(rotation_from_quaternion(quaternion), place)

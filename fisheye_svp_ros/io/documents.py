@@ -72,7 +72,7 @@ def parse_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> di
     node = compose_yaml(text, where, error)
     loader = _Loader('')
     try:
-        with _told(where, error):
+        with _convert_errors(where, error):
             document = loader.construct_document(node) if node else None
     finally:
         loader.dispose()
@@ -86,15 +86,15 @@ def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> 
     if len(text) > LARGEST_YAML:
         raise error(f'{where}: above {LARGEST_YAML >> 20} MB, which is more than is read as YAML')
     depth = values = 0
-    with _told(where, error):
+    with _convert_errors(where, error):
         for event in yaml.parse(text, _Loader):
             opens = isinstance(event, yaml.CollectionStartEvent)
             depth += opens - isinstance(event, yaml.CollectionEndEvent)
             values += opens or isinstance(event, yaml.ScalarEvent)
             if isinstance(event, yaml.AliasEvent):
-                raise _refused('an alias; write out what it stands for', event)
+                raise _yaml_error('an alias; write out what it stands for', event)
             if depth > _DEEPEST or values > _MOST_VALUES:
-                raise _refused(f'more than {_MOST_VALUES} values, or nested deeper than '
+                raise _yaml_error(f'more than {_MOST_VALUES} values, or nested deeper than '
                                f'{_DEEPEST}', event)
         node: yaml.Node | None = yaml.compose(text, _Loader)
         _refuse_repeated_keys(node)
@@ -143,17 +143,17 @@ def _refuse_repeated_keys(node: yaml.Node | None) -> None:
         for key, value in one.value:
             name = key.value if isinstance(key, yaml.ScalarNode) else id(key)
             if name in seen:
-                raise _refused(f'the key {name!r} a second time', key)
+                raise _yaml_error(f'the key {name!r} a second time', key)
             seen.add(name)
             nodes += (key, value)
 
 
-def _refused(what: str, place: Any) -> yaml.MarkedYAMLError:
+def _yaml_error(what: str, place: Any) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=f'there is {what}', problem_mark=place.start_mark)
 
 
 @contextmanager
-def _told(where: str | Path, error: type[FisheyeSvpError]) -> Iterator[None]:
+def _convert_errors(where: str | Path, error: type[FisheyeSvpError]) -> Iterator[None]:
     try:
         yield
     except yaml.YAMLError as cause:

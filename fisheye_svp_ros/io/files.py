@@ -17,13 +17,13 @@ from typing import Any
 
 from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
 
-LARGEST = 1 << 30  # bytes of a table or a photograph
+MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
-_PIECE = 1 << 20  # bytes
+_BLOCK_BYTES = 1 << 20  # bytes
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
 
 
-def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = LARGEST) -> bytes:
+def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> bytes:
     """Return what a regular file holds; raise `error` for any other, and above `most` bytes."""
     try:
         # Unlike Path.open, this does not wait for whoever writes into a pipe.
@@ -32,7 +32,7 @@ def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = LARGE
             if not stat.S_ISREG(found.st_mode):
                 raise error(f'{path}: not a regular file; give one')
             size, data = found.st_size, bytearray()
-            while size <= most and (piece := stream.read(_PIECE)):
+            while size <= most and (piece := stream.read(_BLOCK_BYTES)):
                 data += piece
                 size = max(size, len(data))
     except (OSError, ValueError) as cause:
@@ -43,7 +43,7 @@ def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = LARGE
     return bytes(data)
 
 
-def read_text(path: str | Path, error: type[FisheyeSvpError], most: int = LARGEST) -> str:
+def read_text(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> str:
     """Return the text of a regular file in UTF-8; raise `error` as `read_bytes` does."""
     try:
         return read_bytes(path, error, most).decode('utf-8-sig')
@@ -85,7 +85,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def together() -> Iterator[None]:
+def write_together() -> Iterator[None]:
     """Have all files that are written in the block appear when it succeeds, or none of them."""
     if _waiting.get() is not None:
         yield
@@ -94,7 +94,7 @@ def together() -> Iterator[None]:
     token = _waiting.set(waiting)
     try:
         yield
-        with _undisturbed():
+        with _defer_signals():
             for target, temporary in waiting.items():
                 try:
                     temporary.replace(target)
@@ -107,7 +107,7 @@ def together() -> Iterator[None]:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
+def _defer_signals() -> Iterator[None]:
     """Keep SIGINT and SIGTERM back until the block is done."""
     if threading.current_thread() is not threading.main_thread():
         yield

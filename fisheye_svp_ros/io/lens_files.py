@@ -29,12 +29,12 @@ C = TypeVar('C', bound=Curve)
 
 _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift', 'corrections',
            'target', 'calibration', 'uncertainty', 'provenance'}
-LARGEST = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
-_MOST = 1e12  # any number of a lens
+MAX_LENS_BYTES = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
+_MAX_NUMBER = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
 _NO_LENSES = ('rig', 'camchain', 'tf_static')  # files of a rig beside those of its lenses
 OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
-_OLD = 'effects'  # what older files call corrections, of the lens and of the target alike
+_LEGACY_KEY = 'effects'  # what older files call corrections, of the lens and of the target alike
 
 
 def load_lens(path: str | Path) -> Lens:
@@ -93,7 +93,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
 
     Raises LensError naming `where` and field.
     """
-    _refuse_unknown(document, _FIELDS, where, {_OLD})
+    _refuse_unknown(document, _FIELDS, where, {_LEGACY_KEY})
     image = _section(document, 'image', where)
     target = _effects(document, 'target', where)
     own = _effects(document, 'corrections', where)
@@ -119,7 +119,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         degrees = _number(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
     own = {name: entry for name, entry in own.items() if name != PORT}
-    for entries in (_effects(document, _OLD, where), own):
+    for entries in (_effects(document, _LEGACY_KEY, where), own):
         lens = extend_lens(lens, load_effects(entries, where))
     return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
 
@@ -157,7 +157,7 @@ def _read(path: str | Path) -> tuple[str, str]:
             raise LensError(f'{file}: no lens of camera {camera!r} in it; there are '
                             + ', '.join(lenses))
         file, camera = str(lenses[camera]), ''
-    return read_text(file, LensError, LARGEST), camera
+    return read_text(file, LensError, MAX_LENS_BYTES), camera
 
 
 def _in_folder(folder: Path) -> dict[str, Path]:
@@ -261,8 +261,9 @@ def _number(mapping: Mapping[str, Any], name: str, where: str) -> float:
     value = mapping.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise LensError(f'{where}: {name} is {value!r}; a number is needed')
-    if not abs(value) < _MOST:
-        raise LensError(f'{where}: {name} is {value}; a finite number is needed, below {_MOST:g}')
+    if not abs(value) < _MAX_NUMBER:
+        raise LensError(
+            f'{where}: {name} is {value}; a finite number is needed, below {_MAX_NUMBER:g}')
     return float(value)
 
 

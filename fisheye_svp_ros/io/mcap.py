@@ -20,7 +20,7 @@ from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema, Statistics
 
-from fisheye_svp_ros.io.recording_files import LARGEST
+from fisheye_svp_ros.io.recording_files import MAX_BYTES
 
 _MAGIC = b'\x89MCAP0\r\n'
 _HEAD = struct.Struct('<BQ')  # of a record: opcode, length
@@ -112,7 +112,7 @@ def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
         if opcode == Opcode.CHUNK and data:
             yield _contents(body, f'the chunk at byte {place}', note)
         elif opcode == Opcode.STATISTICS or data:
-            yield _parsed(opcode, body, f'the record at byte {place}', note)
+            yield _parse_record(opcode, body, f'the record at byte {place}', note)
         place = stream.tell()
     note(f'from byte {place} on it cannot be followed')
     summary = _summary(stream)
@@ -138,7 +138,7 @@ def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
     """Return the records of a chunk; of one that is cut short, where it is not compressed."""
     try:
         chunk = Chunk.read(ReadDataStream(BytesIO(body)))
-        data = _decompressed(chunk)
+        data = _decompress(chunk)
     except Exception as cause:
         note(f'{where} is damaged ({cause or type(cause).__name__})')
         return []
@@ -152,15 +152,15 @@ def _contents(body: bytes, where: str, note: _Note) -> list[Any]:
         opcode, length = _HEAD.unpack_from(data, place)
         place += _HEAD.size + length
         if place <= len(data):
-            records += _parsed(opcode, data[place - length:place], where, note)
+            records += _parse_record(opcode, data[place - length:place], where, note)
     return records
 
 
-def _decompressed(chunk: Chunk) -> bytes:
+def _decompress(chunk: Chunk) -> bytes:
     """Return the data of a chunk; raise ValueError for more than was announced."""
     size: int = chunk.uncompressed_size
-    if size > LARGEST:
-        raise ValueError(f'it has {size} bytes; up to {LARGEST} are read')
+    if size > MAX_BYTES:
+        raise ValueError(f'it has {size} bytes; up to {MAX_BYTES} are read')
     if not chunk.compression:
         return bytes(chunk.data)
     data: bytes
@@ -176,7 +176,7 @@ def _decompressed(chunk: Chunk) -> bytes:
     return data
 
 
-def _parsed(opcode: int, body: bytes, where: str, note: _Note) -> list[Any]:
+def _parse_record(opcode: int, body: bytes, where: str, note: _Note) -> list[Any]:
     """Return the record of a body in a list; empty for one that tells nothing of messages."""
     stream = ReadDataStream(BytesIO(body))
     kinds: dict[int, Any] = {Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel,

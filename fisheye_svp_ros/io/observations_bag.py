@@ -19,7 +19,7 @@ _IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
 _NAMES = ('landmarks', 'image_points')
 
 
-class _Set(NamedTuple):
+class _PointSet(NamedTuple):
     stamp: int
     camera: str
     points: ImagePoints
@@ -34,7 +34,7 @@ def read(path: str | Path) -> Observations:
     bag = Bag(path)
     landmarks: dict[int, Landmarks] = {}
     worlds: set[str] = set()
-    sets: list[_Set] = []
+    sets: list[_PointSet] = []
     for record in bag.records(
             lambda topic, kind: topic.rpartition('/')[2] in _NAMES and kind == _CLOUD):
         namespace, _, name = record.topic.rpartition('/')
@@ -44,14 +44,14 @@ def read(path: str | Path) -> Observations:
             worlds.add(namespace)
             landmarks[stamp] = read_landmarks(record.message, where).landmarks
         else:
-            sets.append(_Set(stamp, namespace, read_image_points(record.message, where)))
+            sets.append(_PointSet(stamp, namespace, read_image_points(record.message, where)))
     if len(worlds) != 1 or not sets:
         raise ObservationError(f'{path}: observations need image_points and landmarks of one '
-                               f'namespace; {_instead(bag, worlds)}')
+                               f'namespace; {_topics_present(bag, worlds)}')
     return _table(sorted(sets, key=lambda one: one[:2]), landmarks, worlds.pop(), str(path))
 
 
-def _instead(bag: Bag, worlds: set[str]) -> str:
+def _topics_present(bag: Bag, worlds: set[str]) -> str:
     """Return what a recording has in place of one world's observations, and what to do."""
     images = {topic for topic, kind in bag.topics() if kind in _IMAGES}
     if images and not worlds:
@@ -62,7 +62,7 @@ def _instead(bag: Bag, worlds: set[str]) -> str:
 
 
 def _table(
-    sets: list[_Set], landmarks: dict[int, Landmarks], world: str, source: str
+    sets: list[_PointSet], landmarks: dict[int, Landmarks], world: str, source: str
 ) -> Observations:
     stamps = sorted({one.stamp for one in sets})
     frames = {stamp: frame for frame, stamp in enumerate(stamps)}
@@ -73,7 +73,7 @@ def _table(
         np.repeat([frames[one.stamp] for one in sets], counts),
         np.concatenate([one.points.landmark for one in sets]),
         np.concatenate([one.points.uv for one in sets]),
-        np.concatenate([_places(one, landmarks, source) for one in sets]),
+        np.concatenate([_landmark_points(one, landmarks, source) for one in sets]),
         camera=np.repeat(names, counts),
         t=np.repeat([one.stamp / 1e9 for one in sets], counts),
         cameras=cameras,
@@ -81,7 +81,7 @@ def _table(
     )
 
 
-def _places(one: _Set, landmarks: dict[int, Landmarks], source: str) -> Any:
+def _landmark_points(one: _PointSet, landmarks: dict[int, Landmarks], source: str) -> Any:
     """Return the landmarks (N, 3) of a set: those of its stamp, or the latest before it."""
     known = sorted(landmarks)
     place = max(bisect_right(known, one.stamp) - 1, 0)

@@ -14,9 +14,9 @@ from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
-_FEWEST_UNSEEN = 5
+_MIN_UNSEEN_ROWS = 5
 
-REQUIRED = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
+REQUIRED_COLUMNS = ('frame', 'landmark', 'u', 'v', 'x', 'y', 'z')
 
 
 def read(path: str | Path) -> Observations:
@@ -24,7 +24,7 @@ def read(path: str | Path) -> Observations:
 
     Raises ObservationError, naming file, line and column.
     """
-    table = CsvTable(Path(path), REQUIRED)
+    table = CsvTable(Path(path), REQUIRED_COLUMNS)
     frame, landmark = table.whole('frame'), table.whole('landmark', MOST_LANDMARK)
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
@@ -62,7 +62,7 @@ def _refuse_unseen(table: CsvTable, view: Index, uv: Array) -> None:
     place, where, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
     most = int(count.argmax())
     rows = np.flatnonzero(where.reshape(-1) == most)
-    if len(rows) < max(_FEWEST_UNSEEN, len(uv) / 100):
+    if len(rows) < max(_MIN_UNSEEN_ROWS, len(uv) / 100):
         return
     if np.unique(view[rows], axis=0, return_counts=True)[1].max() > 2:
         u, v = place[most]

@@ -21,7 +21,7 @@ from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
 _CM, _MM = 0.01, 0.001
-_LARGEST = 1 << 24  # bytes
+_MAX_BYTES = 1 << 24  # bytes
 _SQUARE = 1e-3  # digits of a printed rotation are forgiven
 _TIME = re.compile(r'\d{4}(-\d{2}){5}$')
 
@@ -56,7 +56,7 @@ def read(path: str | Path) -> Observations:
         rows[:, 3:],
         np.stack([boards[b].corners[c] for b, c in zip(board, corner, strict=True)]),
         board=board,
-        t=np.repeat(_times(files, description.parent), counts),
+        t=np.repeat(_image_times(files, description.parent), counts),
         source=str(path),
     )
 
@@ -77,7 +77,7 @@ def _read_boards(path: Path) -> dict[int, Board]:
     number, places = -1, set()
     for line, fields in _lines(path):
         if len(fields) == 4:
-            number = _whole(path, line, fields[0])
+            number = _parse_int(path, line, fields[0])
             if number in corners:
                 raise ObservationError(f'{path}, line {line}: board {number} stands there twice')
             corners[number] = []
@@ -126,13 +126,13 @@ def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
         if len(fields) == 1 and ':' in fields[0]:
             name, value = fields[0].split(':', 1)
             if name == 'num_corners':
-                promised = _whole(path, line, value)
+                promised = _parse_int(path, line, value)
             continue
         row = _numbers(path, line, fields)
         if len(row) != 5:
             raise ObservationError(f'{path}, line {line}: board, corner, 1, u, v are needed')
-        board = boards.get(_whole(path, line, fields[0]))
-        if board is None or _whole(path, line, fields[1]) >= len(board.corners):
+        board = boards.get(_parse_int(path, line, fields[0]))
+        if board is None or _parse_int(path, line, fields[1]) >= len(board.corners):
             raise ObservationError(
                 f'{path}, line {line}: board {row[0]:g}, corner {row[1]:g} is not on the target'
             )
@@ -146,7 +146,7 @@ def _read_corners(path: Path, boards: dict[int, Board]) -> Array:
     return np.array(rows).reshape(-1, 5)
 
 
-def _times(files: list[Path], dataset: Path) -> Array:
+def _image_times(files: list[Path], dataset: Path) -> Array:
     """Return the seconds (F,) from the earliest image of the data set; NaN without times."""
     mine = [_time(file) for file in files]
     everywhere = [_time(file) for file in dataset.rglob('*.orpc')]
@@ -167,7 +167,7 @@ def _time(file: Path) -> datetime | None:
 
 def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]]]:
     """Return line numbers and fields of the lines that are neither empty nor a comment."""
-    text = read_text(path, ObservationError, _LARGEST)
+    text = read_text(path, ObservationError, _MAX_BYTES)
     return [
         (i, line.split(separator))
         for i, line in enumerate(text.splitlines(), 1)
@@ -175,7 +175,7 @@ def _lines(path: Path, separator: str | None = ',') -> list[tuple[int, list[str]
     ]
 
 
-def _whole(path: Path, line: int, field: str) -> int:
+def _parse_int(path: Path, line: int, field: str) -> int:
     value = _numbers(path, line, [field])[0]
     if not (value.is_integer() and 0 <= value <= MOST_LANDMARK):
         raise ObservationError(f'{path}, line {line}: {field.strip()!r} is not a whole number '

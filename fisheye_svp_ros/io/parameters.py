@@ -86,7 +86,7 @@ def rows(table: Any) -> list[Row]:
     return [f.metadata['row']._replace(name=f.name) for f in fields(table)]
 
 
-def changed(table: S, values: Mapping[str, Any]) -> S:
+def with_values(table: S, values: Mapping[str, Any]) -> S:
     """Return the table with some values changed; names that are no row are ignored.
 
     Raises ParameterError for a value that is not allowed.

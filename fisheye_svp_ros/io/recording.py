@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 from fisheye_svp_ros.io.clouds import Points
-from fisheye_svp_ros.io.columns import typed
+from fisheye_svp_ros.io.columns import parse_cells
 from fisheye_svp_ros.io.decoding import read_key_values, read_residuals, stamp_of, statuses
 
 STAMP = 'stamp_ns'
@@ -70,7 +70,7 @@ def _columns(rows: Mapping[tuple[str, int], Mapping[str, str]]) -> Columns:
     columns: Columns = {NAMESPACE: [base or '/' for base, _ in order],
                         STAMP: [stamp for _, stamp in order]}
     for name in names:
-        columns[name] = typed([rows[key].get(name) for key in order])
+        columns[name] = parse_cells([rows[key].get(name) for key in order])
     return columns
 
 

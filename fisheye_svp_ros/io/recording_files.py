@@ -13,12 +13,12 @@ import zstandard
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.documents import read_yaml
 
-LARGEST = 1 << 28  # bytes of a chunk or a message, decompressed
+MAX_BYTES = 1 << 28  # bytes of a chunk or a message, decompressed
 
 _SUFFIXES = ('.mcap', '.db3', '.mcap.zstd', '.db3.zstd')
 _ZSTD = b'\x28\xb5\x2f\xfd'  # CDR begins with 0
 _EXPANDS = 1000  # times the size of a file, at most
-_PIECE = 1 << 20  # bytes
+_BLOCK_BYTES = 1 << 20  # bytes
 
 
 def is_recording(path: Path) -> bool:
@@ -43,7 +43,7 @@ def metadata_topics(folder: Path) -> set[tuple[str, str]]:
 
 
 @contextmanager
-def unpacked(file: Path, note: Callable[[str], None]) -> Iterator[Path]:
+def decompress_file(file: Path, note: Callable[[str], None]) -> Iterator[Path]:
     """Yield a file as it was before rosbag2 compressed it: itself, or a temporary one.
 
     note: told what is damaged.  Raises BagError where there is no room for it.
@@ -69,9 +69,9 @@ def unpacked_message(data: bytes) -> bytes:
     """
     if not data.startswith(_ZSTD):
         return data
-    if zstandard.frame_content_size(data) > LARGEST:
-        raise ValueError(f'it is compressed from more than {LARGEST} bytes')
-    return zstandard.ZstdDecompressor().decompress(data, max_output_size=LARGEST)
+    if zstandard.frame_content_size(data) > MAX_BYTES:
+        raise ValueError(f'it is compressed from more than {MAX_BYTES} bytes')
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=MAX_BYTES)
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -84,7 +84,7 @@ def _unpack(file: Path, whole: Path) -> None:
     most, size = _EXPANDS * file.stat().st_size, 0
     reader = zstandard.ZstdDecompressor().stream_reader
     with file.open('rb') as packed, reader(packed) as stream, whole.open('wb') as output:
-        while piece := stream.read(_PIECE):
+        while piece := stream.read(_BLOCK_BYTES):
             size += output.write(piece)
             if size > most:
                 raise ValueError(f'more than {_EXPANDS} times its size comes out of it')

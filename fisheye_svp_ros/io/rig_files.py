@@ -9,7 +9,7 @@ from pathlib import Path
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
-from fisheye_svp_ros.io.lens_files import LARGEST, read_lens_file
+from fisheye_svp_ros.io.lens_files import MAX_LENS_BYTES, read_lens_file
 from fisheye_svp_ros.io.lens_formats import read_foreign
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
@@ -30,7 +30,7 @@ def save_rig(rig: Pose | Sequence[Pose], path: str | Path,
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:
     """Return each camera in the next one, of a file that `load_rig` reads."""
-    foreign = read_foreign(path, read_text(path, LensError, LARGEST))
+    foreign = read_foreign(path, read_text(path, LensError, MAX_LENS_BYTES))
     if foreign is None:
         raise LensError(f'{path}: left_in_right with position and quaternion is needed')
     if not foreign.rigs:

@@ -13,7 +13,7 @@ from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.io.parameters import changed, rows
+from fisheye_svp_ros.io.parameters import rows, with_values
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import allowed
 from fisheye_svp_ros.nodes.declaration import declare, unknown_parameters
@@ -230,7 +230,7 @@ class BaseNode(Node):  # type: ignore[misc]
             for row in rows(self.SETTINGS):
                 if row.file and isinstance(values.get(row.name), str):
                     allowed(values[row.name], self.settings.folder, row.name)
-            settings = changed(self.settings, values)
+            settings = with_values(self.settings, values)
             self._candidate = settings, self.prepare(settings)
         except FisheyeSvpError as error:
             return SetParametersResult(successful=False, reason=str(error))

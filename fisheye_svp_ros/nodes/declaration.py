@@ -14,7 +14,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameter_files import read_parameter_file
-from fisheye_svp_ros.io.parameters import Row, changed, rows
+from fisheye_svp_ros.io.parameters import Row, rows, with_values
 from fisheye_svp_ros.study.settings import Settings
 
 S = TypeVar('S', bound=Settings)
@@ -26,7 +26,7 @@ def declare(node: Any, kind: type[S], given: Mapping[str, Any]) -> S:
     given: values by name, which may be whole numbers where others are asked for.
     Raises ParameterError for a value that is not allowed.
     """
-    settings = changed(kind(), given)
+    settings = with_values(kind(), given)
     for row in rows(kind):
         value = getattr(settings, row.name)
         node.declare_parameter(

@@ -18,7 +18,7 @@ from fisheye_svp_ros.detect.finders import default_detector
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
-from fisheye_svp_ros.detect.workers import BoundedCalls, Late
+from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
@@ -229,7 +229,7 @@ class Detector(BaseNode):
         else:
             self._near = None
             self._counts['images without board'] += 1
-            self._counts['searches broken off'] += isinstance(found, Late)
+            self._counts['searches broken off'] += isinstance(found, TimedOut)
             if isinstance(found, Exception):
                 self.unforeseen(found)
         if self._guiding is not None:

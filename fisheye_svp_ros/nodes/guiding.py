@@ -18,7 +18,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.detect.patterns import Pattern
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.points import Points
-from fisheye_svp_ros.detect.workers import BoundedCalls, Late
+from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, OutputError, ParameterError
 from fisheye_svp_ros.io.files import replacing
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -161,7 +161,7 @@ class Guiding:
     def _fail(self, guide: Guide, result: Any) -> None:
         """Go on without the last photograph; without any there is nothing to go on with."""
         self._failures += 1
-        late = isinstance(result, Late)
+        late = isinstance(result, TimedOut)
         self._trouble = f'guide: {f"nothing within {_LONGEST:g} s" if late else result}'
         if not (late or isinstance(result, FisheyeSvpError)):
             self._node.unforeseen(result)

@@ -32,7 +32,7 @@ from fisheye_svp_ros.io.clouds import (
     IMAGE_POINTS,
     LANDMARKS,
     Points,
-    structured,
+    structured_array,
 )
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
 from fisheye_svp_ros.optics.lens import Lens
@@ -82,12 +82,13 @@ def cloud_message(points: Points, stamp: int, frame: str) -> Any:
 
 def landmarks_message(landmarks: Landmarks, stamp: int, frame: str) -> Any:
     """Return landmarks as PointCloud2: landmark, x, y, z (m)."""
-    return cloud_message(structured(LANDMARKS, landmarks.ids, *landmarks.points.T), stamp, frame)
+    points = structured_array(LANDMARKS, landmarks.ids, *landmarks.points.T)
+    return cloud_message(points, stamp, frame)
 
 
 def image_points_message(landmark: Index, uv: Array, stamp: int, frame: str) -> Any:
     """Return image points as PointCloud2: landmark, u, v (px)."""
-    return cloud_message(structured(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
+    return cloud_message(structured_array(IMAGE_POINTS, landmark, *uv.T), stamp, frame)
 
 
 def image_message(pixels: NDArray[Any], stamp: int, frame: str, encoding: str = '') -> Any:

@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from fisheye_svp_ros.io.bags import BagWriter, Offered
+from fisheye_svp_ros.io.bags import BagWriter, OfferedQos
 from fisheye_svp_ros.nodes.timers import every
 
 _COUNTED = ('/image_points', '/result')
@@ -72,7 +72,7 @@ class Recorder(Node):  # type: ignore[misc]
         publishers = self.get_publishers_info_by_topic(topic)
         for typename in types:
             offered = [
-                Offered(one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                OfferedQos(one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
                         one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL)
                 for one in publishers if one.topic_type == typename
             ]
@@ -91,7 +91,7 @@ class Recorder(Node):  # type: ignore[misc]
             return
 
     def _subscribe(
-        self, topic: str, kind: Any, typename: str, offered: Sequence[Offered]
+        self, topic: str, kind: Any, typename: str, offered: Sequence[OfferedQos]
     ) -> None:
         self._bag.add(topic, typename, offered)
         # What everybody offers is asked for; who asks for more does not hear the others.

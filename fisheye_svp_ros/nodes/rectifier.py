@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from fisheye_svp_ros.detect.image_messages import color_image
-from fisheye_svp_ros.detect.photographs import decoded
+from fisheye_svp_ros.detect.photographs import decode_image
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
@@ -203,6 +203,6 @@ def _read_raw(message: Any, topic: str) -> tuple[str, NDArray[Any], str]:
 
 
 def _read_compressed(message: Any, topic: str) -> tuple[str, NDArray[Any], str]:
-    pixels = decoded(bytes(message.data), topic, color=True)
+    pixels = decode_image(bytes(message.data), topic, color=True)
     depth = 8 * pixels.dtype.itemsize
     return message.header.frame_id, pixels, f'{"mono" if pixels.ndim == 2 else "bgr"}{depth}'

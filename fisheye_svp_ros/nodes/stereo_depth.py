@@ -13,7 +13,7 @@ from visualization_msgs.msg import MarkerArray
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import LANDMARKS, structured
+from fisheye_svp_ros.io.clouds import LANDMARKS, structured_array
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.markers import camera_shape, epipolar_shapes, landmarks_shape
@@ -82,7 +82,7 @@ class StereoDepth(SolverNode):
         ).require()
         points = found.solution.points[0]
         seen = np.isfinite(points[:, 0])
-        cloud = structured(LANDMARKS, ids[seen], *points[seen].T)
+        cloud = structured_array(LANDMARKS, ids[seen], *points[seen].T)
         self._points.publish(messages.cloud_message(cloud, stamp, right.frame))
         doubt = doubt_of_pairs(models, rig.take(None), uv, ids, self.settings.sigma_px)
         self.publish_result(stamp, found.metrics, doubt)

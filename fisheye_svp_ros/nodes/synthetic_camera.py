@@ -15,7 +15,7 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, parameter, sweep_of
+from fisheye_svp_ros.io.parameters import SWEEP, Sweep, parameter, sweep_of, with_values
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.camera import CameraNode, rows_by_frame
 from fisheye_svp_ros.nodes.markers import camera_shape, landmarks_shape, rays_shape
@@ -139,7 +139,7 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
     nothing = np.array([], dtype=np.int64)
     for repetition in itertools.count():
         for number, swept in enumerate(sweep):
-            scenario = changed(settings, swept)
+            scenario = with_values(settings, swept)
             for first, sets, simulation in simulate_in_pieces(scenario, number, repetition):
                 svp_lens = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
                 table = simulation.observations

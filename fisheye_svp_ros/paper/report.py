@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.io.files import replacing, together, write_json
+from fisheye_svp_ros.io.files import replacing, write_json, write_together
 from fisheye_svp_ros.paper import figures
 from fisheye_svp_ros.paper.beyond import CALIBRATION_NOISE, NOISES, POSE_SETS
 from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART
@@ -51,7 +51,7 @@ def write_report(results: Results, folder: Path, executor: Executor) -> list[Pat
     parts = (_summary, _recovery, _localization, _stopping, _calibration, _stereo, _claims,
              _solvers, _noise, _differences)
     blocks = [block for part in parts for block in part(results)]
-    with together():
+    with write_together():
         pictures = _drawn(results, folder, executor)
         write_json(folder / 'paper.json', results.document())
         return [folder / 'paper.json', *write_blocks(folder, 'paper', blocks), *pictures]

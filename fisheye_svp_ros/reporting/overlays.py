@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fisheye_svp_ros.detect.detection import Detection, Searched
+from fisheye_svp_ros.detect.detection import Detection, SearchedPhotograph
 from fisheye_svp_ros.detect.photographs import Photograph
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_bytes
@@ -34,7 +34,7 @@ def write_overlays(photographs: Iterable[Photograph], detection: Detection, fold
         write_bytes(folder / f'{name}.png', drawn.tobytes())
 
 
-def _overlay(pixels: np.ndarray, searched: Searched) -> np.ndarray:
+def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
     scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
     grey = cv2.convertScaleAbs(pixels, alpha=scale)
     zoom = _LARGEST / max(grey.shape)

@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.parameters import Sweep, changed, parameter, rows
+from fisheye_svp_ros.io.parameters import Sweep, parameter, rows, with_values
 from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
@@ -153,8 +153,8 @@ def check_sweep(base: Scenario, sweep: Sweep) -> None:
     """Raise FisheyeSvpError where a sweep names a lens, landmarks or poses that are unusable."""
     for name in _READ_FILES:
         for value in sweep.lists.get(name, ()):
-            next(simulate_in_pieces(changed(base, {name: value})))
-    next(simulate_in_pieces(changed(base, sweep.point(0))))
+            next(simulate_in_pieces(with_values(base, {name: value})))
+    next(simulate_in_pieces(with_values(base, sweep.point(0))))
 
 
 def scalars(scenario: Scenario) -> dict[str, Any]:

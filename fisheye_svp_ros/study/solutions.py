@@ -12,7 +12,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask, scatter
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured
+from fisheye_svp_ros.io.clouds import RESIDUALS, Points, structured_array
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.localization import Localization, localize, sight
@@ -91,7 +91,7 @@ def residual_points(model: ForwardModel, views: Views, solution: Localization) -
     """Return the residuals of one view (1,): px; incidence angle, rad, and range, m, as solved."""
     theta, distance = sight(model, solution.pose, views)
     columns = (*views.uv[0].T, *solution.residual[0].T, theta[0], distance[0])
-    return structured(RESIDUALS, views.landmark[0], *columns)
+    return structured_array(RESIDUALS, views.landmark[0], *columns)
 
 
 def solve_rigs(

@@ -12,7 +12,7 @@ import numpy as np
 
 from fisheye_svp_ros import __version__
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.parameters import SWEEP, Sweep, changed, rows, sweep_of
+from fisheye_svp_ros.io.parameters import SWEEP, Sweep, rows, sweep_of, with_values
 from fisheye_svp_ros.io.recording import Columns
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.simulate.scenario import (
@@ -59,11 +59,12 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     and FisheyeSvpError for a lens, landmarks or poses that cannot be used.
     """
     camera = parameters.get(CAMERA, {})
-    base, sweep = changed(Scenario(), camera), sweep_of(Scenario, camera)
+    base, sweep = with_values(Scenario(), camera), sweep_of(Scenario, camera)
     if not sweep.lists:
         raise ParameterError('nothing is swept; a list such as sweep.radius: [2.0, 0.5] is needed')
     names = solvers_of(base, sweep)
-    tables = {name: changed(SOLVERS[name].settings(), parameters.get(name, {})) for name in names}
+    tables = {
+        name: with_values(SOLVERS[name].settings(), parameters.get(name, {})) for name in names}
     for name, table in tables.items():
         if isinstance(table, StereoDepthSettings) and table.rig != StereoDepthSettings.rig:
             raise ParameterError(f'{name}: rig is {table.rig!r}; a sweep measures with the true '

@@ -22,7 +22,7 @@ from benchmark import kills
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.files import together, write_text, written
+from fisheye_svp_ros.io.files import write_text, write_together, written
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.share import lens_path
@@ -113,18 +113,18 @@ def test_where_nothing_can_be_written_there_is_one_line(
 def test_a_set_of_files_appears_together(tmp_path: Path) -> None:
     one, two = tmp_path / 'a' / 'one', tmp_path / 'two'
     write_text(two, 'old')
-    with pytest.raises(ZeroDivisionError), together():
+    with pytest.raises(ZeroDivisionError), write_together():
         write_text(one, 'new')
         write_text(two, 'new')
         assert not one.exists() and written(one).read_text() == 'new'
         raise ZeroDivisionError
     assert results(tmp_path) == ['two'] and two.read_text() == 'old'
-    with pytest.raises(OutputError, match='cannot be written'), together():
+    with pytest.raises(OutputError, match='cannot be written'), write_together():
         write_text(one, 'new')
         with full_at(2):
             write_text(two, 'new')
     assert results(tmp_path) == ['two'] and two.read_text() == 'old'
-    with together():
+    with write_together():
         write_text(one, 'new')
         write_text(one, 'newer')
         write_text(two, 'new')
@@ -143,7 +143,7 @@ def test_a_signal_among_the_renames_waits_for_the_last(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt), pytest.MonkeyPatch.context() as patched:
         patched.setattr(Path, 'replace', interrupted)
-        with together():
+        with write_together():
             write_text(one, 'new')
             write_text(two, 'new')
     assert results(tmp_path) == ['one', 'two']

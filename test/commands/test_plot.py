@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 
 from fisheye_svp_ros.cli import main
-from fisheye_svp_ros.io.clouds import RESIDUALS, structured
+from fisheye_svp_ros.io.clouds import RESIDUALS, structured_array
 from fisheye_svp_ros.io.columns import arrow, write_columns
 from fisheye_svp_ros.reporting.sweep_plots import draw_residuals, draw_table
 from fisheye_svp_ros.study.dependence import curves, grid, noise_spreads, swept_parameters
@@ -110,7 +110,7 @@ def test_a_rig_is_drawn(tmp_path: Path) -> None:
 
 def test_residuals_are_drawn_against_angle_and_range(tmp_path: Path) -> None:
     columns = [np.linspace(0.1, 1.0, 50)] * 6
-    cloud = structured(RESIDUALS, np.arange(50), *columns)
+    cloud = structured_array(RESIDUALS, np.arange(50), *columns)
     pictures = []
     for lenses in (['', '', ''], ['a', 'b', 'b']):
         draw_residuals([cloud] * 3, lenses, tmp_path / 'a.png')

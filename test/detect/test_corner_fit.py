@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cv2 import GaussianBlur
 
-from fisheye_svp_ros.detect.corner_fit import Corners, _Problem, fit_corners, room
+from fisheye_svp_ros.detect.corner_fit import Corners, _Problem, edge_clearance, fit_corners
 from fisheye_svp_ros.detect.windows import windows
 
 SIDE, COUNT, BLUR, NOISE = 41, 150, 0.6, 1.5
@@ -99,8 +99,9 @@ def test_bent_edges_the_border_and_slopes_of_light_move_no_corner(
 
 
 def test_windows_of_soft_corners_end_before_the_next_edge() -> None:
-    assert room(np.array([12.0, 40.0]), np.array([0.6, 0.6])) == pytest.approx([15.1, 60.2], abs=1)
-    assert room(np.array([12.0]), np.array([2.5])) < 12
+    clearance = edge_clearance(np.array([12.0, 40.0]), np.array([0.6, 0.6]))
+    assert clearance == pytest.approx([15.1, 60.2], abs=1)
+    assert edge_clearance(np.array([12.0]), np.array([2.5])) < 12
 
 
 def test_wild_states_are_lost_in_silence() -> None:

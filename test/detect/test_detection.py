@@ -35,13 +35,13 @@ from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
-    decoded,
+    decode_image,
     doubtful_folders,
     exif_turned,
     find_photographs,
 )
 from fisheye_svp_ros.detect.points import _least_square, find_points
-from fisheye_svp_ros.detect.workers import BoundedCalls, Late, bounded_map
+from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut, bounded_map
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.bags import BagWriter
 from fisheye_svp_ros.io.readers import read_observations
@@ -595,16 +595,16 @@ def test_a_png_that_announces_more_than_it_holds(tmp_path: Path) -> None:
         data = bytearray(good)
         data[place:place + 4] = b'\x7f\xff\xff\xf0'  # a length; OpenCV 5 makes room for it
         with pytest.raises(ObservationError, match='the PNG ends before its image does'):
-            decoded(bytes(data), 'x')
+            decode_image(bytes(data), 'x')
 
 
 def test_a_jpeg_of_thousands_of_scans_is_not_decoded() -> None:
     data = cv2.imencode('.jpg', np.zeros((48, 64), np.uint8),
                         [cv2.IMWRITE_JPEG_PROGRESSIVE, 1])[1].tobytes()
-    assert decoded(data, 'x').shape == (48, 64)
+    assert decode_image(data, 'x').shape == (48, 64)
     again = data[data.rindex(b'\xff\xda'):-2]
     with pytest.raises(ObservationError, match='more than 32 scans'):
-        decoded(data[:-2] + 40 * again + data[-2:], 'x')
+        decode_image(data[:-2] + 40 * again + data[-2:], 'x')
 
 
 def test_a_small_file_of_a_huge_image_is_not_decoded(tmp_path: Path) -> None:
@@ -685,7 +685,7 @@ print(len(detect(find_photographs([{str(tmp_path)!r}]), parse_pattern({BOARD!r})
 
 def test_work_is_bounded_in_time() -> None:
     results = dict(bounded_map(sleep, [0.0, 0.0, 0.0, 120.0, 0.0, 0.0], 1.0))
-    assert results[3] == Late(True)
+    assert results[3] == TimedOut(True)
     assert [results[i] for i in (0, 1, 2, 4, 5)] == [None] * 5
 
 
@@ -703,7 +703,7 @@ def test_a_process_that_dies_between_two_calls_is_replaced() -> None:
     assert called(-1) == 1
     calls._worker.process.kill()
     calls._worker.process.wait()
-    assert called(-2) == Late(False)
+    assert called(-2) == TimedOut(False)
     assert called(-3) == 3
     calls.stop()
 

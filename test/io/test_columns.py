@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fisheye_svp_ros.errors import OutputError
-from fisheye_svp_ros.io.columns import arrow, read_columns, typed, write_columns
+from fisheye_svp_ros.io.columns import arrow, parse_cells, read_columns, write_columns
 
 COLUMNS = {'n': list(range(50)), 'x': [0.1 * i for i in range(50)], 'name': ['a', None] * 25}
 
@@ -45,11 +45,11 @@ def test_other_columns_than_numbers_and_text_are_refused(tmp_path: Path) -> None
 
 
 def test_cells_are_numbers_where_all_are() -> None:
-    assert typed(['1', '', None, '-3']) == [1, None, None, -3]
-    assert typed(['1', '2.5', 'nan'])[:2] == [1.0, 2.5]
+    assert parse_cells(['1', '', None, '-3']) == [1, None, None, -3]
+    assert parse_cells(['1', '2.5', 'nan'])[:2] == [1.0, 2.5]
     long = '9' * 5000
-    assert typed(['1', long]) == [1.0, float('inf')]
-    assert typed(['1_000', '2']) == ['1_000', '2']
+    assert parse_cells(['1', long]) == [1.0, float('inf')]
+    assert parse_cells(['1_000', '2']) == ['1_000', '2']
 
 
 def test_an_empty_table_is_said_to_be_one(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2, PointField  # isort: skip
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.clouds import IMAGE_POINTS, RESIDUALS, structured, unpack
+from fisheye_svp_ros.io.clouds import IMAGE_POINTS, RESIDUALS, structured_array, unpack
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -53,7 +53,7 @@ def test_landmarks_survive_bit_by_bit() -> None:
 
 def test_residuals_have_the_fields_of_the_design() -> None:
     message = messages.cloud_message(
-        structured(RESIDUALS, np.array([3]), *np.arange(6.0)[:, None]), STAMP, 'camera'
+        structured_array(RESIDUALS, np.array([3]), *np.arange(6.0)[:, None]), STAMP, 'camera'
     )
     assert [f.name for f in message.fields] == [
         'landmark', 'u', 'v', 'du', 'dv', 'theta', 'range'
@@ -75,7 +75,7 @@ def test_other_field_order_width_and_endianness_are_read() -> None:
 
 
 def test_rows_that_are_padded_are_read() -> None:
-    points = structured(IMAGE_POINTS, np.arange(6), np.arange(6.0), np.arange(6.0) + 10)
+    points = structured_array(IMAGE_POINTS, np.arange(6), np.arange(6.0), np.arange(6.0) + 10)
     message = messages.cloud_message(points, STAMP, 'camera')
     message.height, message.width = 2, 3
     message.row_step = 3 * message.point_step + 5

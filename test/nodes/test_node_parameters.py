@@ -12,7 +12,7 @@ import pytest
 from helpers.graph import Graph, set_parameter
 
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
-from fisheye_svp_ros.io.parameters import Row, changed, rows, sweep_of
+from fisheye_svp_ros.io.parameters import Row, rows, sweep_of, with_values
 from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.simulate.scenario import Scenario
 from fisheye_svp_ros.study.settings import SolverSettings
@@ -176,11 +176,11 @@ def test_svp_is_one_of_three_words(start: Callable[..., Any]) -> None:
     with pytest.raises(ParameterError, match=r"^svp is 'maybe'; allowed is one of auto, true"):
         start('localizer', '-p', 'svp:=maybe')
     table = SolverSettings()
-    assert [changed(table, {'svp': value}).svp for value in (True, False, 'auto')] == [
+    assert [with_values(table, {'svp': value}).svp for value in (True, False, 'auto')] == [
         'true', 'false', 'auto'
     ]
     with pytest.raises(ParameterError, match='lens is True; str is needed'):
-        changed(table, {'lens': True})
+        with_values(table, {'lens': True})
 
 
 def test_the_true_rig_may_be_named_without_quotes(start: Callable[..., Any]) -> None:
@@ -202,7 +202,7 @@ def test_a_sweep_is_the_product_of_its_lists_the_last_fastest() -> None:
     assert [(p['radius'], p['seed']) for p in sweep] == [
         (2.0, 1), (2.0, 2), (2.0, 3), (0.5, 1), (0.5, 2), (0.5, 3)
     ]
-    assert changed(Scenario(), next(iter(sweep))).seed == 1
+    assert with_values(Scenario(), next(iter(sweep))).seed == 1
 
 
 def test_a_parameter_that_means_nothing_is_named(

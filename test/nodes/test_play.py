@@ -20,7 +20,7 @@ from sensor_msgs.msg import PointCloud2  # isort: skip
 from rclpy.serialization import serialize_message  # isort: skip
 
 from fisheye_svp_ros.io import bags
-from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
+from fisheye_svp_ros.io.bags import Bag, BagWriter, OfferedQos
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import messages
@@ -72,7 +72,7 @@ def write_sets(bag: BagWriter, pause: Callable[[], None]) -> None:
     simulation = simulate_scenario(Scenario(lens='fish180'))
     seen = simulation.observations
     landmarks = messages.landmarks_message(simulation.landmarks, 0, 'world')
-    bag.add('/landmarks', CLOUD, [Offered(latched=True)])
+    bag.add('/landmarks', CLOUD, [OfferedQos(latched=True)])
     bag.write('/landmarks', CLOUD, bytes(serialize_message(landmarks)))
     for stamp in range(1, SETS + 1):
         pause()

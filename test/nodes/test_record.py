@@ -29,7 +29,7 @@ from rclpy.serialization import serialize_message  # isort: skip
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import BagError, ObservationError
 from fisheye_svp_ros.io import decoding
-from fisheye_svp_ros.io.bags import Bag, BagWriter, Offered
+from fisheye_svp_ros.io.bags import Bag, BagWriter, OfferedQos
 from fisheye_svp_ros.io.columns import arrow, read_columns
 from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.readers import read_observations
@@ -289,8 +289,8 @@ def test_a_recording_says_what_its_types_are_where_rosbag2_looks_for_it(tmp_path
 
 def test_a_recording_says_what_its_publishers_offered(tmp_path: Path) -> None:
     with BagWriter(tmp_path / 'bag') as bag:
-        bag.add('/landmarks', CLOUD, [Offered(latched=True)])
-        bag.add('/camera_info', 'sensor_msgs/msg/CameraInfo', [Offered(reliable=False)])
+        bag.add('/landmarks', CLOUD, [OfferedQos(latched=True)])
+        bag.add('/camera_info', 'sensor_msgs/msg/CameraInfo', [OfferedQos(reliable=False)])
     topics = {
         topic: one['offered_qos_profiles'] for topic, one in metadata(tmp_path / 'bag').items()}
     (latched,), (plain,) = topics['/landmarks'], topics['/camera_info']

@@ -23,7 +23,7 @@ from fisheye_svp_ros.commands.executors import process_pool
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
-from fisheye_svp_ros.io.parameters import changed
+from fisheye_svp_ros.io.parameters import with_values
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.simulate.scenario import Scenario, model_of, simulate_scenario
@@ -140,7 +140,7 @@ def test_rows_are_those_of_scenarios_one_by_one(
     assert columns['shift_scale'] == [0.0, 1.0] * 4
     for number in range(8):
         point = {name: columns[name][number] for name in ('environment', 'radius', 'shift_scale')}
-        scenario = changed(Scenario(noise_px=0.3, seed=5), point)
+        scenario = with_values(Scenario(noise_px=0.3, seed=5), point)
         simulation = simulate_scenario(scenario, number)
         seen, model = simulation.observations, model_of('fish214', point['shift_scale'], svp=True)
         solution = localize(model, views_of(seen.xyz, seen.uv[None]))
@@ -441,7 +441,7 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
 
 
 def test_a_damaged_part_is_named(tmp_path: Path) -> None:
-    parts = tables.Parts(tmp_path / 'parts', {'n': int, 'x': float, 'note': str})
+    parts = tables.TableParts(tmp_path / 'parts', {'n': int, 'x': float, 'note': str})
     for number in range(3):
         parts.write(number, {'n': [number], 'x': [None], 'note': ['']})
     parts.join(tmp_path / 'whole')

@@ -18,8 +18,8 @@ from fisheye_svp_ros.pose import Pose
 _MODELS: dict[str, tuple[tuple[str, ...], Callable[..., Distortion]]] = {
     'kb4': (('k1', 'k2', 'k3', 'k4'), lambda *k: Distortion(radial.EQUIDISTANT, k)),
     'ds': (('xi', 'alpha'), lambda *of: Distortion(radial.double_sphere(*of))),
-    'eucm': (('alpha', 'beta'), lambda *of: Distortion(radial.unified(*of))),
-    'ucm': (('alpha',), lambda alpha: Distortion(radial.unified(alpha, 1.0))),
+    'eucm': (('alpha', 'beta'), lambda *of: Distortion(radial.unified_heights(*of))),
+    'ucm': (('alpha',), lambda alpha: Distortion(radial.unified_heights(alpha, 1.0))),
     'fov': (('w',), lambda omega: Distortion(radial.field_of_view_model(omega))),
     'pinhole': ((), lambda: Distortion(radial.PERSPECTIVE)),
 }
@@ -67,7 +67,7 @@ def _rigs(entries: list[dict[str, float]], where: str) -> tuple[Pose, ...]:
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as the one camera of its rig."""
-    near = radial.nearest(lens)
+    near = radial.nearest_kannala_brandt(lens)
     values = {'fx': near.fx, 'fy': near.fy, 'cx': near.cx, 'cy': near.cy}
     values |= {f'k{i}': k for i, k in enumerate(radial.coefficients(near), start=1)}
     return json.dumps({'value0': {

@@ -51,7 +51,7 @@ _MODELS: dict[str, tuple[str, Callable[[Values], Distortion]]] = {
         'fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3', fisheye624),
     'FOV': ('fx fy cx cy omega', lambda v: Distortion(radial.field_of_view_model(v['omega']))),
     'EUCM': ('fx fy cx cy alpha beta',
-             lambda v: Distortion(radial.unified(v['alpha'], v['beta']))),
+             lambda v: Distortion(radial.unified_heights(v['alpha'], v['beta']))),
     'SIMPLE_PINHOLE': ('f cx cy', _brown),
     'PINHOLE': ('fx fy cx cy', _brown),
     'SIMPLE_RADIAL': ('f cx cy k1', _brown),
@@ -101,7 +101,7 @@ def _lens(
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, as its first camera."""
-    near = radial.nearest(lens)
+    near = radial.nearest_kannala_brandt(lens)
     values = (near.fx, near.fy, near.cx + _CORNER, near.cy + _CORNER, *radial.coefficients(near))
     return ('# Camera list with one line of data per camera:\n'
             '#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n'

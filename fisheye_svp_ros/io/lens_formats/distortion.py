@@ -106,7 +106,7 @@ def nearest_lens(
         k = (*distortion.stretch, *[0.0] * RADIAL_TERMS)[:RADIAL_TERMS]
         lens, worst = radial.kannala_brandt(name, size, (fx, fy, cx, cy), k, where), 0.0
     else:
-        lens, worst = radial.fitted(name, size, (fx, fy, cx, cy), distortion.height,
+        lens, worst = radial.fit_curve(name, size, (fx, fy, cx, cy), distortion.height,
                                     distortion.base.limit, where)
     if distortion.sideways:
         lens, worst = _fit_corrections(lens, (fx, fy), distortion, worst)

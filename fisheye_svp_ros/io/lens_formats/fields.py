@@ -13,7 +13,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import LARGEST_YAML, parse_yaml
 from fisheye_svp_ros.pose import Pose, nearest_rotation, rotation_from_quaternion
 
-LARGEST = 1e12  # any number of a lens
+MAX_NUMBER = 1e12  # any number of a lens
 _SLACK = 1e-3  # of the elements of a rotation
 
 
@@ -29,7 +29,7 @@ def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> li
     """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
     values = mapping.get(name)
     if not isinstance(values, list) or len(values) != count or not all(
-        isinstance(value, int | float) and abs(value) < LARGEST for value in values
+        isinstance(value, int | float) and abs(value) < MAX_NUMBER for value in values
     ):
         raise LensError(f'{where}: {name} must be a list of {count} finite numbers, is {values!r}')
     return [float(value) for value in values]
@@ -40,7 +40,7 @@ def values(mapping: Mapping[str, Any], names: Sequence[str], where: str) -> list
     for name in names:
         value = mapping.get(name)
         if isinstance(value, bool) or not isinstance(value, int | float) or (
-                not abs(value) < LARGEST):
+                not abs(value) < MAX_NUMBER):
             raise LensError(f'{where}: {name} is {value!r}; a finite number is needed')
     return [float(mapping[name]) for name in names]
 

@@ -68,7 +68,8 @@ def _distortion(
             base = radial.omnidirectional(*own) if own else radial.PERSPECTIVE
             return brown(base, dict(zip(OPENCV, d, strict=False)))
         case 'ds' | 'eucm', 'radtan' | 'none' if not any(d):
-            return Distortion((radial.double_sphere if model == 'ds' else radial.unified)(*own))
+            heights = radial.double_sphere if model == 'ds' else radial.unified_heights
+            return Distortion(heights(*own))
     raise LensError(f'{where}: {model} with {kind} is not a form that can be read; those are '
                     'pinhole with equidistant, fov, radtan or none, omni with radtan or none, ds '
                     'and eucm')
@@ -90,7 +91,7 @@ def write(lens: Lens) -> str:
 def write_chain(lenses: Sequence[Lens], rigs: Sequence[Pose]) -> str:
     """Return lenses and each camera in the next one in this form; viewpoint shifts stay behind."""
     document: dict[str, Any] = {}
-    for number, near in enumerate(map(radial.nearest, lenses)):
+    for number, near in enumerate(map(radial.nearest_kannala_brandt, lenses)):
         document[f'cam{number}'] = {
             'camera_model': 'pinhole',
             'intrinsics': [near.fx, near.fy, near.cx, near.cy],

@@ -60,7 +60,7 @@ def read(text: str, where: str) -> Foreign:
 
     shift = Gennery(0.0, *values[9:12]) if any(values[9:12]) else None
     limit = np.pi / 2 / abs(linearity) * (1 - 1e-3) if abs(linearity) > 0.5 else np.pi * 0.999
-    lens, worst = radial.fitted('camera', size, values[:4], curve, limit, where, shift)
+    lens, worst = radial.fit_curve('camera', size, values[:4], curve, limit, where, shift)
     return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
 
 
@@ -73,7 +73,7 @@ def _chi(theta: Array, linearity: float) -> Array:
 
 def _read_stereographic(size: list[int], values: list[float], where: str) -> Foreign:
     value = Stereographic().value_and_slope
-    lens, _ = radial.fitted(
+    lens, _ = radial.fit_curve(
         'camera', size, values, lambda theta: value(theta)[0], np.pi * 0.9, where)
     lens = replace(lens, fx=values[0], fy=values[1], image_height=Stereographic())
     return Foreign('mrcal', {'camera': lens}, (), {})

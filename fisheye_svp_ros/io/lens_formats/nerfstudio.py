@@ -50,7 +50,7 @@ def read(text: str, where: str) -> Foreign:
 
 def write(lens: Lens) -> str:
     """Return the lens in this form, without frames."""
-    near = radial.nearest(lens)
+    near = radial.nearest_kannala_brandt(lens)
     return json.dumps({
         'camera_model': _FISHEYE, 'w': near.width, 'h': near.height,
         'fl_x': near.fx, 'fl_y': near.fy, 'cx': near.cx + _CORNER, 'cy': near.cy + _CORNER,

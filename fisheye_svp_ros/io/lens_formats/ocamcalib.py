@@ -15,7 +15,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats import Foreign
 from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
-from fisheye_svp_ros.io.lens_formats.fields import LARGEST
+from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 from fisheye_svp_ros.io.lens_formats.radial import Base
 
 _NUMBERS = re.compile(r'^[-+.\deE\s]+$')
@@ -42,7 +42,7 @@ def read(text: str, where: str) -> Foreign:
     except ValueError as cause:
         raise LensError(f'{where}: not a whole calib_results.txt ({cause})') from cause
     if len(direct) < 2 or len(direct) != 1 + direct[0] or not (
-            np.abs(np.concatenate(rows)) < LARGEST).all() or not direct[1] < 0:
+            np.abs(np.concatenate(rows)) < MAX_NUMBER).all() or not direct[1] < 0:
         raise LensError(f'{where}: the direct polynomial must have as many coefficients as its '
                         'first number says, and begin below 0')
     # What remains when a turn about the axis is taken out of the affine part

@@ -29,7 +29,7 @@ from fisheye_svp_ros.pose import Pose
 _MATRIX = ('camera_matrix', 'cameraMatrix', 'Camera_Matrix', 'K', 'K1', 'M1', 'cameraMatrix1')
 _COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoeffs', 'D', 'D1',
                  'distCoeffs1')
-_SECOND = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
+_RIGHT_KEYS = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
 _WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
 _XI, _OF_FISHEYE = 'xi', 4
 _COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
@@ -70,8 +70,8 @@ def read(text: str, where: str) -> Foreign:
         return nearest_lens(name, size, (k[0], k[4], k[2], k[5], k[1]), distortion, where)
 
     pair = {'camera': lens('camera', _MATRIX, _COEFFICIENTS)}
-    if any(name in document for name in _SECOND[0]):
-        pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_SECOND)}
+    if any(name in document for name in _RIGHT_KEYS[0]):
+        pair = {'left': lens('left', _MATRIX, _COEFFICIENTS), 'right': lens('right', *_RIGHT_KEYS)}
     rigs: tuple[Pose, ...] = ()
     if 'R' in document or 'T' in document:
         turn = np.reshape(_matrix(value(('R',)), ((3, 3),), where), (3, 3))
@@ -107,13 +107,13 @@ def _matrix(value: Any, shapes: Sequence[tuple[int, int]], where: str) -> list[f
 def _from_xml(text: str, where: str) -> dict[str, Any]:
     """Return the numbers, lists and matrices of a FileStorage in XML by name."""
     return {
-        one.tag: {part.tag: _from_words(part.text, part.tag == 'data') for part in one}
-        if one.get('type_id') == 'opencv-matrix' else _from_words(one.text, False)
+        one.tag: {part.tag: _parse_numbers(part.text, part.tag == 'data') for part in one}
+        if one.get('type_id') == 'opencv-matrix' else _parse_numbers(one.text, False)
         for one in fields.xml(text, where, 'OpenCV file')
     }
 
 
-def _from_words(text: str | None, always_listed: bool) -> Any:
+def _parse_numbers(text: str | None, always_listed: bool) -> Any:
     """Return the numbers in a text: a list, or a number alone; the text if it holds others."""
     try:
         numbers = [float(word) for word in (text or '').split()]
@@ -126,7 +126,7 @@ def write(lens: Lens) -> str:
     """Return the lens in this form, YAML."""
     import cv2  # takes a while, and other formats do without
 
-    near = radial.nearest(lens)
+    near = radial.nearest_kannala_brandt(lens)
     storage = cv2.FileStorage('.yml', cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write('image_width', near.width)
     storage.write('image_height', near.height)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats.fields import LARGEST
+from fisheye_svp_ros.io.lens_formats.fields import MAX_NUMBER
 from fisheye_svp_ros.optics.curve_base import ViewpointShift
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view
@@ -26,7 +26,7 @@ class Base(NamedTuple):
 
 
 _GRID = 600
-_INSIDE = 1 - 1e-3  # of the angle at which a curve ends
+_ANGLE_MARGIN = 1 - 1e-3  # of the angle at which a curve ends
 _TOLERANCE = 0.01  # px, of a lens written in a form that knows fewer curves
 
 
@@ -43,7 +43,7 @@ def kannala_brandt(
         curve = KannalaBrandt(*map(float, k))
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
-    if not all(abs(value) < LARGEST for value in curve.coefficients):
+    if not all(abs(value) < MAX_NUMBER for value in curve.coefficients):
         raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no lens has these')
     if not (width.is_integer() and height.is_integer()):
         raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
@@ -55,7 +55,7 @@ def kannala_brandt(
     return replace(lens, max_incidence=field_of_view(lens))
 
 
-def fitted(
+def fit_curve(
     name: str, size: Sequence[float], intrinsics: Sequence[float], curve: Curve, limit: float,
     where: str, shift: ViewpointShift | None = None,
 ) -> tuple[Lens, float]:
@@ -89,12 +89,12 @@ def fitted(
     return replace(lens, max_incidence=min(lens.max_incidence, float(theta[-1]))), worst
 
 
-def nearest(lens: Lens) -> Lens:
+def nearest_kannala_brandt(lens: Lens) -> Lens:
     """Return a lens as Kannala-Brandt; raise LensError where that is off by a hundredth px."""
     if isinstance(lens.image_height, KannalaBrandt):
         return lens
     value = lens.image_height.value_and_slope
-    found, worst = fitted(
+    found, worst = fit_curve(
         lens.name, (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy),
         lambda theta: value(theta)[0], lens.max_incidence, lens.name, lens.viewpoint_shift)
     if worst > _TOLERANCE:
@@ -113,7 +113,7 @@ def omnidirectional(xi: float) -> Base:
     def height(theta: Array) -> Array:
         return np.asarray(np.sin(theta) / (np.cos(theta) + xi))
 
-    return Base(height, float(np.arccos(-xi if xi <= 1 else -1 / xi)) * _INSIDE)
+    return Base(height, float(np.arccos(-xi if xi <= 1 else -1 / xi)) * _ANGLE_MARGIN)
 
 
 def double_sphere(xi: float, alpha: float) -> Base:
@@ -122,16 +122,16 @@ def double_sphere(xi: float, alpha: float) -> Base:
         z = np.cos(theta) + xi
         return np.asarray(np.sin(theta) / (alpha * np.hypot(np.sin(theta), z) + (1 - alpha) * z))
 
-    return Base(height, np.pi * _INSIDE)
+    return Base(height, np.pi * _ANGLE_MARGIN)
 
 
-def unified(alpha: float, beta: float) -> Base:
+def unified_heights(alpha: float, beta: float) -> Base:
     """Return the heights of the extended unified model (Khomutenko et al., RA-L 2016)."""
     def height(theta: Array) -> Array:
         sin, cos = np.sin(theta), np.cos(theta)
         return np.asarray(sin / (alpha * np.sqrt(beta * sin**2 + cos**2) + (1 - alpha) * cos))
 
-    return Base(height, np.pi * _INSIDE)
+    return Base(height, np.pi * _ANGLE_MARGIN)
 
 
 def field_of_view_model(omega: float) -> Base:
@@ -139,7 +139,7 @@ def field_of_view_model(omega: float) -> Base:
     def height(theta: Array) -> Array:
         return np.asarray(np.arctan(2 * np.tan(theta) * np.tan(omega / 2)) / omega)
 
-    return PERSPECTIVE if not omega else Base(height, np.pi / 2 * _INSIDE)
+    return PERSPECTIVE if not omega else Base(height, np.pi / 2 * _ANGLE_MARGIN)
 
 
 def division(k: float) -> Base:
@@ -148,9 +148,9 @@ def division(k: float) -> Base:
         slope = np.tan(theta)
         return np.asarray(2 * slope / (1 + np.sqrt(1 - 4 * k * slope**2)))
 
-    return Base(height, np.pi / 2 * _INSIDE)
+    return Base(height, np.pi / 2 * _ANGLE_MARGIN)
 
 
 EQUIDISTANT = Base(np.asarray, np.pi)
-EQUISOLID = Base(lambda theta: np.asarray(2 * np.sin(theta / 2)), np.pi * _INSIDE)
+EQUISOLID = Base(lambda theta: np.asarray(2 * np.sin(theta / 2)), np.pi * _ANGLE_MARGIN)
 PERSPECTIVE = Base(np.tan, np.pi / 2 * (1 - 1e-6))

@@ -9,12 +9,12 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 
-_FIRST_IN_SECOND = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
+_POSE_KEY = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
 
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return _FIRST_IN_SECOND.search(text) is not None
+    return _POSE_KEY.search(text) is not None
 
 
 def read(text: str, where: str) -> Foreign:

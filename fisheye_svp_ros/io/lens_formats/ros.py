@@ -126,7 +126,7 @@ def _lens_of(
 
 def write(lens: Lens) -> str:
     """Return the lens in this form."""
-    near = radial.nearest(lens)
+    near = radial.nearest_kannala_brandt(lens)
     k = np.array([[near.fx, skew_of(near), near.cx], [0.0, near.fy, near.cy], [0.0, 0.0, 1.0]])
     return camera_info_text(near.name, (near.width, near.height), k, 'equidistant',
                             radial.coefficients(near), np.column_stack([k, np.zeros(3)]))

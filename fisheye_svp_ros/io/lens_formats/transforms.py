@@ -36,7 +36,7 @@ def read(text: str, where: str) -> Foreign:
     """Read the rig: the left camera in the right one; raises LensError, naming what is missing."""
     joints = list(_urdf(text, where) if '<robot' in text else _messages(text, where))
     left, right = (_camera(side, joints, where) for side in ('left', 'right'))
-    (root, mine), (other, theirs) = _rooted(left, joints), _rooted(right, joints)
+    (root, mine), (other, theirs) = _pose_in_root(left, joints), _pose_in_root(right, joints)
     if root != other:
         raise LensError(f'{where}: no fixed transforms lead from {left} to {right}')
     return Foreign('transforms', {}, (theirs.inverse().compose(mine),), {})
@@ -52,7 +52,7 @@ def _camera(side: str, joints: list[_Joint], where: str) -> str:
     return found[0]
 
 
-def _rooted(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:
+def _pose_in_root(frame: str, joints: list[_Joint]) -> tuple[str, Pose]:
     """Return the root of a frame's tree, and the frame in it."""
     above = {child: (parent, pose) for parent, child, pose in joints}
     pose = identity()
@@ -73,7 +73,7 @@ def _urdf(text: str, where: str) -> Iterator[_Joint]:
             place, turn = (_numbers(given.get(name, '0 0 0'), f'{where}: {joint.get("name")}')
                            for name in ('xyz', 'rpy'))
             yield (str(ends[0].get('link')), str(ends[1].get('link')),
-                   Pose(_turned(turn), place))
+                   Pose(_from_rpy(turn), place))
 
 
 def _numbers(text: str, where: str) -> Array:
@@ -83,7 +83,7 @@ def _numbers(text: str, where: str) -> Array:
     return np.array(fields.numbers({'origin': words}, 'origin', 3, where))
 
 
-def _turned(angles: Array) -> Array:
+def _from_rpy(angles: Array) -> Array:
     """Roll, pitch and yaw about fixed axes, as URDF has them."""
     roll, pitch, yaw = rotation_from_vector(np.diag(angles))
     return np.asarray(yaw @ pitch @ roll)
