@@ -224,9 +224,10 @@ class FittedModel:
 
         Along the axes of their boards; the mean square about zero, given the data, of predicted
         offsets: of a sum of the modes, each with a factor of variance 1, and of what each landmark
-        has alone.  sigma: of the whitened noise.
+        has alone.  A motion of the whole target is none of them: it is in the poses.
+        sigma: of the whitened noise.
         """
-        square = self._offset_squares(sigma)
+        square = _without_motion(self._offset_squares(sigma), self._target_motions())
         count = len(square)
         if not square.any():
             return np.zeros((count // 3, 3, 0)), np.zeros((count // 3, 3))
@@ -254,6 +255,16 @@ class FittedModel:
                 present[:, :, None] & present[:, None], sigma**2 * posterior.block, 0.0)
         return np.asarray(square)
 
+    def _target_motions(self) -> Array:
+        """Return the rigid motions (3 L, 6) of the target, along the axes of its boards."""
+        views, random = self.linear.data.views, self.random
+        _, first = np.unique(views.landmark[views.used], return_index=True)
+        arm = views.points[views.used][first]
+        arm = arm - arm.mean(axis=0)
+        turns = np.cross(np.eye(3), arm[:, None])  # (L, 3 turns, 3)
+        moves = np.concatenate([np.broadcast_to(np.eye(3), turns.shape), turns], axis=1)
+        return np.asarray((random.axes @ moves.swapaxes(1, 2)).reshape(-1, 6))
+
     def _landmark_offsets(self, e: Array, r: Array) -> Array:
         """Return what coefficients (E, k, C), (R, C) displace each landmark by: (L, 3, C)."""
         eq, random = self.factored.equations, self.random
@@ -269,6 +280,19 @@ class FittedModel:
                 offset[:, axis] += field.values @ shared[at : at + count]
                 at += count
         return offset
+
+
+def _without_motion(square: Array, motions: Array) -> Array:
+    """Return mean squares (M, M) in the datum that has none of some motions (M, k).
+
+    Source: Baarda, S-transformations and criterion matrices (1973): inner constraints.
+    """
+    values, vectors = np.linalg.eigh(motions.T @ motions)
+    kept = values > 1e-9 * values[-1]  # points on a line turn about it in vain
+    basis = motions @ vectors[:, kept] / np.sqrt(values[kept])
+    across = basis.T @ square
+    cross = basis @ across
+    return np.asarray(square - cross - cross.T + basis @ (across @ basis) @ basis.T)
 
 
 def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Variances) -> RigState:

@@ -265,14 +265,15 @@ class ModelErrors:
         """Return covariances (F, 6, 6), m and rad, of the change in `Pose.retract` of each frame.
 
         linear: frames that were posed with the lens of the diagnosis, those it was made of or
-        others.
+        others.  A frame that one camera alone shows has the pose of that camera: the rig, which
+        such frames say nothing of, is taken as it is.
         """
         return self.propagate(linear, pose_maps(linear.frame_columns))
 
     def propagate(self, linear: Linearization, maps: Array) -> ErrorParts:
         """Return covariances (F, Q, Q) of linear functions (F, Q, M) of whitened image points."""
         turned = np.swapaxes(maps, -1, -2)
-        shared = maps @ linear.shared_columns
+        shared = maps @ _shared_columns(linear)
         covariance = self._covariance_of(linear)
         parameters = shared @ covariance @ np.swapaxes(shared, -1, -2)
         random, variance = self._random_columns(linear)
@@ -381,6 +382,14 @@ def shared_names(linear: Linearization) -> tuple[str, ...]:
 def parameter_names(term: Term) -> list[str]:
     """Return the names of the parameters of an effect, with its own before them."""
     return [f'{term[0].name}.{parameter.name}' for parameter in term[0].parameters]
+
+
+def _shared_columns(linear: Linearization) -> Array:
+    """Return the columns (F, M, K) of what is shared, of the rig where several cameras see."""
+    columns = linear.shared_columns.copy()
+    rig = 6 * (linear.data.cameras - 1)
+    columns[np.bincount(linear.data.frame_of) < 2, :, :rig] = 0.0
+    return columns
 
 
 def _lens_mask(linear: Linearization) -> Array:

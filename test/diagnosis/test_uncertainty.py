@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.scenes import lens, observe, scene
 from helpers.water import AIR, photographs
 from scipy import linalg
 
@@ -28,11 +29,22 @@ def errors_of(observations, free):
     return ModelErrors.from_null_model(null, FittedModel.solve_null_model(null)), null.linear
 
 
+def rigid_motions(at):
+    """Return what unit translations and turns about the origin do to a point, (3, 6)."""
+    return np.transpose([*np.eye(3), *(np.cross(axis, at) for axis in np.eye(3))])
+
+
 def displaced(frames, seed, size=5e-4):
-    """Photographs of a board whose points are off by so many m, anew for each seed."""
+    """Photographs of a board whose points are off by so many m, anew for each seed.
+
+    Of a motion of the whole board they have none: it would be the pose.
+    """
     seen = photographs(AIR, None, frames, noise=0.02)
     rng = np.random.default_rng(seed)
     offset = size * rng.normal(size=(35, 3)) * [1.0, 1.0, 0.0]
+    points = seen.landmarks().points
+    motions = np.linalg.qr(np.concatenate([rigid_motions(at) for at in points]))[0]
+    offset -= (motions @ (motions.T @ offset.ravel())).reshape(-1, 3)
     return replace(seen, xyz=seen.xyz - offset[seen.landmark])
 
 
@@ -85,15 +97,49 @@ def test_what_the_data_know_of_this_target_is_in_its_poses_errors():
     modes, alone = fitted.target_modes(sigma)
     square = (modes**2).sum(axis=-1) + alone**2
     off = np.einsum('lab,lb->la', fitted.random.axes, fitted.predicted_offsets().offset)
-    assert (square >= (1 - 1e-6) * off**2).all()
+    motions = target_motions(data, fitted)
+    off = (off.ravel() - motions @ (motions.T @ off.ravel())).reshape(-1, 3)
+    assert (square >= (1 - 1e-6) * off**2 - 1e-20).all()
     assert square.sum() == pytest.approx((off**2).sum(), rel=0.2)
     # One and the same target moves all poses alike: a mode, not a doubt of each landmark's own.
     assert (alone**2).sum() < 0.1 * square.sum()
-    dense = dense_square(null, sigma)
+    remove = np.eye(len(motions)) - motions @ motions.T
+    dense = remove @ dense_square(null, sigma) @ remove
     whole = modes.reshape(len(dense), -1)
     whole = whole @ whole.T + np.diag(alone.ravel()**2)
     np.testing.assert_allclose(np.diag(whole), np.diag(dense), rtol=1e-5, atol=1e-15)
     assert np.linalg.norm(whole - dense) < 0.05 * np.linalg.norm(dense)
+
+
+def target_motions(data, fitted):
+    """Return an orthonormal basis (3 L, 6) of what a motion of the target does to its points."""
+    points = data.observations.landmarks().points
+    along = [axes @ rigid_motions(at)
+             for axes, at in zip(fitted.random.axes, points, strict=True)]
+    return np.linalg.qr(np.concatenate(along))[0]
+
+
+def test_a_motion_of_the_whole_target_is_no_error_of_its_landmarks():
+    """Poses take it up: the datum of the offsets has none of it."""
+    data = group_by_frame(displaced(8, 3))
+    null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
+    fitted = FittedModel.solve_null_model(null)
+    modes, _ = fitted.target_modes(null.variances.sigma)
+    motions = target_motions(data, fitted)
+    moved = np.linalg.norm(motions.T @ modes.reshape(len(motions), -1))
+    assert moved < 1e-9 * np.linalg.norm(modes)
+
+
+def test_cameras_without_a_common_frame_have_poses_of_their_own():
+    """Nothing says how they stand to each other, and no pose of one of them depends on it."""
+    rng = np.random.default_rng(5)
+    seen = observe(lens(), (), *scene(rng, cameras=2, frames=12), 0.1, rng)
+    apart = replace(seen, frame=seen.frame + 100 * seen.camera)
+    lenses, quick = {'left': lens(), 'right': lens()}, DiagnosisOptions(quick=True)
+    rig, own = (diagnose(one, lenses, options=quick, free_intrinsics=True).to_dict()['uncertainty']
+                for one in (seen, apart))
+    for name in ('position_m', 'rotation_rad'):
+        assert 0 < own[name]['parameters'] < 3 * rig[name]['parameters']
 
 
 def dense_square(null, sigma):
