@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from fisheye_svp_ros.effects.base import Effect
 
 _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 REFUTED = 'held-out frames refute it'
+REFUTED_BY_FILE = 'the held-out file refutes it'
 NOTHING = 'it gains nothing on held-out frames beyond its error'
 
 
@@ -74,7 +75,7 @@ def weakest_cause(evaluation: Evaluation) -> Doubt | None:
         why = _refutation(change)
         if not why and other is not None and change_between(
                 evaluation.predict([effect.name]), other).z < -1:
-            why = 'the held-out file refutes it'
+            why = REFUTED_BY_FILE
         why = why or _confounder(tests, effect, columns, twins) or _implausible(effect, values)
         if why:
             doubts.append(Doubt(effect.name, change.z, why))
@@ -140,6 +141,8 @@ def confirm(
             doubt.effect, parameters_of(effect, values, evaluation.errors[columns]), test.p_value,
             doubt.why)
         selection = without_cause(selection, doubt.effect)
+        if doubt.why in (REFUTED, REFUTED_BY_FILE):
+            selection = replace(selection, refuted=(*selection.refuted, doubt.effect))
 
 
 def _with_refused(

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.diagnosis.advice import Advice, advise
+from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
@@ -178,8 +179,18 @@ class Diagnosis:
         return self.evaluation.fixed_model
 
     @property
+    def written_model(self) -> Linearization:
+        """The model whose lenses are written: with the viewpoint shifts that may be there."""
+        return self.evaluation.written_model
+
+    @property
+    def averaged(self) -> AveragedModel:
+        """The viewpoint shifts that are written and not named."""
+        return self.evaluation.averaged
+
+    @property
     def errors(self) -> ModelErrors:
-        """What is known of the errors of the extended model."""
+        """What is known of the errors of the model whose lenses are written."""
         return self.evaluation.model_errors
 
     @property
@@ -205,7 +216,7 @@ class Diagnosis:
     @property
     def rig(self) -> tuple[tuple[str, str], Pose] | None:
         """The two cameras of a rig and the first in the second, by the extended lenses."""
-        data, rig = self.model.data, self.model.state.rig
+        data, rig = self.model.data, self.written_model.state.rig
         names = rig_cameras(data.observations.cameras)
         if names is None or has_no_rig(data):
             return None
@@ -246,7 +257,7 @@ class Diagnosis:
             'causes': [asdict(cause) for cause in self.causes],
             'named': entry(self.figures.named),
             'lens': entry(self.figures.lens_only) | {
-                'ray_error_mrad': self.conclusion.ray_error_mrad()},
+                'ray_error_mrad': self.conclusion.ray_error_mrad(), **self.averaged.to_dict()},
             'extended': entry(self.figures.extended),
             **self.conclusion.to_dict(),
             'photographs': [
@@ -351,7 +362,7 @@ def _conclude(
     evaluation: Evaluation, candidates: list[UnconfirmedCause], cameras: list[TwoCameras]
 ) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
-    selection, linear = evaluation.selection, evaluation.null.linear
+    selection, averaged = evaluation.selection, evaluation.averaged
     problem, observations = selection.problem, selection.problem.observations
     noise_causes = growth_cause(selection.revision.growth)
     noise_causes += table_causes(observations, selection.revision.outliers, problem.step)
@@ -363,8 +374,9 @@ def _conclude(
         return extended_lenses(problem.inputs.lenses, state, observations)
 
     lenses = with_uncertainty(
-        evaluation.model_errors, linear, evaluation.noise_px,
+        evaluation.model_errors, averaged.linear, evaluation.noise_px,
         evaluation.uncertainty['image_px']['misfit'], lenses_of)
+    lenses = {name: averaged.with_shift_entry(lens, name) for name, lens in lenses.items()}
     advice = advise(evaluation, causes, significant)
     conclusion = conclude(
         evaluation, causes, components, advice, candidates, problem.inputs.lenses, lenses_of,

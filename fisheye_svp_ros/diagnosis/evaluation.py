@@ -5,7 +5,7 @@ Held-out residuals, shares of variance, errors of parameters, gains with their i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Mask
+from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, selected_causes
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.similar_views import similar_views
@@ -29,7 +30,12 @@ from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
-from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors, standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import (
+    ModelErrors,
+    shared_names,
+    standard_errors,
+    total_errors,
+)
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     cause_squares,
@@ -172,23 +178,33 @@ class Evaluation:
         return [effect.name for effect, _, _ in self.selection.causes]
 
     @cached_property
+    def averaged(self) -> AveragedModel:
+        """The model whose lens is written: with the shifts that may be there."""
+        return AveragedModel.of(self.selection)
+
+    @cached_property
     def model_errors(self) -> ModelErrors:
-        """What is known of the errors of the extended model."""
-        return ModelErrors.from_null_model(self.null, self.fitted)
+        """What is known of the errors of the model whose lens is written."""
+        return self.averaged.errors(ModelErrors.from_null_model(self.null, self.fitted))
+
+    @cached_property
+    def written_model(self) -> Linearization:
+        """The model whose lens is written, without random effects: poses are fitted anew."""
+        return _with_poses_anew(self.averaged.linear)
 
     @cached_property
     def uncertainty(self) -> dict[str, dict[str, float]]:
-        """How far off poses and image points are by the extended model: a summary."""
-        return self.model_errors.summary(self.fixed_model)
+        """How far off poses and image points are by the lens that is written: a summary."""
+        return self.model_errors.summary(self.written_model)
 
     @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
         return self._errors_of(self.null)
 
-    def _errors_of(self, null: NullModel) -> Array:
+    def _errors_of(self, null: NullModel, averaged: Collection[str] = ()) -> Array:
         return (standard_errors(null, jackknife=False) if self.selection.problem.options.quick
-                else total_errors(null))
+                else total_errors(null, averaged))
 
     def predict(
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
@@ -262,10 +278,7 @@ class Evaluation:
     @cached_property
     def fixed_model(self) -> Linearization:
         """The causes without random effects: poses, which these had moved, are fitted anew."""
-        linear = self.null.linear
-        if linear.data.poses is not None:
-            return linear
-        return Linearization(linear.data, adjust_poses(linear.data, linear.state), linear.free)
+        return _with_poses_anew(self.null.linear)
 
     @property
     def falling(self) -> bool:
@@ -274,15 +287,21 @@ class Evaluation:
         return all(one >= _SAME_RMS * other for one, other in pairwise(sizes))
 
     @cached_property
+    def _errors_without_shifts(self) -> Array:
+        """Standard errors (K,) without those of the shifts that are averaged over."""
+        kinds = self.averaged.kinds
+        return self._errors_of(self.null, kinds) if kinds else self.errors
+
+    @cached_property
     def covariance(self) -> Array:
-        """Covariance (K, K) of what is shared, with its standard errors (`errors`)."""
+        """Covariance (N, N) of what is shared in the model whose lens is written."""
         own = self.null.included_columns
         inverse, _ = pseudo_inverse(self.null.information[np.ix_(own, own)], 1e-13)
         scale = self.null.scale[own]
         known = np.sqrt(np.diag(inverse)) / scale
-        larger = np.nan_to_num(self.errors) / np.maximum(known, 1e-300)
+        larger = np.nan_to_num(self._errors_without_shifts) / np.maximum(known, 1e-300)
         larger = np.where(known > 0, np.maximum(larger, 1.0), 0.0) / scale
-        return np.asarray(inverse * np.outer(larger, larger))
+        return self.averaged.widen(inverse * np.outer(larger, larger))
 
     @cached_property
     def base_quality(self) -> FitQuality:
@@ -380,16 +399,24 @@ class Evaluation:
         """Free intrinsics before and after, with errors under the null model."""
         if self.medium is not None:
             return {}
-        selection, after = self.selection, self._free_errors()
+        selection = self.selection
+        after = dict(zip(shared_names(self.averaged.linear),
+                         self.averaged.widen_errors(self._errors_without_shifts), strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = self._errors_of(selection.first)
         rig = _count_rig_columns(selection.first, self.free)
-        was, now = selection.problem.base.parameters, selection.state.parameters
+        was, now = selection.problem.base.parameters, self.averaged.linear.state.parameters
         return {
             name: Intrinsic(
-                *given[name], was[name], float(before[rig + i]), now[name], after[name])
+                *given[name], was[name], float(before[rig + i]), now[name], float(after[name]))
             for i, name in enumerate(self.free)
         }
+
+
+def _with_poses_anew(linear: Linearization) -> Linearization:
+    if linear.data.poses is not None:
+        return linear
+    return Linearization(linear.data, adjust_poses(linear.data, linear.state), linear.free)
 
 
 def _count_rig_columns(null: NullModel, free: Sequence[str]) -> int:

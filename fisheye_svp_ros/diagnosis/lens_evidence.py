@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.averaging import OpenShifts
 from fisheye_svp_ros.diagnosis.cross_validation import (
     HeldOut,
     gain_and_confidence,
@@ -30,7 +31,7 @@ from fisheye_svp_ros.solve.ray_errors import (
     typical_points,
     without_motion,
 )
-from fisheye_svp_ros.solve.rig_state import RigState
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared
 
 _BOUNDED = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
@@ -40,13 +41,12 @@ _NEAR = 1  # of ray_errors.RANGES: 1 m
 LensesOf = Callable[[RigState], Mapping[str, Lens]]
 
 
-def lens_columns(null: NullModel) -> Mask:
+def lens_columns(linear: Linearization) -> Mask:
     """Return which of what is shared (K,) goes into a lens file: intrinsics, lasting effects."""
-    linear = null.linear
     found = [np.zeros(6 * (linear.data.cameras - 1), dtype=bool),
              np.ones(len(linear.free), dtype=bool)]
     found += [np.full(len(values), effect.stage != 'target' and not effect.of_recording)
-              for effect, _, values in null.terms]
+              for effect, values in linear.state.terms if is_shared(effect)]
     return np.concatenate(found)
 
 
@@ -67,18 +67,21 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
 
 
 def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
-    null = evaluation.null
+    null, shifts = evaluation.null, OpenShifts.of(evaluation.selection)
     linear, ratio = null.linear, noise_ratio(null.linear)
-    of_lens, (now, given) = lens_columns(null), _shared_values(evaluation)
-    at, scale = null.columns_and_residual(null.included_columns), null.scale[null.included_columns]
+    now, given = _shared_values(evaluation)
+    of_lens = np.append(lens_columns(linear), np.ones(len(shifts.columns), dtype=bool))
+    at = null.columns_and_residual(shifts.columns)
     residual = np.zeros((2, *linear.residual.shape))
     for frame, information in enumerate(null.information_without_frames(at)):
-        kept, change, combination = refit_shared(null, information, (), ())
-        new = now.copy()
-        new[kept] += change
-        off = np.where(of_lens, (new - given) * scale, 0.0)
+        _, change, combination = refit_shared(null, information, (), ())
+        likely = shifts.posterior(null, information)
+        added = np.append(likely.follow @ likely.mean, likely.mean * null.scale[shifts.columns])
+        combination[:-1] -= added
+        new = np.append(now + change - given, np.zeros(len(shifts.columns)))
+        off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
         extended = null.leave_one_out.rows[frame][:, at] @ combination
-        other = null.fixed.border[frame][:, null.included_columns] @ off
+        other = null.fixed.border[frame][:, at[:-1]] @ off
         poses = linear.frame_columns[frame] * ratio[frame][:, None]
         inverse = np.linalg.pinv(poses, rcond=1e-9)
         for i, whitened in enumerate((extended + other, extended)):
@@ -167,8 +170,9 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
-    null, of_lens = evaluation.null, lens_columns(evaluation.null)
-    linear, covariance = null.linear, evaluation.covariance[np.ix_(of_lens, of_lens)]
+    averaged = evaluation.averaged
+    linear, of_lens = averaged.linear, lens_columns(averaged.linear)
+    covariance = evaluation.covariance[np.ix_(of_lens, of_lens)]
     frames = np.zeros((linear.data.frames, 6))
     before, views = lenses_of(evaluation.simulation.state), linear.data.views
     errors, offsets = {}, []
@@ -176,7 +180,7 @@ def find_lens_rays(
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
 
         def extended(step: Array, name: str = name) -> Lens:
-            shared = np.zeros(null.column_count)
+            shared = np.zeros(len(of_lens))
             shared[of_lens] = step
             return lenses_of(linear.state.retract(linear.free, frames, shared))[name]
 

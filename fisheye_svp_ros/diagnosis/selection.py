@@ -82,7 +82,8 @@ class Revision(NamedTuple):
 class Selection:
     """The causes that were found, in the null model around the state with them.
 
-    first: the null model of the simulation, before any cause; trace: what was tried.
+    first: the null model of the simulation, before any cause; trace: what was tried; refuted: by
+    held-out frames.
     """
 
     problem: Problem
@@ -90,6 +91,7 @@ class Selection:
     null: NullModel
     revision: Revision
     trace: tuple[TraceStep, ...]
+    refuted: tuple[str, ...] = ()
 
     @property
     def state(self) -> RigState:

@@ -12,6 +12,8 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import Lens
 
+SHIFT_SIGMA = 4e-3  # m: of e0 where there is a shift; most fisheye lenses measured have 1 to 6 mm
+
 
 @dataclass(frozen=True)
 class ViewpointShiftEffect(Effect):

@@ -98,7 +98,7 @@ def _height_map(figure: Figure, axis: Axes, board: BoardMap) -> None:
 
 def draw_uncertainty(path: Path, diagnosis: Diagnosis) -> None:
     """Draw the standard deviation of a coordinate by noise, parameters and remaining misfit."""
-    linear = diagnosis.model
+    linear = diagnosis.written_model
     data, state = linear.data, linear.state
     parts = diagnosis.errors.of_points(linear)._asdict()
     uv = data.blocks(data.views.uv).reshape(-1, 2)

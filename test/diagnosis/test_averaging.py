@@ -1,0 +1,102 @@
+"""The lens that is written: averaged over the models with and without a viewpoint shift."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.water import AIR, photographs
+
+from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.averaging import PRIOR_ODDS, AveragedModel, OpenShifts
+from fisheye_svp_ros.diagnosis.diagnosis import extended_lenses
+from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
+from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
+from fisheye_svp_ros.effects.viewpoint_shift import SHIFT_SIGMA
+from fisheye_svp_ros.optics.curves import Gennery
+
+
+def diagnosed(e0: float, noise: float, seed: int = 0, **settings: object) -> Diagnosis:
+    """Diagnose eight photographs through a lens with a shift as those of one without."""
+    seen = photographs(AIR.with_shift(Gennery(0.0, e0)), None, 8, noise, seed)
+    return diagnose(seen, AIR, free_intrinsics=True, **settings)  # type: ignore[arg-type]
+
+
+def test_a_shift_that_is_likely_and_not_named_is_written_in_part() -> None:
+    found = diagnosed(0.004, 0.1)
+    assert not found.causes
+    (shift,) = found.averaged.shifts
+    assert PRIOR_ODDS / (1 + PRIOR_ODDS) < shift.weight < 1
+    written = found.lens.viewpoint_shift
+    assert isinstance(written, Gennery) and written.e0 == pytest.approx(shift.e0)
+    assert abs(written.e0 - 0.004) < shift.stderr < SHIFT_SIGMA
+    known = found.lens.uncertainty
+    assert known is not None and known['averaged_shift']['weight'] == pytest.approx(shift.weight)
+    at = known['parameters'].index('e0')
+    assert known['covariance'][at][at] == pytest.approx(shift.stderr**2, rel=1e-6)
+    assert found.to_dict()['lens']['averaged_shift'][0]['e0'] == pytest.approx(shift.e0)
+
+
+def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:
+    """Against the marginal likelihoods of whole models, e0 integrated over its prior."""
+    found = diagnosed(0.004, 0.1)
+    null = found.evaluation.null
+    form = next(i for i, effect in enumerate(null.fixed.forms.effects)
+                if effect.name == 'viewpoint_shift')
+    both = np.append(null.included_columns, null.form_columns(form))
+    information = null.information[np.ix_(both, both)].copy()
+    score = null.information[both, -1]
+    size = SHIFT_SIGMA * null.scale[both[-1]]
+    information[-1, -1] += size**-2
+    alone = information[:-1, :-1]
+    gain = score @ np.linalg.solve(information, score) - score[:-1] @ np.linalg.solve(
+        alone, score[:-1])
+    logs = np.linalg.slogdet(information)[1] - np.linalg.slogdet(alone)[1] + 2 * np.log(size)
+    odds = PRIOR_ODDS * np.exp((gain - logs) / 2)
+    (shift,) = found.averaged.shifts
+    assert shift.weight == pytest.approx(odds / (1 + odds), rel=1e-4)
+    estimate = np.linalg.solve(information, score) / null.scale[both]
+    assert shift.e0 == pytest.approx(shift.weight * estimate[-1], rel=1e-4)
+    moved = found.averaged.linear.state.lens.fx - null.linear.state.lens.fx
+    base = np.linalg.solve(alone, score[:-1]) / null.scale[both[:-1]]
+    assert moved == pytest.approx(shift.weight * (estimate[0] - base[0]), rel=1e-3)
+
+
+def test_nothing_is_added_where_the_data_speak_against_a_shift_or_the_user_does() -> None:
+    assert not diagnosed(0.0, 0.05).averaged.shifts
+    assert diagnosed(0.0, 0.05).lens.viewpoint_shift is None
+    options = DiagnosisOptions(left_out=('viewpoint_shift',))
+    assert not diagnosed(0.004, 0.1, options=options).averaged.shifts
+
+
+def test_a_named_shift_is_written_as_it_is_named() -> None:
+    found = diagnosed(0.004, 0.05)
+    assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
+    assert not found.averaged.shifts
+    named = found.causes[0].parameters['e0']['value']
+    written = found.lens.viewpoint_shift
+    assert isinstance(written, Gennery) and written.e0 == pytest.approx(named)
+
+
+def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() -> None:
+    found = diagnosed(0.004, 0.1)
+    closed = diagnosed(0.004, 0.1, options=DiagnosisOptions(left_out=('viewpoint_shift',)))
+    assert found.figures.named.rms_px == pytest.approx(closed.figures.named.rms_px, rel=1e-3)
+    assert found.file.extended_px < closed.file.extended_px
+    given = found.problem.inputs.lenses
+    rays = find_lens_rays(found.evaluation, found.lenses, lambda state: extended_lenses(
+        given, state, found.problem.observations)).errors['']
+    for one, other in zip(rays['given'], rays['extended'], strict=True):
+        assert one.value == pytest.approx(other.value, rel=1e-6)  # no difference to itself
+    known, bare = (d.uncertainty['image_px'] for d in (found, closed))
+    assert known['parameters'] > bare['parameters']
+    assert LensErrors.from_lens(found.lens).model.names[-1] == 'e0'
+
+
+def test_a_refuted_shift_is_not_written() -> None:
+    selection = diagnosed(0.004, 0.1).evaluation.selection
+    assert OpenShifts.of(selection).effects
+    refuted = replace(selection, refuted=('viewpoint_shift',))
+    assert not OpenShifts.of(refuted).effects
+    assert not AveragedModel.of(refuted).shifts
