@@ -179,9 +179,11 @@ def _print(
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.WORDS)
     if args.output:
-        lenses = [str(Path(camera) / EXTENDED) for camera in diagnosis.lenses]
-        files = ', '.join([*lenses, *(['rig.yaml'] if diagnosis.rig else [])])
-        print(f'{args.output}: report.html, diagnosis.json, {files}, residuals.csv')
+        files = ['report.html', 'diagnosis.json']
+        if diagnosis.offers_extended:
+            files += [str(Path(camera) / EXTENDED) for camera in diagnosis.lenses]
+        files += ['rig.yaml'] * bool(diagnosis.rig)
+        print(f'{args.output}: {", ".join(files)}, residuals.csv')
 
 
 def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
@@ -197,7 +199,7 @@ def _write(
     wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
-    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
+    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED, not_offered
     from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
     folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.model)
@@ -207,7 +209,7 @@ def _write(
         document['next'] = wanted.to_list()
     write_json(folder / 'diagnosis.json', document)
     for camera, lens in diagnosis.lenses.items():
-        save_lens(lens, folder / camera / EXTENDED)
+        save_lens(lens, folder / camera / EXTENDED, not_offered(diagnosis))
     if diagnosis.rig:
         cameras, rig = diagnosis.rig
         save_rig(rig, folder / 'rig.yaml', cameras)

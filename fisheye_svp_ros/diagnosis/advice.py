@@ -77,7 +77,7 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
         boards = sorted({board for cause in causes if cause.effect_class.budget_stage() == 'target'
                          for board in _boards(cause)})
         advice.append(Advice(
-            'measure the target again (the extended lens file corrects it for this target alone)',
+            'measure the target again',
             boards=boards,
             landmarks=[n for c in causes if c.effect_class.target_map == 'single'
                        for n in _landmarks(c)],

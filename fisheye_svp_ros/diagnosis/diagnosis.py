@@ -119,6 +119,11 @@ class Diagnosis:
         return self.conclusion.decision
 
     @property
+    def offers_extended(self) -> bool:
+        """Whether the extended lens is expected to be better than the lens as given."""
+        return self.decision['lens'].say in ('use_extended', 'recalibrate')
+
+    @property
     def candidates(self) -> list[UnconfirmedCause]:
         """Effects that are significant, and not confirmed."""
         return self.conclusion.candidates

@@ -82,10 +82,10 @@ def cameras_in(path: str | Path) -> tuple[str, ...]:
     return tuple(foreign.lenses) if foreign and len(foreign.lenses) > 1 else ()
 
 
-def save_lens(lens: Lens, path: str | Path) -> None:
-    """Write a lens YAML that `load_lens` reads back to the same lens."""
-    document = lens_to_dict(lens)
-    write_text(path, dump_yaml(document, default_flow_style=None, width=99))
+def save_lens(lens: Lens, path: str | Path, note: str = '') -> None:
+    """Write a lens YAML that `load_lens` reads back to the same lens; note: a comment above."""
+    text = dump_yaml(lens_to_dict(lens), default_flow_style=None, width=99)
+    write_text(path, f'# {note}\n{text}' if note else text)
 
 
 def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:

@@ -33,6 +33,7 @@ from fisheye_svp_ros.nodes.set_collection import (
 )
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.diagnosis_text import not_offered
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import posable_observations
@@ -227,7 +228,7 @@ class ModelCritic(SolverNode):
             return response
         path = Path(self.settings.output).absolute()
         try:
-            save_lens(self._verdict.lens, path)
+            save_lens(self._verdict.lens, path, not_offered(self._verdict))
         except FisheyeSvpError as error:
             response.message = str(error)
             return response

@@ -94,7 +94,7 @@ def write_report(
         next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
-        extended=_extended(diagnosis, inputs),
+        extended=_extended(diagnosis, inputs), not_offered=text.not_offered(diagnosis),
     ))
     return [report, *pictures]
 

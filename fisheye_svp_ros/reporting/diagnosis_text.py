@@ -92,6 +92,13 @@ def lens_words(d: Diagnosis) -> str:
     return (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
 
 
+def not_offered(d: Diagnosis) -> str:
+    """Return why the extended lens is not to be used, '' where it is."""
+    if d.offers_extended:
+        return ''
+    return f'Not better than the lens as given, as far as is known: {d.decision["lens"].why}'
+
+
 def only_gross(d: Diagnosis) -> bool:
     """Say whether all that remains is points that were rejected, by name."""
     return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
@@ -260,8 +267,8 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         text += (f', which takes away {value} (95 % interval {low} to {high}) of the error above '
                  'the noise')
     if 'target' in {c.effect_class.budget_stage() for c in moving}:
-        text += (f'; on the same corrected target {EXTENDED} leaves {d.file.extended_px:.3g} px, '
-                 f'the lens as given {d.file.given_px:.3g} px')
+        text += (f'; on the same corrected target the extended lens leaves '
+                 f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
     for (label, base, extended, _), compared in zip(
         known_rows(known), known.values(), strict=True
     ):

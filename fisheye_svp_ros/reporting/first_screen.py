@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
 from fisheye_svp_ros.reporting.diagnosis_text import known_rows, lens_words, size
-from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, TARGET, headline
+from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
 _SHOWN = 4  # photographs, and candidates, by name
@@ -66,7 +66,7 @@ def first_screen(
     about = frames_of(d.advice, RETAKE) or frames_of(d.advice, UNLIKE)
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         ('Lens', lens_words(d), d.decision['lens'], []),
-        ('Target', TARGET[d.decision['target'].say], d.decision['target'], []),
+        ('Target', target_words(d), d.decision['target'], []),
         ('Photographs', PHOTOGRAPHS[d.decision['photographs'].say], d.decision['photographs'],
          about),
     )
@@ -140,7 +140,10 @@ def _causes(d: Diagnosis) -> str:
 
 
 def _candidates(d: Diagnosis) -> str:
-    words = [f'{one.effect} ({one.why})' for one in d.candidates[:_SHOWN]]
+    words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (by its evidence '
+             f'{100 * one.weight:.0f} % likely: e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} '
+             'mm is in the extended lens)' for one in d.averaged.shifts]
+    words += [f'{one.effect} ({one.why})' for one in d.candidates[:_SHOWN]]
     more = len(d.candidates) - _SHOWN
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
 
@@ -178,9 +181,8 @@ def next_command(d: Diagnosis, observations: str, options: str, lenses: Sequence
     observations: with the options that find the board; options: of the extended lenses; lenses:
     as given.
     """
-    if d.decision['lens'].say == 'keep':
-        return f'fisheye-svp localize {observations} {" ".join(lenses)} -o poses'
     boards = {*d.problem.observations.board.tolist()}
     if d.decision['lens'].say == 'undecided' and len(d.lenses) == len(boards) == 1:
         return f'fisheye-svp diagnose {observations} {" ".join(lenses)} --next 6 -o next'
-    return f'fisheye-svp localize {observations} {options} -o poses'
+    used = options if d.offers_extended else ' '.join(lenses)
+    return f'fisheye-svp localize {observations} {used} -o poses'

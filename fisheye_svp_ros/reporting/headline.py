@@ -45,6 +45,12 @@ def headline(d: Diagnosis) -> str:
     return f'{largest_cause(d)}. {lens_words(d)}.'
 
 
+def target_words(d: Diagnosis) -> str:
+    """Return what to do about the target."""
+    say = d.decision['target'].say
+    return TARGET['measure_again' if say == 'correct' and not d.offers_extended else say]
+
+
 def largest_cause(d: Diagnosis) -> str:
     """Return the cause of the largest share of the variance, or what stands in its place."""
     if d.causes:

@@ -22,7 +22,7 @@ SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
 SMALL = Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
 LIKELY = Bound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
-    [], [], (0.0, 0.0), SAME, LensOffset(0.3, 0.4, 0.6, 0.1), [], [SMALL], 0.05, True)
+    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.4, 0.6, 0.1), [], [SMALL], 0.05, True)
 
 
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
@@ -51,6 +51,12 @@ def test_the_extended_lens_is_used_where_it_predicts_better_on_the_same_target()
     facts = SOUND._replace(causes=['target_shape'], named_gain=(0.8, 0.7), file=BETTER)
     found = decide_lens(facts)
     assert found.say == 'use_extended' and found.figure == ('file_gain', 0.75, '1')
+
+
+def test_a_lens_with_a_likely_shift_and_no_cause_is_used_where_it_predicts_better() -> None:
+    assert decide_lens(SOUND._replace(averaged=True, file=BETTER)).say == 'use_extended'
+    assert decide_lens(SOUND._replace(file=BETTER)).say == 'keep'
+    assert decide_lens(SOUND._replace(averaged=True)).say == 'keep'
 
 
 def test_figures_that_disagree_leave_it_undecided() -> None:

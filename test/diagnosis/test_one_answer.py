@@ -112,3 +112,17 @@ def test_a_lens_that_half_a_diagnosis_would_make_worse_is_not_recommended(
     assert lens['say'] == 'undecided'
     bound, = (one for one in lens['bound'] if one['effect'] == 'viewpoint_shift')
     assert bound['value'] > 0.0047
+
+
+@pytest.mark.parametrize('name', SETS)
+def test_a_lens_that_is_not_recommended_is_not_offered(
+    results: dict[str, Path], name: str
+) -> None:
+    """Neither by a command, nor as a correction of the target; the file itself says why."""
+    out, found = diagnosed(results, name)
+    offered = found['decision']['lens']['say'] in ('use_extended', 'recalibrate')
+    page = (out / 'report.html').read_text()
+    assert ('/extended_lens.yaml' in page) == offered
+    assert ('Correct it by extended_lens.yaml' in page) <= offered
+    first = (out / 'extended_lens.yaml').read_text().partition('\n')[0]
+    assert first.startswith('# Not better than the lens as given') == (not offered)
