@@ -10,8 +10,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
+from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
-from fisheye_svp_ros.diagnosis.selection import NoiseGrowth
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.scene.observations import Observations

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -43,7 +44,7 @@ _STEP_TOLERANCE = 3e-3  # of the noise: what a step moves predictions by
 _MIN_MODE, _MAX_MODES = 0.01, 12  # of all, what one way for landmarks to be off explains
 _PROBES = 24
 _PAIR_REACH = 80  # of the image: how near to each other points have the same place
-_MIN_PAIRS = 100
+MIN_PAIRS = 100
 
 
 class RepeatedErrors(Protocol):
@@ -182,27 +183,41 @@ class FittedModel:
         hat = self.predict_rows(*self.solve_rows(signs))
         return np.asarray(np.clip((signs * hat).mean(axis=-1), 0.0, 0.8))
 
+    @cached_property
+    def standardized_residuals(self) -> Array:
+        """Residuals (F, M) over their standard deviations."""
+        return np.asarray(
+            self.residuals() / np.sqrt((1 - self.leverages()) * self.solution.variance))
+
     def standardized_squares(self) -> Array:
         """Return squared residuals (F, M) over their expected squares: each about 1 on average."""
-        return np.asarray(
-            self.residuals()**2 / (1 - self.leverages()) / self.solution.variance)
+        return np.asarray(self.standardized_residuals**2)
+
+    def point_pairs(self) -> tuple[Index, Index]:
+        """Return pairs of points (P, 2) of different frames on the same place, and frames (N,).
+
+        The closest come first.  Points have numbers among the used ones of (F, M / 2).
+        """
+        linear = self.linear
+        uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
+        used = linear.row_mask[:, ::2]
+        frame = np.nonzero(used)[0]
+        at = uv[used]
+        reach = float(np.ptp(at, axis=0).max()) / _PAIR_REACH
+        pairs = cKDTree(at).query_pairs(reach, output_type='ndarray')
+        pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]
+        apart = np.linalg.norm(at[pairs[:, 0]] - at[pairs[:, 1]], axis=1)
+        return pairs[np.argsort(apart, kind='stable')], frame
 
     def place_correlation(self) -> float:
         """Return how alike points of different frames err on the same place, in standard errors.
 
         Residuals with everything predicted that are finer than the image fields have room for.
         """
-        linear = self.linear
-        remaining = self.residuals().reshape(*linear.residual.shape[:1], -1, 2)
-        uv = linear.data.blocks(np.nan_to_num(linear.linear.uv)[..., None, :])
-        used = linear.row_mask[:, ::2]
-        frame = np.broadcast_to(np.arange(len(used))[:, None], used.shape)[used]
-        at, errors = uv[used], remaining[used]
-        reach = float(np.ptp(at, axis=0).max()) / _PAIR_REACH
-        pairs = cKDTree(at).query_pairs(reach, output_type='ndarray')
-        pairs = pairs[frame[pairs[:, 0]] != frame[pairs[:, 1]]]
-        if len(pairs) < _MIN_PAIRS:
+        pairs, _ = self.point_pairs()
+        if len(pairs) < MIN_PAIRS:
             return 0.0
+        errors = self.residuals()[self.linear.row_mask].reshape(-1, 2)
         products = (errors[pairs[:, 0]] * errors[pairs[:, 1]]).sum(axis=1)
         typical = np.clip(products, *np.quantile(products, (0.005, 0.995)))
         return float(typical.mean() / max(typical.std(), 1e-300) * np.sqrt(len(pairs)))

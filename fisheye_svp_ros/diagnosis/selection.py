@@ -13,13 +13,13 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, refit
+from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth, noise_growth
 from fisheye_svp_ros.diagnosis.null_model import (
     FINEST_FIELD,
     NullModel,
@@ -59,16 +59,6 @@ _LEAST_SQUARES_LIMIT = 400.0  # and so many: its columns lead nowhere, least squ
 _MAX_EFFECTS = 20  # in one round
 _REINSTATED_SIGMAS = 4.0  # below these a rejected point is like all others
 _OUTLIER_PROBABILITY = 0.005  # probability of one such point among clean ones
-_WITHIN_SIGMAS = 2.6  # standard errors
-
-
-class NoiseGrowth(NamedTuple):
-    """Noise that changes: value, standard error, p-value; variance (F, M): over the mean one."""
-
-    value: float
-    stderr: float
-    p_value: float
-    variance: Array
 
 
 class Revision(NamedTuple):
@@ -176,17 +166,15 @@ def _change_effects(problem: Problem, search: _Search, null: NullModel, most: in
 
 
 def _revise(problem: Problem, search: _Search, null: NullModel) -> _Search:
-    """Revise outliers and noise once the causes are known, and ask for the finest image field."""
-    if problem.options.quick or (search.revision and search.finest):
+    """Ask for the finest image field once the causes are known, then revise outliers and noise."""
+    if problem.options.quick or search.revision is not None:
         return search
     fitted = FittedModel.solve_null_model(null)
-    if search.revision is None:
-        search = _revise_outliers(problem, search, fitted)
-    if not search.finest and fitted.place_correlation() > _FIELD_TEST_SIGMAS:
-        # Points of different frames err alike where they fall on the same place.
-        search = replace(search, finest=null.calls_for_finest_field(
-            search.data, search.state, problem.options.left_out))
-    return search
+    # Points of different frames err alike where they fall on the same place.
+    if (not search.finest and fitted.place_correlation() > _FIELD_TEST_SIGMAS
+            and null.calls_for_finest_field(search.data, search.state, problem.options.left_out)):
+        return replace(search, finest=True)
+    return _revise_outliers(problem, search, fitted)
 
 
 def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> _Search:
@@ -196,7 +184,7 @@ def _revise_outliers(problem: Problem, search: _Search, fitted: FittedModel) -> 
     """
     squares, growth = fitted.standardized_squares(), None
     if 'noise_vs_angle' not in problem.options.left_out:
-        growth = noise_growth(fitted, squares)
+        growth = noise_growth(fitted)
         squares = squares / growth.variance
         if growth.p_value * len(CATALOGUE) > SIGNIFICANCE:
             growth = None
@@ -360,47 +348,6 @@ def reinstate_outliers(
     why = tuple(one for one, back in zip(outliers.why, again, strict=True) if not back)
     return (replace(data, views=views._replace(weight=weight, row=row)),
             Outliers(outliers.rows[~again], outliers.px[~again], why))
-
-
-def noise_growth(fitted: FittedModel, squares: Array) -> NoiseGrowth:
-    """Fit sigma(theta) = sigma0 exp(growth theta^2) to standardised squares (likelihood ratio).
-
-    Those of outlying points count as little as the limit allows.  It is none where the same
-    landmarks do not scatter more at larger angles: some landmarks scatter more than others.
-    """
-    linear = fitted.linear
-    used = linear.row_mask
-    e2 = np.minimum(squares[used], 20.0)
-    theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
-    every = theta**2 - (theta[used] ** 2).mean()
-    z = every[used]
-
-    def deviance(growth: float) -> float:
-        # With z centred the mean of log sigma does not change: only the scale is profiled out.
-        return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
-
-    best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
-    # Heavier tails than the normal distribution's scatter the squares more.
-    tails = max(float(e2.var()) / 2, 1.0)
-    gain = (deviance(0.0) - float(best.fun)) / tails
-    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    landmark = np.where(linear.data.views.used, linear.data.views.landmark, -1)
-    rows = linear.data.blocks(landmark[..., None] * np.ones(2))[used].astype(int)
-    within = np.sign(best.x) * _growth_within_landmarks(e2, z, rows, np.nonzero(used)[0])
-    p = float(special.chdtrc(1, max(gain, 0.0))) if within > _WITHIN_SIGMAS else 1.0
-    level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
-    return NoiseGrowth(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
-
-
-def _growth_within_landmarks(e2: Array, z: Array, landmark: Index, frame: Index) -> float:
-    """Return how squares e2 (M,) grow with z for the same landmarks (M,), in standard errors.
-
-    What one frame (M,) says counts as one observation: its points may err together.
-    """
-    count = np.maximum(np.bincount(landmark), 1)
-    mean, middle = ((np.bincount(landmark, weights=of) / count)[landmark] for of in (e2, z))
-    products = np.bincount(frame, weights=(e2 / np.maximum(mean, 1e-300) - 1) * (z - middle))
-    return float(products.sum() / max(np.sqrt((products**2).sum()), 1e-300))
 
 
 def with_noise_growth(state: RigState, growth: float) -> RigState:

@@ -7,6 +7,7 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy import stats
 
+from benchmark.blind_trial import Task, draw_case
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose, refit
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain, sum_gains
 from fisheye_svp_ros.diagnosis.stepwise import bulk_p_values
@@ -39,6 +40,26 @@ def test_landmarks_that_scatter_more_are_no_noise_that_grows_with_the_angle():
     found = diagnose(replace(clean, uv=clean.uv + rng.normal(size=clean.uv.shape) * sigma), lens())
     assert [cause.effect for cause in found.causes] == []
     assert 'scatter_vs_theta' in [s.variable for s in found.remaining]
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_ripples_that_grow_outward_are_no_noise(seed):
+    """A static error of the lens that no image field is fine enough for."""
+    rng = np.random.default_rng(seed)
+    table = observe(lens(), (), *scene(rng, frames=30), SIGMA, rng)
+    arm = (table.uv - [lens().cx, lens().cy]) / 700
+    ripple = arm * np.sin(100 * np.linalg.norm(arm, axis=1, keepdims=True))
+    found = diagnose(replace(table, uv=table.uv + 3 * SIGMA * ripple), lens())
+    assert 'noise_vs_angle' not in {cause.effect for cause in found.causes}
+
+
+@pytest.mark.parametrize('seed', [0, 2])
+def test_landmarks_of_two_colors_are_no_noise(seed):
+    """The lens magnifies one color more: its points err by more where the image is higher."""
+    case = draw_case(Task('outside', 1.0, ('colour',), seed, 0))
+    found = diagnose(case.scene.table(case.given), case.scene.lens,
+                     free_intrinsics=case.scene.free)
+    assert 'noise_vs_angle' not in {cause.effect for cause in found.causes}
 
 
 @pytest.mark.parametrize(('radius', 'size'), [(0.07, 2), (0.12, 4)])
