@@ -18,7 +18,7 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare rectification kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare rectification hand-eye kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -100,6 +100,16 @@ compare: .venv-compare/ready
 # docs/results/rectification.md; a minute.
 rectification: .venv-compare/ready
 	.venv-compare/bin/python -m benchmark.rectification
+
+# Cameras on robots beside OpenCV's hand-eye calibration, which OpenCV 5 has no more, into
+# docs/results/hand_eye.md; ten minutes.
+hand-eye: .venv-hand-eye/ready
+	.venv-hand-eye/bin/python -m benchmark.hand_eye
+
+.venv-hand-eye/ready: setup.py
+	$(PYTHON) -m venv .venv-hand-eye
+	$(QUIETLY) .venv-hand-eye/bin/pip install --quiet -e '.[fast]' 'opencv-python-headless<5'
+	touch $@
 
 # mrcal without what only its windows need, which wants to be compiled.
 .venv-compare/ready: setup.py

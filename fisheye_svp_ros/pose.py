@@ -113,6 +113,16 @@ def cross_matrix(vector: Array) -> Array:
     return cross
 
 
+def log_derivative(vector: Array) -> Array:
+    """Return d log(exp(e) exp(v)) / de (..., 3, 3) of rotation vectors v (..., 3), at e = 0.
+
+    The inverse of the left Jacobian of SO(3): Barfoot, State Estimation for Robotics, (7.76).
+    """
+    half = np.maximum(np.linalg.norm(vector, axis=-1) / 2, 1e-6)[..., None, None]
+    k = cross_matrix(vector)
+    return np.asarray(np.eye(3) - k / 2 + (1 - half / np.tan(half)) / (4 * half**2) * (k @ k))
+
+
 def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
     """Unit quaternions (..., 4) in ROS order x, y, z, w to matrices; the norm is divided out."""
     q = np.asarray(quaternion, dtype=float)

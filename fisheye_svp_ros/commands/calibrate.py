@@ -27,15 +27,22 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
+from fisheye_svp_ros.reporting.hand_eye_text import HEADER, hand_eye_rows, hand_eye_sentence
 from fisheye_svp_ros.reporting.progress import progress, stages
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
 from fisheye_svp_ros.scene.photograph_names import list_frames
-from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_port
+from fisheye_svp_ros.solve.lens_calibration import (
+    Calibration,
+    calibrate,
+    calibrate_hand_eye,
+    calibrate_port,
+)
 from fisheye_svp_ros.solve.measured_poses import rms_px, sigma_known
 from fisheye_svp_ros.study.solutions import solve_rigs
 
@@ -59,6 +66,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--lens', metavar='AIR.yaml', type=Path,
                         help='the same camera calibrated in air: with --medium or --port the '
                         'place of the port alone is fitted')
+    parser.add_argument('--poses', metavar='POSES.csv',
+                        help='poses of the flange of a robot that carried the camera, in its '
+                        'base: where the camera sits in the flange is fitted too')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
                         help='lens file to write; covariances go beside it as .calibrate.json, '
                         'the report as calibration.html; for several cameras a folder, for a lens '
@@ -153,6 +163,10 @@ def _calibrate_camera(
     with progress('calibrating'):
         result, kept, gross = calibrate_without_outliers(table, fitted)
     note_gross_errors(table, gross)
+    hand_eye = None
+    if args.poses:
+        with progress('fitting the robot'):
+            result, hand_eye = calibrate_hand_eye(result, kept, read_poses(args.poses).by_frame())
     try:
         with stages('how far it may be trusted'):
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
@@ -160,7 +174,7 @@ def _calibrate_camera(
         raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
                             f'({cause}); is what the camera looked through another?') from cause
     lens = with_covariance(result.adjusted.lens, trusted)
-    return CalibratedCamera(lens, result, trusted, kept, args.model)
+    return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
 
 
 def _write(found: CalibratedCamera, path: Path) -> None:
@@ -253,6 +267,8 @@ def _print(found: CalibratedCamera) -> None:
               'they are said to be')
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
           f'{np.degrees(found.result.reached):.2f}; {noise_text(found.result.sigma)}')
+    if found.hand_eye:
+        print_table(hand_eye_sentence(found.hand_eye), HEADER, hand_eye_rows(found.hand_eye))
 
 
 def _document(found: CalibratedCamera) -> dict[str, Any]:

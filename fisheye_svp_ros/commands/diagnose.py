@@ -40,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help="true poses, of a rig's right camera; unknown and fitted by default")
+                        help='poses of the camera (of a rig: its right one) or of the flange of a '
+                        'robot that carries it, which the data tell apart; unknown and fitted by '
+                        'default')
     parser.add_argument('--free', choices=['intrinsics'],
                         help='fit the intrinsics too; always so for a lens from `calibrate`')
     parser.add_argument('--held-out', metavar='TEST',
@@ -89,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
     names = free_parameters(rig_lenses(observations, lens), free)
     poses = None
     if args.poses:
-        poses = poses_by_frame(observations, *read_poses(args.poses), args.poses)
+        poses = poses_by_frame(observations, read_poses(args.poses).by_frame(), args.poses)
     other = _read(args.against, args, given)[0] if args.against else None
     with stages('diagnosing') as progress:
         settings: dict[str, Any] = {

@@ -15,6 +15,7 @@ from fisheye_svp_ros.diagnosis.advice import Advice, advise
 from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
+from fisheye_svp_ros.diagnosis.checks.robot_poses import find_hand_eye, prepare_problem
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
 from fisheye_svp_ros.diagnosis.checks.two_datasets import (
     DatasetModel,
@@ -50,6 +51,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
+from fisheye_svp_ros.solve.hand_eye import HandEye
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
@@ -72,7 +74,8 @@ class Figures(NamedTuple):
 class SearchRecord(NamedTuple):
     """What else was tried: steps, what could not be tested and why, outliers, cross-checks.
 
-    cameras: what each two cameras of a rig say of each other; against: what another data set says.
+    cameras: what each two cameras of a rig say of each other; against: what another data set says;
+    hand_eye: where the camera sits on the robot whose poses were given.
     """
 
     trace: list[TraceStep]
@@ -80,6 +83,7 @@ class SearchRecord(NamedTuple):
     gross: list[dict[str, Any]]
     cameras: list[TwoCameras]
     against: TwoDatasets | None = None
+    hand_eye: HandEye | None = None
 
 
 @dataclass(frozen=True)
@@ -214,6 +218,11 @@ class Diagnosis:
         return self.record.against
 
     @property
+    def hand_eye(self) -> HandEye | None:
+        """Where the camera sits on the robot, if the given poses are those of its flange."""
+        return self.record.hand_eye
+
+    @property
     def lens(self) -> Lens:
         """The extended lens, of the first camera of a rig."""
         return next(iter(self.lenses.values()))
@@ -277,6 +286,7 @@ class Diagnosis:
             'uncertainty': self.uncertainty,
             'trace': [asdict(step) for step in self.trace],
             **({'external': external} if external else {}),
+            **({'hand_eye': self.hand_eye.to_dict()} if self.hand_eye else {}),
         }
 
 
@@ -290,7 +300,8 @@ def diagnose(
 
     lens: of every camera, or the lenses of a rig by camera.
     free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
-    poses: true poses by frame, of a rig's right camera; held_out: other frames of the same camera
+    poses: by frame, of the camera (of a rig: its right one), or of the flange of a robot that
+    carries it, which the data tell apart; held_out: other frames of the same camera
     and target; options: effects to include or leave out; progress: told what is being done, and
     which share is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
@@ -347,7 +358,7 @@ def diagnose_against(
 def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     """Take checked inputs through all stages."""
     progress('fitting the simulation as it is', 0.0)
-    problem = Problem.prepare(inputs)
+    problem, of_robot = prepare_problem(inputs)
     medium = find_medium(problem, progress)
     if medium is not None:
         problem = behind_port(problem, medium)
@@ -360,7 +371,11 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
         one, FittedModel.solve_null_model(one.null), medium))
-    return _conclude(evaluation, candidates, cameras)
+    found = _conclude(evaluation, candidates, cameras)
+    if inputs.poses is None or not of_robot:
+        return found
+    hand_eye = find_hand_eye(found.model, inputs.poses)
+    return replace(found, record=found.record._replace(hand_eye=hand_eye))
 
 
 def _conclude(

@@ -86,7 +86,7 @@ class Inputs:
     """What a diagnosis is asked about, checked.
 
     observations; lenses: as given, by camera, '' where one is that of all; free: intrinsics that
-    are fitted; poses: true poses by frame; held_out: other frames of the same cameras.
+    are fitted; poses: those given, by frame; held_out: other frames of the same cameras.
     """
 
     observations: Observations

@@ -22,6 +22,10 @@ class FramePoses(NamedTuple):
     frame: Index
     pose: Pose
 
+    def by_frame(self) -> dict[int, Pose]:
+        """Return the pose of each frame."""
+        return {number: self.pose.take(i) for i, number in enumerate(self.frame.tolist())}
+
 
 def read_poses(path: str | Path) -> FramePoses:
     """Read poses: m and unit quaternions.

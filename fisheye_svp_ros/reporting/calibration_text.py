@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.reporting.hand_eye_text import hand_eye_warnings
 from fisheye_svp_ros.reporting.tables import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import list_frames
 
 if TYPE_CHECKING:
+    from fisheye_svp_ros.solve.hand_eye import HandEye
     from fisheye_svp_ros.solve.lens_calibration import Calibration
     from fisheye_svp_ros.study.lens_trust import LensTrust
 
@@ -25,13 +27,14 @@ _MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no furt
 
 @dataclass(frozen=True)
 class CalibratedCamera:
-    """One camera's lens with its errors, the fit, its trust, and the table it was fitted to."""
+    """One camera's lens with its errors, the fit, its trust, its table, and the robot, if any."""
 
     lens: Lens
     result: Calibration
     trust: LensTrust
     table: Observations
     model: str
+    hand_eye: HandEye | None = None
 
     def parameter_rows(self) -> list[tuple[str, str, str, str, str]]:
         """Return name, value, standard error, range over targets ('': settled) and unit.
@@ -50,7 +53,8 @@ class CalibratedCamera:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What there is to say against the lens, a sentence each."""
-        return (*self._of_shift(), *self._of_fit(), *self._of_image())
+        return (*self._of_shift(), *self._of_fit(), *self._of_image(),
+                *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()))
 
     def _of_shift(self) -> list[str]:
         return [

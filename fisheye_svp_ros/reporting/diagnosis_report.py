@@ -92,7 +92,7 @@ def write_report(
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
         next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
-        known=list(text.known_rows(known)), free=_free(inputs),
+        known=list(text.known_rows(known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
         extended=_extended(diagnosis, inputs), not_offered=text.not_offered(diagnosis),
     ))
@@ -151,8 +151,8 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
         yield from ((title, m) for m in diagnosis.board_maps(names) if m.spread_out)
 
 
-def _free(inputs: ReportInputs) -> str:
-    free = {'poses': not inputs.poses, 'intrinsics': inputs.free_intrinsics}
+def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
+    free = {'poses': diagnosis.model.data.poses is None, 'intrinsics': inputs.free_intrinsics}
     return text.listed([name for name, fitted in free.items() if fitted]) or 'nothing'
 
 

@@ -8,11 +8,19 @@ from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
 from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quantity
+from fisheye_svp_ros.reporting.hand_eye_text import (
+    HEADER,
+    hand_eye_rows,
+    hand_eye_sentence,
+    hand_eye_warnings,
+)
+from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
 _APART, _MOST = 3.0, 4
 _ALONE = ('; they do not keep their places, or were not photographed at the same moments, so that '
           'each view was posed by itself: nothing rests on their rig')
+ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'The two cameras as each other\'s truth'
 
@@ -30,6 +38,8 @@ class Section(NamedTuple):
 def sections(diagnosis: Diagnosis) -> list[Section]:
     """Return the external evidence that a diagnosis has."""
     found = [_of_cameras(pair) for pair in diagnosis.cameras]
+    if diagnosis.hand_eye is not None:
+        found.append(_of_robot(diagnosis.hand_eye))
     return found if diagnosis.against is None else [*found, _of_sets(diagnosis.against)]
 
 
@@ -38,6 +48,14 @@ def carried_row(one: Transfer, what: str) -> tuple[str, ...]:
     less = one.less_px
     return (one.source, one.to, what, f'{one.without_px:.4f}', f'{one.with_px:.4f}',
             f'{less.value:.4f} ({less.low:.4f} to {less.high:.4f})')
+
+
+def _of_robot(found: HandEye) -> Section:
+    x, y, z = 1e3 * found.camera.position
+    sentence = (f'The given poses are not those of the camera, which sits at {x:.2f}, {y:.2f}, '
+                f'{z:.2f} mm in the flange. They were not held: {hand_eye_sentence(found)}.')
+    warnings = [f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found)]
+    return Section(ROBOT_TITLE, sentence + ''.join(warnings), [], HEADER, hand_eye_rows(found))
 
 
 def _of_cameras(pair: TwoCameras) -> Section:

@@ -16,7 +16,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose, cross_matrix, identity
+from fisheye_svp_ros.pose import Pose, identity, log_derivative
 from fisheye_svp_ros.scene.observations import Views
 from fisheye_svp_ros.solve.arrow import (
     ArrowEquations,
@@ -66,13 +66,13 @@ def adjust(
 
     held: effects whose values stay what they are.
     """
-    problem = _Adjustment(data, state, free, held, prior)
+    problem = Adjustment(data, state, free, held, prior)
     return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
 
 
 def adjust_poses(data: RigViews, state: RigState) -> RigState:
     """Fit the poses of the frames alone."""
-    problem = _Adjustment(data, state, (), held=None)
+    problem = Adjustment(data, state, (), held=None)
     return problem.unpack(levenberg_marquardt(problem, problem.pack([state])).state)
 
 
@@ -148,7 +148,7 @@ def adjust_lens(lens: Lens, views: Views, pose: Pose, names: Sequence[str]) -> A
     """
     data = RigViews.of_one_camera(views)
     state = RigState(pose, identity(1), lens, (), corrected=True)
-    problem = _Adjustment(data, state, names)
+    problem = Adjustment(data, state, names)
     solved = levenberg_marquardt(problem, problem.pack([state]), MAX_LENS_ITERATIONS)
     if not np.isfinite(solved.cost[0]):
         raise GeometryError(
@@ -177,7 +177,7 @@ def adjust_lens_from(
     """
     states = [RigState(pose.take(i), identity(1), lens.with_parameters(names, one.tolist()), (),
                        corrected=True) for i, one in enumerate(values)]
-    problem = _Adjustment(RigViews.of_one_camera(views), states[0], names)
+    problem = Adjustment(RigViews.of_one_camera(views), states[0], names)
     solved: Minimum = levenberg_marquardt(problem, problem.pack(states), max_iterations)
     return problem.unpack(solved.state, int(np.argmin(solved.cost))).lens
 
@@ -201,7 +201,7 @@ def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
     return np.stack([blocks[i, :, i] for i in range(cameras)])
 
 
-class _Adjustment:
+class Adjustment:
     """S arrow systems, see least_squares.LeastSquares: frames are blocks, all else is shared."""
 
     step = staticmethod(arrow_step)
@@ -297,18 +297,8 @@ def _pose_rows(prior: PosePrior, pose: Pose) -> tuple[Array, Array]:
     """Return residuals (P, R) of poses (P,) and their derivatives (P, R, 6) by `retract`."""
     change = pose.difference(prior.mean)
     columns = prior.root.copy()
-    columns[..., 3:] = prior.root[..., 3:] @ _log_derivative(change[..., 3:])
+    columns[..., 3:] = prior.root[..., 3:] @ log_derivative(change[..., 3:])
     return (prior.root @ change[..., None])[..., 0], columns
-
-
-def _log_derivative(vector: Array) -> Array:
-    """Return d log(exp(e) exp(v)) / de (..., 3, 3) of rotation vectors v (..., 3), at e = 0.
-
-    The inverse of the left Jacobian of SO(3): Barfoot, State Estimation for Robotics, (7.76).
-    """
-    half = np.maximum(np.linalg.norm(vector, axis=-1) / 2, 1e-6)[..., None, None]
-    k = cross_matrix(vector)
-    return np.asarray(np.eye(3) - k / 2 + (1 - half / np.tan(half)) / (4 * half**2) * (k @ k))
 
 
 def _equations(linear: Linearization, shared: Array) -> tuple[Array, Arrays]:

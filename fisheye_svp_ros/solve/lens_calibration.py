@@ -23,14 +23,16 @@ from fisheye_svp_ros.optics.lens import (
     parameter_values,
 )
 from fisheye_svp_ros.optics.ports import Port
-from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, Views
 from fisheye_svp_ros.solve.bundle_adjustment import AdjustedLens, adjust_lens, adjust_lens_from
+from fisheye_svp_ros.solve.hand_eye import HandEye, fit_hand_eye, flange_poses
 from fisheye_svp_ros.solve.initial_pose import initial_poses
 from fisheye_svp_ros.solve.lens_start import focal_candidates, lost_views, select_points
 from fisheye_svp_ros.solve.localization import Localization, localize
 from fisheye_svp_ros.solve.measured_poses import posable_views, rms_px, sigma_known
 from fisheye_svp_ros.solve.reliability import noise_sigma
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
 
 MAX_OUTSIDE = 0.1  # of its size; how far outside the image a point may be, as tags cut off are
 FOCAL_UNCERTAINTY = 0.1  # a focal length that is known no better than this is not known
@@ -111,6 +113,37 @@ def calibrate_port(
     _check_rows(observations.source, views, names)
     adjusted = _fit_port(lens, select_points(views), views, names)
     return _as_calibration(observations, adjusted, views, left_out)
+
+
+def calibrate_hand_eye(
+    found: Calibration, observations: Observations, poses: dict[int, Pose]
+) -> tuple[Calibration, HandEye]:
+    """Fit a calibrated lens anew, together with the robot that carried the camera.
+
+    found: the calibration of the observations without poses; poses: of the flange, by frame; a
+    frame may have none.
+    Raises ObservationError where these do not determine the hand-eye transform, or fit none.
+    """
+    adjusted, views = found.adjusted, found.views
+    data = replace(RigViews.of_one_camera(views), table=observations)
+    state = RigState(adjusted.pose, identity(1), adjusted.lens, (), corrected=True)
+    names = adjusted.names
+    try:
+        state, hand_eye = fit_hand_eye(data, state, names, *flange_poses(data, poses))
+    except GeometryError as cause:
+        raise ObservationError(f'{observations.source}: the given poses are not those of a flange '
+                               f'that carries the camera: {cause}') from cause
+    linear = Linearization(data, state, names)
+    residual = np.where(views.used[..., None], views.uv - linear.linear.uv, np.nan)
+    # The covariances stay those of the images alone, which are no smaller.
+    adjusted = adjusted._replace(lens=state.lens, pose=state.pose, residual=residual)
+    theta = incidence(
+        state.lens, state.pose.into_body(views.points), limited=False).theta[views.used]
+    block = {**(adjusted.lens.calibration or {}), 'rms_px': rms_px(residual),
+             'hand_eye': hand_eye.to_dict(), 'reached_deg': float(np.degrees(theta.max()))}
+    lens = replace(_with_field(adjusted, theta), calibration=block)
+    found = found._replace(adjusted=adjusted._replace(lens=lens), reached=float(theta.max()))
+    return found, hand_eye
 
 
 def placed_names(lens: Lens) -> tuple[str, ...]:

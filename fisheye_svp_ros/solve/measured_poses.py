@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
@@ -147,13 +147,9 @@ def _check_inside(observations: Observations, lens: Lens) -> None:
 
 
 def poses_by_frame(
-    observations: Observations, frame: Index, pose: Pose, source: str
+    observations: Observations, known: dict[int, Pose], source: str
 ) -> dict[int, Pose]:
-    """Return the true pose of each frame of a table, of poses (P,) of the frames (P,).
-
-    Raises ObservationError, naming the source, for a frame without one.
-    """
-    known = {number: pose.take(i) for i, number in enumerate(frame.tolist())}
+    """Return known poses by frame; raise ObservationError for a frame of a table without one."""
     for number in observations.frames.tolist():
         if number not in known:
             raise ObservationError(

@@ -1,0 +1,320 @@
+"""Hand-eye calibration: where a camera sits in the flange of a robot, and the target in its base.
+
+The robot states poses of its flange in its base; the images state poses of the camera in the
+target.  One transform each, one scale of lengths, and the noise of the robot's poses, in m and
+rad, are fitted together with poses, intrinsics and effects; the two variances are those that the
+data state (MacKay, Bayesian interpolation, 1992, eq. 4.10).  A camera whose own poses are known
+is the same with both transforms near the identity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.pose import (
+    Pose,
+    cross_matrix,
+    log_derivative,
+    nearest_rotation,
+    quaternion_from_rotation,
+)
+from fisheye_svp_ros.solve.arrow import ArrowEquations, arrow_covariance, arrow_information
+from fisheye_svp_ros.solve.bundle_adjustment import Adjustment
+from fisheye_svp_ros.solve.least_squares import Arrays, levenberg_marquardt
+from fisheye_svp_ros.solve.reliability import noise_sigma
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
+
+PARAMETERS = 13  # camera in flange, target in base, scale
+MIN_FRAMES = 4
+_MIN_TURN = 1e-3  # second singular value of the turns relative to the first: two axes
+_MAX_SHARE = 0.3  # of the camera's distance, and of a radian: more is no noise of a robot
+_MIN_NOISE = 1e-7  # m, rad: what is written has no more digits
+_ROUNDS = 40
+_TOLERANCE = 1e-3  # relative, of the noise
+_MIN_EIGENVALUE = 1e-9  # of the information of unit diagonal
+
+
+class Transforms(NamedTuple):
+    """Camera in flange, target in base, and what the robot's lengths are multiplied by."""
+
+    camera: Pose
+    target: Pose
+    scale: float
+
+    def flange(self, camera: Pose) -> Pose:
+        """Return the flange in the base, in lengths of the target, of cameras (F,) in it."""
+        rows = [0] * len(camera.position)
+        return self.target.reshape(1).take(rows).compose(camera).compose(
+            self.camera.reshape(1).take(rows).inverse())
+
+    def scale_lengths(self, flange: Pose) -> Pose:
+        """Return what the robot states, in lengths of the target."""
+        return Pose(flange.rotation, self.scale * flange.position)
+
+
+@dataclass(frozen=True)
+class HandEye:
+    """A hand-eye calibration.
+
+    camera: in the flange; target: in the base; scale: of the robot's lengths to those of the
+    target; covariance (13, 13): of the changes of the two in `Pose.retract` and of the scale;
+    noise_m, noise_rad: standard deviations of the robot's poses, one axis; frame (F,): the frames
+    that have a pose; residual (F, 6): flange by the images minus flange by the robot, m, rad.
+    """
+
+    camera: Pose
+    target: Pose
+    scale: float
+    covariance: Array
+    noise_m: float
+    noise_rad: float
+    frame: Index
+    residual: Array
+
+    @property
+    def stderr(self) -> Array:
+        """Standard errors (13,) of the parameters, m and rad."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what files hold: m, rad, quaternions x, y, z, w.
+
+        covariance: of both transforms, each (dx, dy, dz, rotation about x, y, z) in its reference
+        frame, and of the scale.
+        """
+        def entry(pose: Pose) -> dict[str, list[float]]:
+            return {'position': pose.position.tolist(),
+                    'quaternion': quaternion_from_rotation(pose.rotation).tolist()}
+
+        return {
+            'camera_in_flange': entry(self.camera), 'target_in_base': entry(self.target),
+            'scale': self.scale, 'covariance': self.covariance.tolist(),
+            'noise_m': self.noise_m, 'noise_rad': self.noise_rad, 'frames': len(self.frame),
+        }
+
+
+def solve_hand_eye(camera: Pose, flange: Pose) -> Transforms:
+    """Solve both transforms and the scale from poses (F,) alone, without start values.
+
+    camera: in the target; flange: in the base.  Rotations by the Kronecker product (Shah, Solving
+    the robot-world/hand-eye calibration problem using the Kronecker product, 2013), then the
+    rest, which is linear.
+    Raises GeometryError where the flange does not turn about two axes.
+    """
+    _check_turns(flange)
+    # R_flange R_mount = R_base R_camera: both rotations are of the first singular vectors of this.
+    product = np.einsum('fij,fkl->ikjl', flange.rotation, camera.rotation).reshape(9, 9)
+    left, _, right = np.linalg.svd(product)
+    first, second = left[:, 0].reshape(3, 3), right[0].reshape(3, 3)
+    sign = np.sign(np.linalg.det(first))
+    base, mount = nearest_rotation(sign * first), nearest_rotation(sign * second)
+    if np.linalg.det(second) * sign < 0:
+        raise GeometryError('no hand-eye transform explains how the robot turned')
+    return _solve_lengths(camera, flange, base, mount)
+
+
+def _solve_lengths(camera: Pose, flange: Pose, base: Array, mount: Array) -> Transforms:
+    """Return the transforms of known rotations: scale p_f = R_b p_c + t_b - R_f t_m is linear."""
+    frames = len(flange.position)
+    columns = np.concatenate([
+        np.broadcast_to(np.eye(3), (frames, 3, 3)), -flange.rotation,
+        -flange.position[..., None]], axis=-1).reshape(-1, 7)
+    solved = np.linalg.lstsq(columns, -(camera.position @ base.T).ravel(), rcond=None)[0]
+    return Transforms(Pose(mount, solved[3:6]), Pose(base, solved[:3]), float(solved[6]))
+
+
+def _check_turns(flange: Pose) -> None:
+    if len(flange.position) >= MIN_FRAMES:
+        first = flange.take([0] * len(flange.position))
+        turns = flange.difference(first)[:, 3:]
+        sizes = np.linalg.svd(turns, compute_uv=False)
+        if sizes[1] > max(_MIN_TURN, _MIN_TURN * sizes[0]):
+            return
+        raise GeometryError('the flange turns about one axis at most; turn it about two axes or '
+                            'more, by 20 degrees or more')
+    raise GeometryError(f'{len(flange.position)} frames have a pose of the robot; '
+                        f'{MIN_FRAMES} or more are needed')
+
+
+def fit_hand_eye(
+    data: RigViews, state: RigState, free: Sequence[str], flange: Pose, known: Mask
+) -> tuple[RigState, HandEye]:
+    """Fit hand-eye transform, noise of the robot, poses, intrinsics and effects together.
+
+    state: to start from, fitted to the images; flange (F,): in the base, of the frames where
+    `known` (F,), which have a pose of the robot.
+    Raises GeometryError where the poses do not determine the transform, or fit none.
+    """
+    start = solve_hand_eye(state.pose.take(known), flange.take(known))
+    linear = Linearization(data, state, free)
+    unknowns = 6 * data.frames + linear.shared_columns.shape[-1]
+    given = bool(np.isfinite(data.observations.sigma).all())
+    sigma = 1.0 if given else noise_sigma(
+        float((linear.residual**2).sum()), int(linear.row_mask.sum()), unknowns)
+    robot = _Robot(flange, known, sigma)
+    residual = robot.residual(start, state.pose)[known]
+    noise = np.maximum(np.sqrt((residual.reshape(-1, 2, 3) ** 2).mean(axis=(0, 2))), _MIN_NOISE)
+    _check_noise(noise, state.pose)
+    for _ in range(_ROUNDS):
+        problem = _HandEyeAdjustment(data, state, free, robot, noise)
+        found = levenberg_marquardt(problem, problem.pack_all(state, start))
+        state, start = problem.unpack(found.state), problem.transforms(found.state, 0)
+        before, noise = noise, problem.estimate_noise(state, start)
+        if np.abs(noise / before - 1).max() < _TOLERANCE or (noise <= _MIN_NOISE).all():
+            break
+    covariance = problem.covariance(state, start)
+    return state, HandEye(
+        start.camera, start.target, start.scale, covariance, float(noise[0]), float(noise[1]),
+        _frame_numbers(data)[known], robot.residual(start, state.pose)[known])
+
+
+def _check_noise(noise: Array, camera: Pose) -> None:
+    distance = float(np.median(np.linalg.norm(camera.position, axis=1)))
+    if noise[0] > _MAX_SHARE * distance or noise[1] > _MAX_SHARE:
+        raise GeometryError(
+            f'no hand-eye transform explains the poses of the robot: {1000 * noise[0]:.0f} mm and '
+            f'{np.degrees(noise[1]):.1f} degrees are left; check that frames, units and the order '
+            'of the quaternion (x, y, z, w) belong together')
+
+
+class _Robot(NamedTuple):
+    """Poses of the flange (F,), the frames that have one, and the noise of the images, px."""
+
+    flange: Pose
+    known: Mask
+    sigma: float
+
+    def residual(self, transforms: Transforms, camera: Pose) -> Array:
+        """Return flange by the images minus flange by the robot (F, 6), zero where unknown."""
+        off = transforms.flange(camera).difference(transforms.scale_lengths(self.flange))
+        return np.where(self.known[:, None], off, 0.0)
+
+    def columns(self, transforms: Transforms, camera: Pose) -> tuple[Array, Array]:
+        """Return derivatives (F, 6, 6) by the camera's pose and (F, 6, 13) by what is shared."""
+        found = transforms.flange(camera)
+        base = np.broadcast_to(transforms.target.rotation, found.rotation.shape)
+        lever = cross_matrix(found.rotation @ transforms.camera.position)
+        turned = log_derivative(self.residual(transforms, camera)[:, 3:])
+        frame = np.zeros((len(base), 6, 6))
+        frame[:, :3, :3], frame[:, :3, 3:], frame[:, 3:, 3:] = base, lever @ base, turned @ base
+        shared = np.zeros((len(base), 6, PARAMETERS))
+        shared[:, :3, :3] = -found.rotation
+        shared[:, :3, 3:6] = -found.rotation @ cross_matrix(transforms.camera.position)
+        shared[:, 3:, 3:6] = -turned @ found.rotation
+        shared[:, :3, 6:9] = np.eye(3)
+        shared[:, :3, 9:12] = -cross_matrix(found.position - transforms.target.position)
+        shared[:, 3:, 9:12] = turned
+        shared[:, :3, 12] = -self.flange.position
+        mask = self.known[:, None, None]
+        return np.where(mask, frame, 0.0), np.where(mask, shared, 0.0)
+
+
+class _HandEyeAdjustment(Adjustment):
+    """A bundle adjustment with the robot's poses: their rows, and 13 more shared parameters."""
+
+    def __init__(
+        self, data: RigViews, template: RigState, free: Sequence[str], robot: _Robot, noise: Array
+    ) -> None:
+        super().__init__(data, template, free)
+        self._robot = robot
+        self._weight = robot.sigma / np.repeat(noise, 3)
+
+    def pack_all(self, state: RigState, transforms: Transforms) -> Arrays:
+        """Return a state and the transforms, which come last."""
+        own = (*transforms.camera, *transforms.target, np.array([transforms.scale]))
+        return (*self.pack([state]), *(part[None] for part in own))
+
+    def unpack(self, packed: Arrays, system: int = 0) -> RigState:
+        return super().unpack(packed[:5], system)
+
+    def transforms(self, packed: Arrays, system: int) -> Transforms:
+        """Return the transforms of one of the states."""
+        *poses, scale = (part[system] for part in packed[5:])
+        return Transforms(Pose(*poses[:2]), Pose(*poses[2:]), float(scale[0]))
+
+    def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
+        if not len(index):
+            return np.zeros(0), ()
+        costs, systems = zip(*(self._joint(self.unpack(state, i), self.transforms(state, i))
+                               for i in range(len(index))), strict=True)
+        return (np.concatenate(costs),
+                tuple(np.concatenate(parts) for parts in zip(*systems, strict=True)))
+
+    def retract(self, state: Arrays, step: Arrays) -> Arrays:
+        frame, shared = step
+        mount, target, scale = np.split(shared[:, -PARAMETERS:], (6, 12), axis=1)
+        return (*super().retract(state[:5], (frame, shared[:, :-PARAMETERS])),
+                *Pose(*state[5:7]).retract(mount), *Pose(*state[7:9]).retract(target),
+                state[9] + scale)
+
+    def estimate_noise(self, state: RigState, transforms: Transforms) -> Array:
+        """Return the noise (2,) of the robot, m and rad: of its residuals' own freedom."""
+        equations = ArrowEquations(*self._joint(state, transforms)[1])
+        frame, shared = self._robot.columns(transforms, state.pose)
+        blocks = equations.blocks[0]
+        inverse = np.linalg.inv(blocks)
+        rest = -frame @ inverse @ equations.cross[0]
+        rest[..., -PARAMETERS:] += shared
+        whole = arrow_covariance(tuple(equations)).shared[0]
+        variance = frame @ inverse @ np.swapaxes(frame, -1, -2)
+        variance = variance + rest @ whole @ np.swapaxes(rest, -1, -2)
+        leverage = np.diagonal(variance, axis1=-2, axis2=-1) * self._weight**2
+        residual = self._robot.residual(transforms, state.pose)
+        known = self._robot.known
+        freedom = (1 - leverage[known]).reshape(-1, 2, 3).sum(axis=(0, 2))
+        squares = (residual[known] ** 2).reshape(-1, 2, 3).sum(axis=(0, 2))
+        return np.asarray(np.maximum(np.sqrt(squares / np.maximum(freedom, 1e-3)), _MIN_NOISE))
+
+    def covariance(self, state: RigState, transforms: Transforms) -> Array:
+        """Return the covariance (13, 13) of the transforms; raise where they are undetermined."""
+        normal = self._joint(state, transforms)[1]
+        information = arrow_information(normal)[0]
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        own = information[-PARAMETERS:, -PARAMETERS:] / np.outer(
+            scale[-PARAMETERS:], scale[-PARAMETERS:])
+        if np.linalg.eigvalsh(own)[0] < _MIN_EIGENVALUE:
+            raise GeometryError('the poses of the robot do not determine the hand-eye transform; '
+                                'turn the flange about two axes or more, and move it')
+        whole = arrow_covariance(normal).shared[0]
+        return np.asarray(self._robot.sigma**2 * whole[-PARAMETERS:, -PARAMETERS:])
+
+    def _joint(self, state: RigState, transforms: Transforms) -> tuple[Array, Arrays]:
+        """Return cost (1,) and normal equations with those of the robot's poses."""
+        cost, normal = self._system(state)
+        blocks, cross, shared, block_gradient, shared_gradient = (part[0] for part in normal)
+        off = self._robot.residual(transforms, state.pose) * self._weight
+        frame, own = (part * self._weight[:, None]
+                      for part in self._robot.columns(transforms, state.pose))
+        transposed = np.swapaxes(frame, -1, -2)
+        added = ArrowEquations(
+            blocks + transposed @ frame,
+            np.concatenate([cross, transposed @ own], axis=-1),
+            np.pad(shared, (0, PARAMETERS)),
+            block_gradient + (transposed @ off[..., None])[..., 0],
+            np.concatenate([shared_gradient, np.einsum('fmk,fm->k', own, off)]),
+        )
+        added.shared[-PARAMETERS:, -PARAMETERS:] += np.einsum('fmk,fml->kl', own, own)
+        return cost + (off**2).sum(), tuple(part[None] for part in added)
+
+
+def _frame_numbers(data: RigViews) -> Index:
+    return data.views.frame[np.unique(data.frame_of, return_index=True)[1]]
+
+
+def flange_poses(data: RigViews, poses: dict[int, Pose]) -> tuple[Pose, Mask]:
+    """Return poses (F,) of the flange by frame number, and which frames (F,) have one.
+
+    A frame that the first camera did not see, of cameras that no rig holds together, has none.
+    """
+    numbers = _frame_numbers(data).tolist()
+    known = np.array([number in poses for number in numbers])
+    if data.frames > len(set(numbers)):
+        known &= np.isin(np.arange(data.frames), data.frame_of[data.camera_of == 0])
+    missing = Pose(np.eye(3), np.zeros(3))
+    return Pose.stack([poses.get(number, missing) for number in numbers]), known

@@ -1,0 +1,125 @@
+"""Hand-eye calibration: transforms, scale and noise of a robot, and what does not fix them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.differences import jacobian
+from helpers.robot import LENS, TRUTH, robot
+
+from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.solve.hand_eye import (
+    HandEye,
+    Transforms,
+    _Robot,
+    fit_hand_eye,
+    flange_poses,
+    solve_hand_eye,
+)
+from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_hand_eye
+from fisheye_svp_ros.solve.rig_state import RigState, group_by_frame
+
+
+def fit(seed: int, **settings) -> tuple[RigState, HandEye]:
+    table, camera, poses = robot(seed, **settings)
+    data = group_by_frame(table)
+    state = RigState(camera, identity(1), LENS, ())
+    return fit_hand_eye(data, state, ('f', 'cx', 'cy'), *flange_poses(data, poses))
+
+
+def errors(found: HandEye) -> np.ndarray:
+    return np.concatenate([found.camera.difference(TRUTH.camera),
+                           found.target.difference(TRUTH.target), [found.scale - TRUTH.scale]])
+
+
+def test_exact_poses_give_the_transforms() -> None:
+    camera = robot(1)[1]
+    flange = TRUTH.flange(camera)
+    found = solve_hand_eye(camera, Pose(flange.rotation, flange.position / TRUTH.scale))
+    np.testing.assert_allclose(found.camera.difference(TRUTH.camera), 0, atol=1e-12)
+    np.testing.assert_allclose(found.target.difference(TRUTH.target), 0, atol=1e-12)
+    assert found.scale == pytest.approx(TRUTH.scale, abs=1e-12)
+
+
+def test_noise_and_errors_are_those_of_the_robot() -> None:
+    found = [fit(seed)[1] for seed in range(12)]
+    noise = np.array([(one.noise_m, one.noise_rad) for one in found])
+    np.testing.assert_allclose(np.sqrt((noise**2).mean(axis=0)), (3e-4, 1e-3), rtol=0.12)
+    z = np.array([errors(one) / one.stderr for one in found])
+    assert 0.8 < np.sqrt((z**2).mean()) < 1.2
+
+
+def test_a_camera_whose_own_poses_are_known_is_at_the_flange() -> None:
+    table, camera, _ = robot(3)
+    data = group_by_frame(table)
+    state = RigState(camera, identity(1), LENS, ())
+    found = fit_hand_eye(data, state, (), camera, np.ones(data.frames, dtype=bool))[1]
+    nothing = identity()
+    assert np.abs(found.camera.difference(nothing)).max() < 5e-4
+    assert np.abs(found.target.difference(nothing)).max() < 5e-4
+    assert found.noise_m < 5e-5
+
+
+def test_derivatives() -> None:
+    _, camera, poses = robot(2, frames=5)
+    known = np.array([True, True, False, True, True])
+    one = _Robot(Pose.stack(list(poses.values())), known, 1.0)
+    frame, shared = one.columns(TRUTH, camera)
+
+    def moved(change: np.ndarray) -> np.ndarray:
+        there = Transforms(TRUTH.camera.retract(change[:6]), TRUTH.target.retract(change[6:12]),
+                           TRUTH.scale + change[12])
+        return one.residual(there, camera)
+
+    np.testing.assert_allclose(shared, jacobian(moved)(np.zeros(13)), atol=1e-6)
+    np.testing.assert_allclose(frame, jacobian(
+        lambda change: one.residual(TRUTH, camera.retract(np.tile(change, (5, 1)))))(
+            np.zeros(6)), atol=1e-6)
+    assert not frame[2].any() and not shared[2].any()
+
+
+def test_a_robot_holds_the_lens() -> None:
+    """Poses that are far better than those of the images tell the lens."""
+    off: list[list[float]] = []
+    for seed in range(6):
+        table, _, poses = robot(seed, frames=8, noise=(2e-6, 5e-6))
+        alone = calibrate(table, 'kannala_brandt', (1280, 960), ('f', 'cx', 'cy', 'k1'))
+        both, found = calibrate_hand_eye(alone, table, poses)
+        off.append([abs(one.adjusted.lens.cx - LENS.cx) for one in (alone, both)])
+        written = both.adjusted.lens.calibration['hand_eye']
+        assert written['noise_m'] == found.noise_m and len(written['covariance']) == 13
+        assert both.adjusted.lens.calibration['rms_px'] >= (
+            alone.adjusted.lens.calibration['rms_px'])
+    before, after = np.mean(off, axis=0)
+    assert after < 0.7 * before
+
+
+def test_frames_without_a_pose_have_none() -> None:
+    table, camera, poses = robot(4)
+    for number in (0, 7):
+        del poses[number]
+    data = group_by_frame(table)
+    state = RigState(camera, identity(1), LENS, ())
+    found = fit_hand_eye(data, state, (), *flange_poses(data, poses))[1]
+    assert len(found.frame) == 16 and not {0, 7} & set(found.frame.tolist())
+    assert (np.abs(errors(found) / found.stderr) < 4).all()
+
+
+def test_what_does_not_fix_the_transform_is_refused() -> None:
+    _, camera, _ = robot(5)
+    turned = np.zeros((18, 3))
+    turned[:, 2] = np.linspace(0, 1, 18)
+    one_axis = Pose(rotation_from_vector(turned), camera.position)
+    with pytest.raises(GeometryError, match='turn it about two axes'):
+        solve_hand_eye(one_axis, one_axis)
+    with pytest.raises(GeometryError, match='4 or more are needed'):
+        solve_hand_eye(camera.take([0, 1, 2]), camera.take([0, 1, 2]))
+
+
+def test_poses_of_other_frames_are_refused() -> None:
+    table, _, poses = robot(6)
+    alone = calibrate(table, 'kannala_brandt', (1280, 960), ('f', 'cx', 'cy', 'k1'))
+    shuffled = dict(zip(poses, [poses[(7 * i + 3) % 18] for i in range(18)], strict=True))
+    with pytest.raises(ObservationError, match='not those of a flange that carries the camera'):
+        calibrate_hand_eye(alone, table, shuffled)
