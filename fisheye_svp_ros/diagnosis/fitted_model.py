@@ -16,7 +16,12 @@ from scipy.spatial import cKDTree
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
-from fisheye_svp_ros.diagnosis.null_model import FINEST_FIELD, NullModel, column_norms
+from fisheye_svp_ros.diagnosis.null_model import (
+    FINEST_FIELD,
+    NullModel,
+    column_norms,
+    prior_products,
+)
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
     NAMES,
@@ -130,6 +135,7 @@ class FittedModel:
             [linear.shared_columns / scale, linear.residual[..., None]], axis=-1
         )
         eq = make_equations(random.columns, linear.frame_columns, border).select(variances.alive)
+        eq = eq.add_products(prior_products(linear, linear.state, scale, variances.sigma))
         return cls._solve(linear, random, eq, variances, scale)
 
     @classmethod
@@ -157,12 +163,17 @@ class FittedModel:
         rows = predict_rows(self.random.columns, self.pose_columns, *eq.split(e, r), eq.units)
         return np.asarray(rows + self.linear.shared_columns @ (values / self.scale[:, None]))
 
-    def solve_rows(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Return the coefficients (E, k, C), (R, C), (K, C) that rows (F, M, C) call for."""
+    def solve_rows(
+        self, rows: Array, pull: Array | float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """Return the coefficients (E, k, C), (R, C), (K, C) that rows (F, M, C) call for.
+
+        pull (K, C): products of pseudo-observations with the normalized shared columns.
+        """
         e, r = self.factored.equations.join(
             *multiply_rows(self.random.columns, self.pose_columns, rows))
         x = np.einsum('fmk,fmc->kc', self.linear.shared_columns, rows, optimize=True)
-        return self.factored.solve(e, r, x / self.scale[:, None])
+        return self.factored.solve(e, r, x / self.scale[:, None] + pull)
 
     def residuals(self) -> Array:
         """Return whitened residuals (F, M), every random effect at its prediction."""
@@ -318,8 +329,9 @@ def refit(data: RigViews, state: RigState, free: Sequence[str], variances: Varia
     fitted = FittedModel.of_state(Linearization(data, state, free), variances)
     eq = fitted.factored.equations
 
-    def solve(residual: Array) -> tuple[Array, Array]:
-        e, r, values = (part[..., 0] for part in fitted.solve_rows(residual[..., None]))
+    def solve(residual: Array, state: RigState) -> tuple[Array, Array]:
+        pull = prior_products(fitted.linear, state, fitted.scale, variances.sigma)[:-1, -1:]
+        e, r, values = (part[..., 0] for part in fitted.solve_rows(residual[..., None], pull))
         return eq.split(e, r)[0][:, :6] / eq.group_scale, values / fitted.scale
 
     return gauss_newton(fitted.linear, solve, _STEP_TOLERANCE * variances.sigma)

@@ -46,7 +46,7 @@ from fisheye_svp_ros.mixed_model import (
     make_equations,
     no_variances,
 )
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, is_shared
 
 FINEST_FIELD = 'image_finest'
 _OF_FRAMES = np.array([stage == 'frame' for stage in STAGE_OF.values()])  # components
@@ -116,7 +116,7 @@ class NullModel:
         before: variances to start from; left_out: effects; finest: with the finest image field.
         """
         bare = cls._linearize(data, state, free, left_out, finest)
-        return replace(bare, variances=find_variances(bare._all_free(), before))
+        return bare._with_priors(find_variances(bare._all_free(), before))
 
     @classmethod
     def with_variances(
@@ -131,7 +131,7 @@ class NullModel:
         landmarks = len(np.unique(data.views.landmark[data.views.used]))
         known = variances or no_variances(len(NAMES), landmarks)
         bare = cls._linearize(data, state, free, tuple(CATALOGUE), finest, known.alive)
-        return replace(bare, variances=known)
+        return bare._with_priors(known)
 
     @classmethod
     def _linearize(
@@ -146,13 +146,19 @@ class NullModel:
         full = make_equations(random.columns, linear.frame_columns, fixed.border)
         return cls(linear, fixed, random, full, initial_variances(full))
 
+    def _with_priors(self, variances: Variances) -> NullModel:
+        """Return the model with variances, and the priors of its effects beside their noise."""
+        products = prior_products(
+            self.linear, self.linear.state, self.scale, variances.sigma)
+        return replace(self, variances=variances, full=self.full.add_products(products))
+
     def relinearize(
         self, data: RigViews, state: RigState, free: Sequence[str], left_out: Sequence[str],
         finest: bool,
     ) -> NullModel:
         """Return the model around another state, the variances as they are."""
-        return replace(self._linearize(data, state, free, left_out, finest),
-                       variances=self.variances)
+        bare = self._linearize(data, state, free, left_out, finest)
+        return bare._with_priors(self.variances)
 
     def calls_for_finest_field(
         self, data: RigViews, state: RigState, left_out: Sequence[str]
@@ -249,6 +255,10 @@ class NullModel:
         large = np.array([parameter.large for parameter in effect.parameters])
         return np.asarray(1 / (large * self.scale[columns]) ** 2)
 
+    def physical_precision(self, columns: Index, effect: Effect) -> Array:
+        """Return precisions (P,) of an effect's normalized columns by its prior, 0 without one."""
+        return np.asarray((effect.prior_sigma(self.linear.scene) * self.scale[columns]) ** -2.0)
+
     def columns_and_residual(self, columns: Index) -> Index:
         """Return what is in the model, further columns and, last, the residual of the border."""
         return np.unique(np.concatenate([self.included_columns, columns, [len(self.scale)]]))
@@ -329,6 +339,28 @@ def with_ordinary_landmarks(null: NullModel, landmarks: Sequence[int]) -> Varian
     """Return the variances with the offsets of some landmarks drawn as those of most are."""
     mine = np.isin(null.random.landmark, landmarks)
     return replace(null.variances, weight=np.where(mine, 1.0, null.variances.weight))
+
+
+def prior_products(
+    linear: Linearization, state: RigState, scale: Array, sigma: float
+) -> Array:
+    """Return what the priors of effects add to the products (X + 1, X + 1) of a border.
+
+    A pseudo-observation each (`Effect.prior_sigma`), for values of a state; scale (X,): norms of
+    the columns, which begin with those that are shared; sigma: of the whitened noise.
+    Source: Theil and Goldberger, On pure and mixed statistical estimation in economics,
+    International Economic Review 2 (1961).
+    """
+    terms = [term for term in state.terms if is_shared(term[0])]
+    values = np.concatenate([np.zeros(0), *(values for _, values in terms)])
+    expected = np.concatenate(
+        [np.zeros(0), *(effect.prior_sigma(linear.scene) for effect, _ in terms)])
+    at = linear.shared_columns.shape[-1] - len(values) + np.arange(len(values))
+    rows = np.zeros((len(values), len(scale) + 1))
+    rows[np.arange(len(values)), at] = 1 / scale[at]
+    rows[:, -1] = -values
+    rows *= (sigma / expected)[:, None]
+    return np.asarray(rows.T @ rows)
 
 
 def column_norms(columns: Array) -> Array:

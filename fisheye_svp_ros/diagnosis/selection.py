@@ -280,7 +280,10 @@ def _estimate_forms(
     columns = [null.form_columns(form) for form in forms]
     every = np.concatenate([included, *columns])
     information = null.restrict_information(null.information, included)
-    inverse, _ = pseudo_inverse(information[np.ix_(every, every)], 1e-12)
+    prior = np.concatenate([np.zeros(len(included)), *(
+        null.physical_precision(mine, null.fixed.forms.effects[form])
+        for form, mine in zip(forms, columns, strict=True))])
+    inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-12)
     values = (inverse @ information[every, -1]) / null.scale[every]
     estimated, at = [], len(included)
     for form, mine in zip(forms, columns, strict=True):

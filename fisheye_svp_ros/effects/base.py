@@ -160,6 +160,10 @@ class Effect(ABC):
         """Displacement (S, N, D) at this effect's stage."""
         return np.asarray(self.columns(scene) @ values)
 
+    def prior_sigma(self, scene: Scene) -> Array:
+        """Return standard deviations (P,) of the values about 0 before any data; inf: unknown."""
+        return np.full(len(self.parameters), np.inf)
+
     def absurd(self, values: Array, scene: Scene) -> bool:
         """Whether there can be no such values (P,), whatever the data say.
 

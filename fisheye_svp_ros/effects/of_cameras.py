@@ -46,6 +46,11 @@ class OfCameras(Effect):
     def holds_for(self, t: Array, known: Array) -> bool:
         return all(effect.holds_for(t, known) for _, _, effect in self.parts)
 
+    def prior_sigma(self, scene: Scene) -> Array:
+        own = {number: one for _, number, one in scene.cameras}
+        return np.concatenate([
+            effect.prior_sigma(own[number]) for number, _, effect in self.parts])
+
     def columns(self, scene: Scene) -> Array:
         """Every camera has a scene of its own: see `of_camera`."""
         raise NotImplementedError('an effect of single cameras is asked camera by camera')

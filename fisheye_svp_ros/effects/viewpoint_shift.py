@@ -12,7 +12,7 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import Lens
 
-SHIFT_SIGMA = 4e-3  # m: of e0 where there is a shift; most fisheye lenses measured have 1 to 6 mm
+SHIFT_SIGMA = 4e-3  # m: of e0 before any data; fisheye lenses that were measured have 1 to 6 mm
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,11 @@ class ViewpointShiftEffect(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         return tuple(Parameter(f'e{i}', 'm', 0.01) for i in range(self.order))
+
+    def prior_sigma(self, scene: Scene) -> Array:
+        """Return those of a shift of such a size, each order at the edge of the field."""
+        edge = scene.lens.max_incidence
+        return np.asarray(SHIFT_SIGMA / edge ** (2.0 * np.arange(self.order)))
 
     def columns(self, scene: Scene) -> Array:
         shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]

@@ -132,8 +132,11 @@ class Equations:
 
     def with_ridge(self, ridge: float) -> Equations:
         """Return the equations with a small prior precision of the shared fixed columns."""
-        diagonal = np.append(np.full(len(self.blocks.xx) - 1, ridge), 0.0)
-        return replace(self, blocks=self.blocks._replace(xx=self.blocks.xx + np.diag(diagonal)))
+        return self.add_products(np.diag(np.append(np.full(len(self.blocks.xx) - 1, ridge), 0.0)))
+
+    def add_products(self, products: Array) -> Equations:
+        """Return the equations with more products (X, X) of the border: of pseudo-observations."""
+        return replace(self, blocks=self.blocks._replace(xx=self.blocks.xx + products))
 
     def multiply(self, e: Array, r: Array) -> tuple[Array, Array, Array]:
         """Multiply coefficients (E, k, C), (R, C): products with blocks, rest and border."""

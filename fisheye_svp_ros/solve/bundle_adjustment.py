@@ -77,18 +77,19 @@ def adjust_poses(data: RigViews, state: RigState) -> RigState:
 
 
 def gauss_newton(
-    linear: Linearization, solve: Callable[[Array], tuple[Array, Array]], tolerance: float
+    linear: Linearization, solve: Callable[[Array, RigState], tuple[Array, Array]],
+    tolerance: float,
 ) -> RigState:
     """Fit as `adjust` does, under a covariance of the residuals that the caller knows.
 
-    solve: returns the step of poses (F, 6) and of what is shared (K,) from residuals (F, M),
-    by the columns of this linearization, which change little.  tolerance: of what a step moves
-    predictions by, root mean square, whitened.
+    solve: returns the step of poses (F, 6) and of what is shared (K,) from residuals (F, M) and
+    their state, by the columns of this linearization, which change little.  tolerance: of what a
+    step moves predictions by, root mean square, whitened.
     """
     data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
     limit = _MAX_RISE * float((residual**2).sum())
     for _ in range(_GAUSS_NEWTON_STEPS):
-        frame, shared = solve(residual)
+        frame, shared = solve(residual, state)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
         after = partial(_partial_step, state, free, frame, shared)
         state, residual = shorten_step(data, free, after, limit)

@@ -193,7 +193,7 @@ def test_gauss_newton_under_white_noise_is_the_adjustment():
     frame, shared = linear.frame_columns, linear.shared_columns
     turned = np.swapaxes(frame, -1, -2)
 
-    def solve(residual):
+    def solve(residual, _):
         flat = shared.reshape(residual.size, -1)
         equations = ArrowEquations(
             (turned @ frame)[None], (turned @ shared)[None], (flat.T @ flat)[None],
