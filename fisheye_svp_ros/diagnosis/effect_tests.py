@@ -121,7 +121,7 @@ class EffectTests:
                 continue
             if effect.absurd(score.estimate, null.linear.scene):
                 continue
-            gain, count = self._gain_under_prior(remaining, columns, effect, score), score.rank
+            gain, count = score.statistic, score.rank
             if effect.per_frame:  # what it is in single frames is one variance
                 gain, count = random_gain(null, included, columns), 1
                 score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
@@ -129,16 +129,6 @@ class EffectTests:
             candidates.append(
                 Candidate(form, effect, score, self._correct(effect, score), criterion))
         return sorted(candidates, key=lambda candidate: -candidate.criterion)
-
-    def _gain_under_prior(
-        self, remaining: Array, columns: Index, effect: Effect, score: Score
-    ) -> float:
-        """Return twice the gain in log likelihood of what is likeliest under an effect's prior."""
-        precision = self.null.physical_precision(columns, effect)
-        if not precision.any():
-            return score.statistic
-        block, gradient = remaining[np.ix_(columns, columns)], remaining[columns, -1]
-        return float(gradient @ np.linalg.solve(block + np.diag(precision), gradient))
 
     def significant_candidates(self, included: Index) -> Iterator[Candidate]:
         """Yield what is significant, best criterion first, the variances' uncertainty taken in."""

@@ -38,9 +38,12 @@ class ViewpointShiftEffect(Effect):
         return tuple(Parameter(f'e{i}', 'm', 0.01) for i in range(self.order))
 
     def prior_sigma(self, scene: Scene) -> Array:
-        """Return those of a shift of such a size, each order at the edge of the field."""
-        edge = scene.lens.max_incidence
-        return np.asarray(SHIFT_SIGMA / edge ** (2.0 * np.arange(self.order)))
+        """Return those of a shift of such a size at the edge of the field, of each higher order.
+
+        Of e0 a wider one: a shift larger than known ones is to be named, and not something else.
+        """
+        edge = scene.lens.max_incidence ** (2.0 * np.arange(1, self.order))
+        return np.array([self.parameters[0].large, *(SHIFT_SIGMA / edge)])
 
     def columns(self, scene: Scene) -> Array:
         shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]

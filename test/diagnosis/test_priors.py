@@ -20,6 +20,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, g
 
 SIGMA, SHIFT, ORDER = 0.2, 0.003, 3
 FREE = intrinsic_names(lens())
+WIDE = 0.01  # m: of e0
 EFFECT = ViewpointShiftEffect(ORDER)
 
 
@@ -68,9 +69,9 @@ def test_higher_orders_are_known_by_what_they_do_at_the_edge_of_the_field() -> N
     data, state, _ = few_views()
     view = Linearization(data, state, FREE).scene
     sizes = EFFECT.prior_sigma(view) * view.lens.max_incidence ** (2 * np.arange(ORDER))
-    assert sizes == pytest.approx(SHIFT_SIGMA)
+    assert sizes == pytest.approx([WIDE, SHIFT_SIGMA, SHIFT_SIGMA])
     each = together([*by_camera(0, 'left', [ViewpointShiftEffect(1)]),
                      *by_camera(1, 'right', [ViewpointShiftEffect(2)])])
     rig = replace(view, cameras=((np.arange(1), 0, view), (np.arange(1), 1, view)))
     assert each.prior_sigma(rig) == pytest.approx(
-        [SHIFT_SIGMA, SHIFT_SIGMA, SHIFT_SIGMA / view.lens.max_incidence**2])
+        [WIDE, WIDE, SHIFT_SIGMA / view.lens.max_incidence**2])
