@@ -23,28 +23,23 @@ from fisheye_svp_ros.commands.photographs import (
     sizes_beside,
 )
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
-from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import GeometryError, ObservationError, ParameterError
+from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
-from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
-from fisheye_svp_ros.optics.lens import Lens, parameter_values
+from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
 from fisheye_svp_ros.reporting.hand_eye_text import HEADER, hand_eye_rows, hand_eye_sentence
 from fisheye_svp_ros.reporting.progress import progress, stages
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
-from fisheye_svp_ros.scene.observations import Observations, rig_cameras, stereo_views
-from fisheye_svp_ros.scene.photograph_names import list_frames
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import (
     Calibration,
     calibrate,
     calibrate_hand_eye,
     calibrate_port,
 )
-from fisheye_svp_ros.solve.measured_poses import rms_px, sigma_known
-from fisheye_svp_ros.study.solutions import solve_rigs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,8 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
                         help='lens file to write; covariances go beside it as .calibrate.json, '
                         'the report as calibration.html; for several cameras a folder, for a lens '
-                        'of each and rig.yaml, of three and more also rig.json, rig.urdf, '
-                        'tf_static.yaml and camchain.yaml')
+                        'of each, rig.yaml, rig.json, rig.urdf, tf_static.yaml and camchain.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -119,10 +113,8 @@ def run(args: argparse.Namespace) -> None:
         for warning in one.warnings:
             say(warning)
     lenses = {camera: one.lens for camera, one in found.items()}
-    if len(lenses) > 2:
+    if len(lenses) > 1:
         calibrate_cameras(_joined([one.table for one in found.values()]), lenses, args.output)
-    elif pair := rig_cameras(observations.cameras):
-        _rig(observations, lenses, pair, args.output)
 
 
 def _joined(tables: Sequence[Observations]) -> Observations:
@@ -180,76 +172,6 @@ def _calibrate_camera(
 def _write(found: CalibratedCamera, path: Path) -> None:
     save_lens(found.lens, path)
     write_json(path.with_suffix('.calibrate.json'), _document(found))
-
-
-def _rig(
-    observations: Observations, lenses: Mapping[str, Lens], names: tuple[str, str],
-    folder: Path | None,
-) -> None:
-    """Calibrate, print and write the rig between two calibrated cameras."""
-    from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
-
-    left, right = (ForwardModel(lenses[name]) for name in names)
-    try:
-        both = _common_frames(observations, {name: lenses[name] for name in names})
-    except ObservationError as cause:
-        say(f'rig: {cause}')
-        return
-    found = solve_rigs((left, right), *stereo_views(both))
-    fitted, reason = found.solution, found.reasons[0]
-    if reason and sigma_known(both):
-        say(f'rig: {reason}')
-    frames, rms = len(both.frames), rms_px(np.concatenate(
-        [residual.reshape(-1, 2) for residual in (fitted.left_residual, fitted.right_residual)]))
-    own = max((lenses[name].calibration or {})['rms_px'] for name in names)
-    if rms > MAX_RIG_RATIO * own:
-        say(f'rig: with it {rms:.2f} px are left, where the cameras alone leave {own:.2f} px at '
-            'most: they moved, were not photographed at the same moments, or a lens is wrong')
-    if frames < MIN_SHARED_FRAMES:
-        say(f'rig: {frames} of the frames alone show it; photograph the target with both cameras '
-            'at once more often')
-    place = 1000 * fitted.rig.position[0]
-    print(f'rig: camera {names[0]} in {names[1]} at {place[0]:.3f}, {place[1]:.3f}, '
-          f'{place[2]:.3f} mm, from {frames} frames, rms {rms:.4f} px')
-    if folder:
-        save_rig(fitted.rig.take(0), folder / 'rig.yaml', names)
-
-
-def _common_frames(observations: Observations, lenses: dict[str, Lens]) -> Observations:
-    """Return the rows of the frames that both cameras of a rig have, without gross errors.
-
-    Raises ObservationError where there is no such frame, or no rig explains most of them.
-    """
-    from fisheye_svp_ros.solve.initial_rig import initial_state
-    from fisheye_svp_ros.solve.measured_poses import posable_observations
-    from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
-    from fisheye_svp_ros.solve.rig_checks import is_unrelated
-    from fisheye_svp_ros.solve.rig_state import group_by_frame
-
-    def shared(table: Observations) -> Observations:
-        one, other = (table.frame[table.camera == camera] for camera in (0, 1))
-        return table.take(np.isin(table.frame, np.intersect1d(one, other)))
-
-    first, second = map(observations.cameras.index, lenses)
-    pair = observations.take(np.isin(observations.camera, (first, second)))
-    pair = replace(pair, cameras=tuple(lenses), camera=(pair.camera == second).astype(np.int64))
-    both = shared(posable_observations(pair, lenses)[0])
-    if not len(both):
-        raise ObservationError(f'{observations.source}: no frame was seen by both cameras; '
-                               'photographs of one moment must have one frame number')
-    data, (left, right) = group_by_frame(both), lenses.values()
-    state = initial_state(data, left, [right])
-    if is_unrelated(data, state):
-        raise ObservationError(
-            f'{observations.source}: none explains where {" and ".join(lenses)} stand in most '
-            'frames; photographs of one moment must have one frame number, others different ones, '
-            'and points be numbered from the same end')
-    _, gross = find_outliers(data, state)
-    torn = sorted({int(both.frame[row]) for row, why in zip(gross.rows, gross.why, strict=True)
-                   if why == FRAME})
-    if torn:
-        say(f'rig: left out: {list_frames(both, torn)}: {FRAME}')
-    return shared(both.take(~np.isin(np.arange(len(both)), gross.rows)))
 
 
 def _print(found: CalibratedCamera) -> None:

@@ -1,8 +1,8 @@
-"""The rig of three and more calibrated cameras: fitted, printed, written."""
+"""The rig of two and more calibrated cameras: fitted, printed, written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,38 +16,69 @@ from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import quaternion_from_rotation
 from fisheye_svp_ros.reporting.tables import print_table
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, rig_cameras
+from fisheye_svp_ros.scene.photograph_names import list_frames
+from fisheye_svp_ros.solve.measured_poses import posable_observations
+from fisheye_svp_ros.solve.outliers import FRAME
 from fisheye_svp_ros.solve.rig_calibration import (
     RigCalibration,
     calibrate_rig,
     connected_cameras,
 )
+from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
 
 
 def calibrate_cameras(
     table: Observations, lenses: Mapping[str, Lens], folder: Path | None
 ) -> None:
-    """Fit the rig of all cameras that frames hold together; print it, write it to a folder."""
-    groups = connected_cameras(table)
-    largest = max(groups, key=len)
-    for group in groups:
-        if group != largest:
-            say(f'rig: nothing holds {" and ".join(group)} to {", ".join(largest)}: no frame '
-                'shows the target to both at once; photograph it where two cameras see it')
-    if len(largest) < 2:
-        return
+    """Fit the rig of all cameras that frames hold together; print it, write it to a folder.
+
+    lenses: from `calibrate`.
+    """
     try:
-        found = calibrate_rig(table, lenses, largest)
+        table, _ = posable_observations(table, lenses)
+        groups = connected_cameras(table)
+        largest = max(groups, key=len)
+        for group in groups:
+            if group != largest:
+                say(f'rig: nothing holds {" and ".join(group)} to {", ".join(largest)}: no frame '
+                    'shows the target to both at once; photograph it where two cameras see it, '
+                    'and give photographs of one moment one frame number')
+        if len(largest) < 2:
+            return
+        pair = rig_cameras(largest)
+        found = calibrate_rig(table, lenses, pair or largest)
     except FisheyeSvpError as cause:
         say(f'rig: {cause}')
         return
-    if found.left_out:
-        say('rig: left out, since no rig explains them: frames '
-            + ', '.join(map(str, found.left_out)))
+    for warning in _warnings(found, table, lenses):
+        say(f'rig: {warning}')
     if folder:
         with write_together():
             _write(found, [lenses[name] for name in found.cameras], folder)
     _print(found)
+
+
+def _warnings(
+    found: RigCalibration, table: Observations, lenses: Mapping[str, Lens]
+) -> Iterator[str]:
+    """Yield what there is to say against a rig."""
+    if found.left_out:
+        yield f'left out: {list_frames(table, found.left_out)}: {FRAME}'
+    if found.reason:
+        yield found.reason
+    own = max((lenses[name].calibration or {}).get('rms_px', np.inf) for name in found.cameras)
+    if found.total_rms_px > MAX_RIG_RATIO * own:
+        yield (f'with it {found.total_rms_px:.2f} px are left, where the cameras alone leave '
+               f'{own:.2f} px at most: they moved, were not photographed at the same moments, or '
+               'a lens is wrong')
+    for name, shared in zip(found.cameras, found.shared.tolist(), strict=True):
+        if shared < MIN_SHARED_FRAMES:
+            what = 'it' if len(found.cameras) == 2 else name
+            yield (f'{shared} of the frames alone show {what}; photograph the target with two '
+                   'cameras at once more often')
+            if len(found.cameras) == 2:
+                return
 
 
 def _write(found: RigCalibration, lenses: Sequence[Lens], folder: Path) -> None:
@@ -77,6 +108,11 @@ def _document(found: RigCalibration) -> dict[str, Any]:
 
 
 def _print(found: RigCalibration) -> None:
+    if len(found.cameras) == 2:
+        x, y, z = 1000 * found.steps()[0].position
+        print(f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '
+              f'{y:.3f}, {z:.3f} mm, from {len(found.frame)} frames, '
+              f'rms {found.total_rms_px:.4f} px')
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     rows = []
     for i, name in enumerate(found.cameras):

@@ -9,16 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.errors import GeometryError
+from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, rig_covariance
 from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.measured_poses import sigma_known
+from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
+from fisheye_svp_ros.solve.reliability import misfit_fails, misfit_reason
+from fisheye_svp_ros.solve.rig_checks import is_unrelated
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 _MIN_CAMERAS = 2  # that a frame must show the target to
-_TORN, _MOST_TORN = 5.0, 0.2  # times the median rms of frames; share of them
 
 
 class RigCalibration(NamedTuple):
@@ -26,9 +29,10 @@ class RigCalibration(NamedTuple):
 
     covariance (C - 1, 6, 6), m and rad, of the change in `Pose.retract`, of each camera but the
     first, with the errors that its lenses state of themselves; frame (F,); pose (F,) of the first
-    camera in the target; rms_px (C,); sigma_px: noise of u and v, estimated, None where the
-    observations bring their own; shared (C,): frames that a camera shares with others; left_out:
-    frames that no rig explains.
+    camera in the target; rms_px (C,), and over all: total_rms_px; sigma_px: noise of u and v,
+    estimated, None where the observations bring their own; shared (C,): frames that a camera
+    shares with others; left_out: frames that no rig explains; reason: why it should not be relied
+    on, '' where nothing speaks against it.
     """
 
     cameras: tuple[str, ...]
@@ -37,9 +41,11 @@ class RigCalibration(NamedTuple):
     frame: Index
     pose: Pose
     rms_px: Array
+    total_rms_px: float
     sigma_px: float | None
     shared: Index
     left_out: tuple[int, ...]
+    reason: str
 
     def steps(self) -> tuple[Pose, ...]:
         """Return each camera in the next one (C - 1 poses), as rig files have them."""
@@ -71,39 +77,53 @@ def calibrate_rig(
     """Fit the rig and the poses of its frames to what the cameras saw, their lenses known.
 
     cameras: connected ones, in the order in which they are wanted; the first is the frame of all.
-    Raises GeometryError, naming the frame, for a view that does not fix a pose, and where the rig
-    is not determined.
+    Outliers are rejected, and frames in which the cameras contradict each other.
+    Raises ObservationError where no rig explains most frames; GeometryError, naming the frame, for
+    a view that does not fix a pose, and where the rig is not determined.
     """
     order = connected_cameras(_select_cameras(table, cameras))[0]
-    rows = _select_shared(_select_cameras(table, order))
-    torn: list[int] = []
-    linear = _fit_rig(rows, [lenses[name] for name in order])
-    # One at a time: a frame that is torn pulls the rig, and others with it.
-    for _ in range(int(_MOST_TORN * len(rows.frames))):
-        worst = _torn_frame(linear, rows.frames)
-        if worst is None:
-            break
-        torn.append(worst)
-        rows = rows.take(rows.frame != worst)
-        linear = _fit_rig(rows, [lenses[name] for name in order])
+    ordered = [lenses[name] for name in order]
+    rows, torn = _without_outliers(_select_shared(_select_cameras(table, order)), ordered)
+    linear = _fit_rig(rows, ordered)
     # Cameras stand in the order in which frames hold them together; the first one stays the first.
     place = [order.index(name) for name in cameras if name in order]
     data, state = linear.data, linear.state
     freedom = int(linear.row_mask.sum()) - 6 * (data.frames + data.cameras - 1)
     if freedom < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
-    known = bool(np.isfinite(rows.sigma).all())
-    sigma = None if known else float(np.sqrt((linear.residual**2).sum() / freedom))
+    chi2 = float((linear.residual**2).sum()) / freedom
+    known = sigma_known(rows)
+    fails = known and bool(misfit_fails(np.array(chi2 * freedom), np.array(freedom)))
+    sigma = None if known else float(np.sqrt(chi2))
     covariance = rig_covariance(*_with_lenses(linear, order, sigma or 1.0))
-    off = np.where(data.views.used[..., None], data.views.uv - linear.linear.uv, np.nan)
+    squares = ((data.views.uv - linear.linear.uv) ** 2).sum(axis=-1)
+    squares = np.where(data.views.used, squares, np.nan)
     return RigCalibration(
         tuple(order[i] for i in place), state.rig.take(place),
         covariance[[i - 1 for i in place[1:]]], rows.frames, state.pose,
-        np.array([np.sqrt(np.nanmean((off[data.camera_of == i] ** 2).sum(axis=-1)))
-                  for i in place]),
-        sigma, np.bincount(data.camera_of, minlength=len(order))[place],
-        tuple(sorted(torn)),
+        np.array([np.sqrt(np.nanmean(squares[data.camera_of == i])) for i in place]),
+        float(np.sqrt(np.nanmean(squares))), sigma,
+        np.bincount(data.camera_of, minlength=len(order))[place], torn,
+        misfit_reason(chi2, freedom) if fails else '',
     )
+
+
+def _without_outliers(
+    rows: Observations, lenses: Sequence[Lens]
+) -> tuple[Observations, tuple[int, ...]]:
+    """Return the rows without outliers, and the frames that no rig explains."""
+    data = group_by_frame(rows)
+    state = initial_state(data, lenses[0], lenses[1:])
+    if is_unrelated(data, state):
+        raise ObservationError(
+            f'{rows.source}: none explains where {" and ".join(rows.cameras)} stand in most '
+            'frames; photographs of one moment must have one frame number, others different ones, '
+            'and points be numbered from the same end')
+    _, found = find_outliers(data, state)
+    torn = {int(rows.frame[row]) for row, why in zip(found.rows, found.why, strict=True)
+            if why == FRAME}
+    kept = ~np.isin(np.arange(len(rows)), found.rows) & ~np.isin(rows.frame, sorted(torn))
+    return _select_shared(rows.take(kept)), tuple(sorted(torn))
 
 
 def _fit_rig(rows: Observations, lenses: Sequence[Lens]) -> Linearization:
@@ -129,13 +149,6 @@ def _with_lenses(
 
     stated_by_all = block_diag(*parts) if parts else np.zeros((0, 0))
     return Linearization(linear.data, linear.state, free), sigma, stated_by_all
-
-
-def _torn_frame(linear: Linearization, frames: Index) -> int | None:
-    """Return the frame whose residuals are out of proportion: photographs of other moments."""
-    rms = np.sqrt((linear.residual**2).sum(axis=1) / linear.row_mask.sum(axis=1))
-    worst = int(np.argmax(rms))
-    return int(frames[worst]) if rms[worst] > _TORN * np.median(rms) else None
 
 
 def _select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:

@@ -142,7 +142,9 @@ def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(['calibrate', str(table), '--image-size', '424x400', '--free',
                      'fx,fy,cx,cy,k1,k2,k3,e0', '-o', str(out)]) == 0
     assert '-50.0' in capsys.readouterr().out
-    assert {path.name for path in out.glob('*.yaml')} == {'left.yaml', 'right.yaml', 'rig.yaml'}
+    assert {path.name for path in out.glob('*.yaml')} == {
+        'left.yaml', 'right.yaml', 'rig.yaml', 'camchain.yaml', 'tf_static.yaml'}
+    assert json.loads((out / 'rig.json').read_text())['cameras']['right']['covariance']
     lenses = [f'--lens={name}={out / name}.yaml' for name in ('left', 'right')]
     assert cli.main(['localize', str(table), *lenses, '-o', str(tmp_path / 'poses')]) == 0
     assert json.loads((tmp_path / 'poses' / 'right' / 'localize.json').read_text())['frames'] == 10
