@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import chain, takewhile
 
 import numpy as np
-from scipy import optimize, special, stats
+from scipy import optimize, special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_tests import (
@@ -222,18 +222,25 @@ def bulk_p_values(statistic: Array, rank: Array, found: Index) -> Array:
     """
     one, others = np.maximum(rank, 1), np.setdiff1d(np.flatnonzero(rank > 0), found)
     if not others.size:
-        return np.asarray(stats.chi2.sf(statistic, one))
+        return np.asarray(special.chdtrc(one, statistic))
     size, of = rank[others], statistic[others] / np.maximum(rank[others], 1)
     fits = []
     for freedom in _TAIL_FREEDOMS:
-        scale = max(float(np.median(of / stats.f.median(size, freedom))), 1.0)
-        density = np.asarray(stats.f.logpdf(of / scale, size, freedom))
+        scale = max(float(np.median(of / special.fdtri(size, freedom, 0.5))), 1.0)
+        density = _log_density_of_f(of / scale, size, freedom)
         fits.append((float(density.sum() - len(of) * np.log(scale)), scale, freedom))
     normal, best = fits[-1], max(fits)
     _, scale, freedom = best if best[0] > normal[0] + _TAIL_GAIN else normal
     beyond = statistic > _OUTWEIGHED_RATIO * statistic[others].max()
     freedom_of_each = np.where(beyond, normal[2], freedom)
-    return np.asarray(stats.f.sf(statistic / one / scale, one, freedom_of_each))
+    return np.asarray(special.fdtrc(one, freedom_of_each, statistic / one / scale))
+
+
+def _log_density_of_f(x: Array, rank: Array, freedom: float) -> Array:
+    """Return the log density of F distributions; `scipy.stats` takes half a second to import."""
+    rest = special.betaln(rank / 2, freedom / 2) - special.xlogy(rank / 2, rank / freedom)
+    power = special.xlog1py((rank + freedom) / 2, rank * x / freedom)
+    return np.asarray(special.xlogy(rank / 2 - 1, x) - power - rest)
 
 
 def test_landmarks(tests: EffectTests) -> tuple[Array, Array, Array]:

@@ -214,9 +214,12 @@ class Adjustment:
         """Take what to fit; held: effects that stay as they are, None for all but the poses."""
         self._data, self._template, self._free = data, template, tuple(free)
         self._prior = prior or Prior()
-        moving = [np.full(6 * (data.cameras - 1) + len(self._free), held is not None)]
-        moving += [np.full(len(values), held is not None and effect.name not in held)
-                   for effect, values in template.terms if is_shared(effect)]
+        self._poses_alone = held is None
+        moving = [np.zeros(0, dtype=bool)]
+        if held is not None:
+            moving += [np.ones(6 * (data.cameras - 1) + len(self._free), dtype=bool)]
+            moving += [np.full(len(values), effect.name not in held)
+                       for effect, values in template.terms if is_shared(effect)]
         self._moving = np.concatenate(moving)
 
     def pack(self, states: Sequence[RigState]) -> Arrays:
@@ -242,6 +245,8 @@ class Adjustment:
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
         frame, shared = step
         rotation, position, rig_rotation, rig_position, values = state
+        if self._poses_alone:
+            return (*Pose(rotation, position).retract(frame), *state[2:])
         cameras = 6 * (self._data.cameras - 1)
         move = np.zeros((len(shared), self._data.cameras, 6))
         move[:, 1:] = shared[:, :cameras].reshape(len(shared), -1, 6)
@@ -255,12 +260,12 @@ class Adjustment:
         """Return cost (1,) and normal equations of one state, infinite for an impossible lens."""
         if any(lens.check() for lens in state.lenses):
             return np.array([np.inf]), self._empty_equations()
-        linear = Linearization(self._data, state, self._free)
-        if self._moving.any():
+        linear = Linearization(self._data, state, self._free, self._poses_alone)
+        if self._poses_alone:
+            shared = np.zeros((*linear.residual.shape, 0))
+        else:
             # A column of zeros leaves its parameter where it is.
             shared = linear.shared_columns * self._moving
-        else:
-            shared = np.zeros((*linear.residual.shape, len(self._moving)))
         return self._with_prior(state, *_equations(linear, shared))
 
     def _empty_equations(self) -> Arrays:

@@ -177,11 +177,16 @@ class Linearization:
     residual (F, M), whitened, measured minus predicted; frame_columns (F, M, 6): by the pose of
     the frame (zero where poses are known); shared_columns (F, M, K): by rig, free intrinsics and
     the parameters of the effects, in this order.  Where the corrections of a lens stay what they
-    are, the derivatives follow how these vary over the image; those of effects do not.
+    are, the derivatives follow how these vary over the image; those of effects do not, unless
+    `fixed_effects` says that the effects stay what they are, too: poses alone are then fitted in
+    three steps, where inexact derivatives find no step that keeps what it promises.
     """
 
-    def __init__(self, data: RigViews, state: RigState, free: Sequence[str]) -> None:
+    def __init__(
+        self, data: RigViews, state: RigState, free: Sequence[str], fixed_effects: bool = False
+    ) -> None:
         self.data, self.state, self.free = data, state, tuple(free)
+        self._follows_effects = state.corrected or fixed_effects
         self.model = state.model
         pose = state.view_poses(data)
         self.linear: LinearViews = self.model.linearise(pose, data.views)
@@ -224,7 +229,7 @@ class Linearization:
 
     def _through_corrections(self, columns: Array) -> Array:
         """Return columns (S, N, 2, P) of measured points from those of ideal ones."""
-        if not self.state.corrected:
+        if not self._follows_effects:
             return columns
         return self.model.through(self.linear, self.data.views, columns)
 
