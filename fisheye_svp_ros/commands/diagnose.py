@@ -184,7 +184,7 @@ def _print(
         files = ['report.html', 'diagnosis.json']
         if diagnosis.offers_extended:
             files += [str(Path(camera) / EXTENDED) for camera in diagnosis.lenses]
-        files += ['rig.yaml'] * bool(diagnosis.rig)
+        files += ['rig.yaml'] * bool(diagnosis.rig_chain)
         print(f'{args.output}: {", ".join(files)}, residuals.csv')
 
 
@@ -212,8 +212,8 @@ def _write(
     write_json(folder / 'diagnosis.json', document)
     for camera, lens in diagnosis.lenses.items():
         save_lens(lens, folder / camera / EXTENDED, not_offered(diagnosis))
-    if diagnosis.rig:
-        cameras, rig = diagnosis.rig
+    if diagnosis.rig_chain:
+        cameras, rig = diagnosis.rig_chain
         save_rig(rig, folder / 'rig.yaml', cameras)
     _write_residuals(folder / 'residuals.csv', points, diagnosis.model.data.observations)
     write_report(diagnosis, points, known, _inputs(args, free), wanted)

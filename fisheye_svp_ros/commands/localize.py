@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
+from fisheye_svp_ros.commands.localize_rig import AXES, MAX_TABLE_ROWS, localize_cameras
 from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes
 from fisheye_svp_ros.commands.photographs import read_input as read
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
@@ -22,9 +24,7 @@ from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
 from fisheye_svp_ros.solve.localization import sight
 from fisheye_svp_ros.solve.measured_poses import MeasuredPoses, localize_measured, rms_px
 
-_MAX_TABLE_ROWS = 40  # frames in the table for people
 _Parts = dict[str, dict[str, float]]  # root mean squares by quantity and part
-_AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,17 +34,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--model-error', action='store_true',
                         help='covariances with what the lens file says of its own errors: its '
                         'parameters, and the misfit that remains (an extended_lens.yaml)')
+    parser.add_argument('--rig', metavar='RIG',
+                        help='where the cameras of a rig stand: rig.yaml from `calibrate`, the '
+                        'folder that holds it, a camchain; one pose per frame from all cameras, '
+                        'of the first of them')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
                         help='folder for localize.json, poses.csv, residuals.csv, covariance.csv; '
-                        'of a rig, a folder in it for each camera')
+                        'of cameras without --rig, a folder in it for each')
 
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
+    if args.rig and args.model_error:
+        raise ParameterError('--model-error is for one camera at a time; leave --rig out')
     given = load_lenses(args.lens)
     observations, sizes = read(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
     check_sizes(args.observations, sizes, lenses)
+    if args.rig:
+        localize_cameras(observations, lenses, args.rig, args.output)
+        return
     for camera, (name, lens) in enumerate(lenses.items()):
         model, uncertainty = ForwardModel(lens), None
         table = observations.take(observations.camera == camera)
@@ -75,7 +84,7 @@ def _print(
         for part in (slice(0, 3), slice(3, 6))
     ]
     rows = []
-    for i, frame in enumerate(views.frame[:_MAX_TABLE_ROWS]):
+    for i, frame in enumerate(views.frame[:MAX_TABLE_ROWS]):
         place = (f'{1000 * value:.3f}' for value in result.pose.position[i])
         rows.append((
             _frame_label(table, int(frame)), str(int(views.used[i].sum())),
@@ -88,8 +97,8 @@ def _print(
         f'rms {rms_px(measured.inlier_residual):.4f} px',
         header, rows,
     )
-    if len(views.frame) > _MAX_TABLE_ROWS:
-        print(f'  and {len(views.frame) - _MAX_TABLE_ROWS} more frames')
+    if len(views.frame) > MAX_TABLE_ROWS:
+        print(f'  and {len(views.frame) - MAX_TABLE_ROWS} more frames')
     said = noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty)
     print(f'  {said}, in the worst direction')
 
@@ -122,7 +131,7 @@ def _write(
         'du': result.residual[used][:, 0], 'dv': result.residual[used][:, 1],
         'theta': theta[used], 'range': distance[used],
     })
-    names = [f'{a}_{b}' for a in _AXES for b in _AXES]
+    names = [f'{a}_{b}' for a in AXES for b in AXES]
     entries = result.covariance.reshape(-1, 36).T
     write_table(
         folder / 'covariance.csv',

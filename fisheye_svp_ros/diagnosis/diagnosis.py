@@ -52,6 +52,7 @@ from fisheye_svp_ros.scene.observations import Observations, rig_cameras
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
 from fisheye_svp_ros.solve.hand_eye import HandEye
+from fisheye_svp_ros.solve.rig_calibration import connected_cameras
 from fisheye_svp_ros.solve.rig_checks import has_no_rig
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState
 
@@ -236,6 +237,21 @@ class Diagnosis:
             return None
         first, second = (rig.take(data.observations.cameras.index(name)) for name in names)
         return names, second.inverse().compose(first)
+
+    @property
+    def rig_chain(self) -> tuple[tuple[str, ...], tuple[Pose, ...]] | None:
+        """The cameras of a rig of any number and each in the next one, by the extended lenses.
+
+        None where no frames hold them all together.
+        """
+        if self.rig is not None:
+            return self.rig[0], (self.rig[1],)
+        data, place = self.model.data, self.written_model.state.rig
+        table = data.observations
+        if data.cameras < 3 or has_no_rig(data) or len(connected_cameras(table)) > 1:
+            return None
+        return table.cameras, tuple(place.take(i + 1).inverse().compose(place.take(i))
+                                    for i in range(data.cameras - 1))
 
     def board_maps(self, names: Sequence[str] = ()) -> list[BoardMap]:
         """Return how the target differs from what it is said to be; names: by these effects."""

@@ -46,6 +46,23 @@ def cameras_in_first(steps: Sequence[Pose]) -> Pose:
     return Pose.stack(poses)
 
 
+def load_cameras(path: str | Path) -> tuple[tuple[str, ...], Pose]:
+    """Return the cameras of a rig by name, and where they stand in the first one (C,).
+
+    path: of a rig file, or of a file or folder that holds lenses and rig.
+    Raises LensError where there is none.
+    """
+    file = Path(path) / 'rig.yaml' if Path(path).is_dir() else path
+    steps = load_rigs(file)
+    foreign = read_foreign(file, read_text(file, LensError, MAX_LENS_BYTES))
+    assert foreign is not None
+    names = foreign.cameras or tuple(foreign.lenses) or STEREO
+    if len(names) != len(steps) + 1:
+        raise LensError(f'{file}: {len(names)} cameras, and {len(steps)} transforms between them; '
+                        'each camera in the next one is needed')
+    return names, cameras_in_first(steps)
+
+
 def load_rig(path: str | Path) -> Pose:
     """Return the first (left) camera in the second one, of a rig file or what another tool wrote.
 

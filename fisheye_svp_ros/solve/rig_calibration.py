@@ -81,9 +81,9 @@ def calibrate_rig(
     Raises ObservationError where no rig explains most frames; GeometryError, naming the frame, for
     a view that does not fix a pose, and where the rig is not determined.
     """
-    order = connected_cameras(_select_cameras(table, cameras))[0]
+    order = connected_cameras(select_cameras(table, cameras))[0]
     ordered = [lenses[name] for name in order]
-    rows, torn = _without_outliers(_select_shared(_select_cameras(table, order)), ordered)
+    rows, torn = _without_outliers(_select_shared(select_cameras(table, order)), ordered)
     linear = _fit_rig(rows, ordered)
     # Cameras stand in the order in which frames hold them together; the first one stays the first.
     place = [order.index(name) for name in cameras if name in order]
@@ -151,7 +151,7 @@ def _with_lenses(
     return Linearization(linear.data, linear.state, free), sigma, stated_by_all
 
 
-def _select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
+def select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
     """Return the rows of some cameras, numbered in their order."""
     number = np.full(len(table.cameras), -1)
     number[[table.cameras.index(name) for name in cameras]] = np.arange(len(cameras))

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.surround import CAMERAS, LENS, RIG, photographs
+from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
-from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
-from fisheye_svp_ros.io.readers import write_observations
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
+from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.io.rig_files import cameras_in_first, load_rigs, save_rig
 from fisheye_svp_ros.pose import Pose
 
@@ -89,3 +89,31 @@ def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
     text = (tmp_path / 'rig.yaml').read_text()
     (tmp_path / 'broken.yaml').write_text(text.replace('cam1_in_cam2', 'cam2_in_cam1'))
     assert cli.main(['lens', str(tmp_path / 'broken.yaml')]) == 2
+
+
+def test_a_rig_of_three_is_posed_and_diagnosed_as_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the rig of the lenses that were found, a pose per frame from all cameras."""
+    table = photographs(2, (45.0, 135.0), 24)
+    write_observations(tmp_path / 'obs.csv', table.take(table.camera < 3))
+    lens = tmp_path / 'lens.yaml'
+    save_lens(LENS.svp(), lens)
+    lenses = [f'--lens=cam{i}={lens}' for i in range(3)]
+    out = tmp_path / 'diagnosis'
+    assert cli.main(['diagnose', str(tmp_path / 'obs.csv'), *lenses, '--quick',
+                     '-o', str(out)]) == 0
+    found = json.loads((out / 'diagnosis.json').read_text())
+    shift, = (cause for cause in found['causes'] if cause['effect'] == 'viewpoint_shift')
+    for camera in CAMERAS[:3]:
+        e0 = shift['parameters'][f'{camera}.e0']
+        assert abs(e0['value'] - 0.004) < 4 * e0['stderr'] < 0.012
+    capsys.readouterr()
+    extended = [f'--lens=cam{i}={out}/cam{i}/extended_lens.yaml' for i in range(3)]
+    assert cli.main(['localize', str(tmp_path / 'obs.csv'), *extended, '--rig',
+                     str(out / 'rig.yaml'), '-o', str(tmp_path / 'poses')]) == 0
+    assert 'cam0 in the world, by' in capsys.readouterr().out
+    document = json.loads((tmp_path / 'poses' / 'localize.json').read_text())
+    assert document['frames'] == 24 and list(document['cameras']) == list(CAMERAS[:3])
+    assert document['rms_px'] < 1.1 * NOISE * 2**0.5
+    assert len(read_poses(tmp_path / 'poses' / 'poses.csv').frame) == 24

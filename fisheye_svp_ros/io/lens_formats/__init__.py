@@ -40,13 +40,14 @@ class Foreign(NamedTuple):
     """What a file of another tool holds.
 
     form: of the file; lenses by camera; rigs: each camera in the next one; worst_px: how far each
-    lens is from what the file says.
+    lens is from what the file says; cameras: of a rig without lenses, if it names them.
     """
 
     form: str
     lenses: dict[str, Lens]
     rigs: tuple[Pose, ...]
     worst_px: dict[str, float]
+    cameras: tuple[str, ...] = ()
 
     def deviation_px(self, lens: Lens) -> float:
         """Return how far a lens of the file is from what the file says, px."""
