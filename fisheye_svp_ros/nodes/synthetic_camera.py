@@ -1,4 +1,4 @@
-"""Simulates what one or two cameras see of landmarks; steps through sweeps."""
+"""Simulates what one camera or a rig sees of landmarks; steps through sweeps."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class PhotographingSettings(SyntheticCameraSettings):
 class SweepSet(NamedTuple):
     """Set `place` of the `sets` of scenario `number`; `frame` of the piece that is simulated.
 
-    swept: values of the sweep point; seen: observations by camera; svp_lens: for `camera_info`.
+    swept: values of the sweep point; seen: observations by camera; svp_lenses: for `camera_info`.
     """
 
     number: int
@@ -63,7 +63,7 @@ class SweepSet(NamedTuple):
     swept: dict[str, Any]
     simulation: Simulation
     seen: dict[str, Observations]
-    svp_lens: Lens
+    svp_lenses: tuple[Lens, ...]
 
 
 class SyntheticCamera(CameraNode):
@@ -97,8 +97,9 @@ class SyntheticCamera(CameraNode):
 
     def configure(self, settings: SyntheticCameraSettings) -> None:
         """Start over with new settings."""
-        for style in self._sweep.lists.get('style', (settings.style,)):
-            for name in camera_names(style):
+        for style, rig in itertools.product(self._sweep.lists.get('style', (settings.style,)),
+                                            self._sweep.lists.get('rig', (settings.rig,))):
+            for name in camera_names(style, rig):
                 self.camera(name)
         self.play(steps(settings, self._sweep))
 
@@ -113,18 +114,18 @@ class SyntheticCamera(CameraNode):
         text = ', '.join(f'{name} {value}' for name, value in step.swept.items())
         self.tag(stamp, {**place, **scalars(step.scenario)}, text)
         self.publish_landmarks(simulation.landmarks, stamp)
-        for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):
-            pose = poses.take(step.frame)
-            picture = self._photograph(step, pose) if self.photographs else seen
-            self.camera(name).publish(stamp, picture, pose, step.svp_lens)
+        for number, (name, seen) in enumerate(step.seen.items()):
+            pose = simulation.poses[number].take(step.frame)
+            picture = self._photograph(step, number, pose) if self.photographs else seen
+            self.camera(name).publish(stamp, picture, pose, step.svp_lenses[number])
         if self._markers.get_subscription_count():
             world = self.settings.world_frame
             self._markers.publish(messages.markers_message(_shapes(step), stamp, world))
 
-    def _photograph(self, step: SweepSet, pose: Pose) -> Pixels:
+    def _photograph(self, step: SweepSet, camera: int, pose: Pose) -> Pixels:
         rng = np.random.default_rng([step.scenario.seed, step.number, step.place])
         printed = _printed(self.settings.photograph)
-        return render(step.simulation.lens, printed, pose, Exposure(), rng)
+        return render(step.simulation.lenses[camera], printed, pose, Exposure(), rng)
 
 
 def _printed(board: str) -> Print:
@@ -141,7 +142,11 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
         for number, swept in enumerate(sweep):
             scenario = with_values(settings, swept)
             for first, sets, simulation in simulate_in_pieces(scenario, number, repetition):
-                svp_lens = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
+                equivalent = kannala_brandt_equivalent(ForwardModel(simulation.lens).lens)
+                svp_lenses = tuple(
+                    equivalent if lens is simulation.lens
+                    else kannala_brandt_equivalent(ForwardModel(lens).lens)
+                    for lens in simulation.lenses)
                 table = simulation.observations
                 rows_of = rows_by_frame(table)
                 for frame in range(len(simulation.poses[0].position)):
@@ -150,7 +155,7 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
                         for camera in table.cameras
                     }
                     yield SweepSet(number, first + frame, sets, frame, scenario, swept,
-                                   simulation, seen, svp_lens)
+                                   simulation, seen, svp_lenses)
         if not settings.repeat:
             return
 
@@ -158,7 +163,7 @@ def steps(settings: SyntheticCameraSettings, sweep: Sweep) -> Iterator[SweepSet]
 def _shapes(step: SweepSet) -> Iterator[messages.Segments]:
     simulation = step.simulation
     yield landmarks_shape(simulation.landmarks.points)
-    for (name, seen), poses in zip(step.seen.items(), simulation.poses, strict=True):
-        pose = poses.take(step.frame)
+    for number, (name, seen) in enumerate(step.seen.items()):
+        pose = simulation.poses[number].take(step.frame)
         yield camera_shape(pose, f'true {name}'.strip(), alpha=1.0)
-        yield rays_shape(simulation.lens, pose, seen.xyz, name)
+        yield rays_shape(simulation.lenses[number], pose, seen.xyz, name)

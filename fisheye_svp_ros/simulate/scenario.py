@@ -15,11 +15,12 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.landmark_files import environment, load_landmarks
-from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
 from fisheye_svp_ros.io.parameters import Sweep, parameter, rows, with_values
 from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.rig_files import load_cameras
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import (
@@ -31,12 +32,12 @@ from fisheye_svp_ros.pose import (
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.scene.rigs import BASELINE, STYLES, calibration_poses, rig_from_angle
-from fisheye_svp_ros.simulate.simulation import simulate, simulate_stereo
+from fisheye_svp_ros.simulate.simulation import simulate, simulate_rig, simulate_stereo
 
 MONO = 'mono'
 CALIBRATION = 'calibration'
 # Sweeping one of these may name a file that cannot be read: found out before anything runs.
-_READ_FILES = ('lens', 'environment', 'poses_file')
+_READ_FILES = ('lens', 'environment', 'poses_file', 'rig')
 
 
 @dataclass(frozen=True)
@@ -79,18 +80,24 @@ class Scenario:
         0.0, 'Standard deviation of the noise of image points', 'px', (0.0, 1e3)
     )
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
+    rig: str = parameter(
+        '', 'Cameras in place of `lens` and `style`: a folder or file with their lenses and where '
+        'they stand, as `calibrate` writes it; poses are of the first', file=True
+    )
 
 
 _SETS_PER_BLOCK = 1000  # sets that are simulated at once
 
-SCALARS = tuple(row.name for row in rows(Scenario) if not isinstance(row.default, tuple))
+SCALARS = tuple(row.name for row in rows(Scenario)
+                if not isinstance(row.default, tuple) and row.name != 'rig')
 
 
 class Simulation(NamedTuple):
     """What the cameras of a scenario see.
 
-    observations: one frame a set; poses: of each camera in the world, (P,), one a set, in the
-    order of `observations.cameras`; rig: the left camera in the right one, None for one camera.
+    lens: of the first camera; lenses: of each; observations: one frame a set; poses: of each
+    camera in the world, (P,), one a set, in the order of `observations.cameras`; rig: the left
+    camera in the right one, None for one camera, and for those of a file.
     """
 
     lens: Lens
@@ -98,6 +105,7 @@ class Simulation(NamedTuple):
     observations: Observations
     poses: tuple[Pose, ...]
     rig: Pose | None
+    lenses: tuple[Lens, ...]
 
 
 def simulate_scenario(
@@ -133,15 +141,47 @@ def simulate_in_pieces(
 def _simulate_poses(
     scenario: Scenario, poses: Pose, rng: np.random.Generator, lens: Lens | None = None
 ) -> Simulation:
+    if scenario.rig:
+        return _simulate_rig(scenario, poses, rng)
     lens = true_lens(scenario.lens, scenario.shift_scale) if lens is None else (
         _scaled(lens, scenario.shift_scale))
     landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
     model, sigma = ForwardModel(lens), scenario.noise_px
     if rig is None:
         seen = simulate(model, landmarks, poses, sigma, rng)
-        return Simulation(lens, landmarks, seen, (poses,), None)
+        return Simulation(lens, landmarks, seen, (poses,), None, (lens,))
     seen = simulate_stereo(model, model, landmarks, rig, poses, sigma, rng)
-    return Simulation(lens, landmarks, seen, (poses.compose(rig), poses), rig)
+    return Simulation(lens, landmarks, seen, (poses.compose(rig), poses), rig, (lens, lens))
+
+
+def _simulate_rig(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
+    """Simulate the cameras of a file; poses (P,) of the first of them."""
+    names, lenses, places = scenario_cameras(scenario.rig)
+    lenses = tuple(_scaled(lens, scenario.shift_scale) for lens in lenses)
+    landmarks, count = scenario_landmarks(scenario), len(poses.position)
+    each = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
+    seen = simulate_rig([ForwardModel(lens) for lens in lenses], landmarks, each,
+                        scenario.noise_px, rng, names)
+    return Simulation(lenses[0], landmarks, seen, each, None, lenses)
+
+
+def scenario_cameras(rig: str) -> tuple[tuple[str, ...], tuple[Lens, ...], Pose]:
+    """Return names, lenses and places (C,) in the first one of the cameras of a file or folder.
+
+    Raises LensError where it does not hold all of them.
+    """
+    path = lens_path(rig)
+    return _cameras_of(path, _version(path / 'rig.yaml' if path.is_dir() else path))
+
+
+@lru_cache(maxsize=8)
+def _cameras_of(path: Path, version: int) -> tuple[tuple[str, ...], tuple[Lens, ...], Pose]:
+    names, places = load_cameras(path)
+    held = cameras_in(path)
+    missing = [name for name in names if name not in held]
+    if missing:
+        raise LensError(f'{path}: the rig has the camera {missing[0]}, and there is no lens of it')
+    return names, tuple(load_lens(f'{path}#{name}') for name in names), places
 
 
 def noise_generator(seed: int, number: int, repetition: int = 0) -> np.random.Generator:
@@ -158,12 +198,21 @@ def check_sweep(base: Scenario, sweep: Sweep) -> None:
 
 
 def scalars(scenario: Scenario) -> dict[str, Any]:
-    """Return the parameters of a scenario that are single values, as `scenario` tells them."""
-    return {name: getattr(scenario, name) for name in SCALARS}
+    """Return the parameters of a scenario that are single values, as `scenario` tells them.
+
+    Cameras of a file have lenses of their own: no solver takes that of a scenario for them.
+    """
+    values = {name: getattr(scenario, name) for name in SCALARS}
+    if scenario.rig:
+        del values['lens'], values['style']
+        values['rig'] = scenario.rig
+    return values
 
 
-def camera_names(style: str) -> tuple[str, ...]:
-    """Return the names of the cameras that a style has."""
+def camera_names(style: str, rig: str = '') -> tuple[str, ...]:
+    """Return the names of the cameras that a style has, or the rig of a file."""
+    if rig:
+        return scenario_cameras(rig)[0]
     return ('',) if style == MONO else STEREO
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -58,14 +59,32 @@ def simulate_stereo(
 
     rig: left camera in the right one; poses (S,) of the right camera in the world.
     """
-    views = blank_views(landmarks.ids, landmarks.points, len(poses.position), t)
+    return simulate_rig((left, right), landmarks, (poses.compose(rig), poses), sigma, rng, STEREO,
+                        t=t)
+
+
+def simulate_rig(
+    models: Sequence[ForwardModel],
+    landmarks: Landmarks,
+    poses: Sequence[Pose],
+    sigma: float,
+    rng: np.random.Generator,
+    cameras: tuple[str, ...],
+    *,
+    t: Array | None = None,
+) -> Observations:
+    """Return the image points in the C cameras of a rig, as `simulate` does, in one table.
+
+    models, cameras: of each, and its poses (S,) in the world.
+    """
+    views = blank_views(landmarks.ids, landmarks.points, len(poses[0].position), t)
     seen = [
         add_noise(
             model, predict_points(model, place, views._replace(camera=views.camera + camera)),
             sigma, rng)
-        for camera, (model, place) in enumerate(((left, poses.compose(rig)), (right, poses)))
+        for camera, (model, place) in enumerate(zip(models, poses, strict=True))
     ]
-    return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, STEREO)
+    return _table(np.stack(seen, axis=1), landmarks, sigma, t, None, cameras)
 
 
 class Prediction(NamedTuple):

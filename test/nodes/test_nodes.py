@@ -30,6 +30,7 @@ from fisheye_svp_ros.io.decoding import stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.observations_csv import write_observations
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import camera, messages
 from fisheye_svp_ros.nodes.base import Finished
@@ -195,6 +196,35 @@ def test_a_change_of_parameters_starts_over(graph: Callable[..., Graph]) -> None
     count = len(scenarios)
     g.until(lambda: len(scenarios) > count + 3)
     assert values(scenarios[-1])['radius'] == '0.5'
+
+
+def test_a_rig_of_three_cameras_has_a_namespace_each(
+    ros_domain: int, tmp_path: Path
+) -> None:
+    """A localizer of one of them finds its true pose with its lens."""
+    lens = load_lens(lens_path('fish180'))
+    names = ('front', 'rear', 'top')
+    for number, name in enumerate(names):
+        save_lens(replace(lens, name=name, cx=lens.cx + number), tmp_path / f'{name}.yaml')
+    steps = [Pose(np.eye(3), np.array([0.1 * (i + 1), 0.0, 0.0])) for i in range(2)]
+    save_rig(steps, tmp_path / 'rig.yaml', names)
+    parameters = ('svp:=false', f'rig:={tmp_path}', f'localizer:lens:={tmp_path}/top.yaml',
+                  'rate:=20.0', 'radius:=0.5')
+    g = Graph(*(word for one in parameters for word in ('-p', one)),
+              '-r', 'localizer:image_points:=top/image_points',
+              '-r', 'localizer:true_pose:=top/true_pose')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    infos = [g.hear(CameraInfo, f'{name}/camera_info', LATCHED) for name in names]
+    poses = [g.hear(PoseStamped, f'{name}/true_pose') for name in names]
+    g.start(Localizer)
+    g.start(SyntheticCamera)
+    g.until(lambda: results and all(infos) and all(poses))
+    assert [heard[0].header.frame_id for heard in infos] == [
+        f'{name}_camera_optical_frame' for name in names]
+    assert float(values(results[0])['position_error_m']) < 1e-9
+    first, last = (heard[0].pose.position for heard in (poses[0], poses[2]))
+    assert abs(abs(last.x - first.x) - 0.3) < 1e-9
+    g.close()
 
 
 @pytest.mark.parametrize('lens', ['fish180', 'fish214'])

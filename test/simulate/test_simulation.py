@@ -10,20 +10,22 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
 from fisheye_svp_ros.effects.quantisation import QuantisationEffect
 from fisheye_svp_ros.effects.wrong_ids import WrongIdsEffect
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.landmark_files import environment
-from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.parameters import Sweep
+from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import back_project, project
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import group_views
-from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig
+from fisheye_svp_ros.scene.rigs import calibration_poses, paper_pose, rig, surround_rig
 from fisheye_svp_ros.simulate import scenario
 from fisheye_svp_ros.simulate.scenario import (
     Scenario,
     check_sweep,
+    scalars,
     simulate_in_pieces,
     simulate_scenario,
 )
@@ -190,3 +192,38 @@ def test_a_million_steps_take_little_memory() -> None:
     assert (first, sets) == (0, 1_000_001) and len(piece.poses[0].position) < 10_000
     assert tracemalloc.get_traced_memory()[1] < 200e6
     tracemalloc.stop()
+
+
+def four_cameras(folder):
+    """Write the lenses and the rig of four cameras; return their places in the first one."""
+    rig = surround_rig(4, 0.1)
+    for number in range(4):
+        save_lens(replace(FISH180, name=f'cam{number}', cx=FISH180.cx + number),
+                  folder / f'cam{number}.yaml')
+    steps = [rig.take(i + 1).inverse().compose(rig.take(i)) for i in range(3)]
+    save_rig(steps, folder / 'rig.yaml', tuple(f'cam{i}' for i in range(4)))
+    return rig
+
+
+def test_cameras_of_a_file_see_what_they_would_alone(tmp_path):
+    rig = four_cameras(tmp_path)
+    seen = simulate_scenario(Scenario(rig=str(tmp_path), radius=0.5,
+                                      poses=(0.01, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
+    table = seen.observations
+    assert table.cameras == ('cam0', 'cam1', 'cam2', 'cam3') and seen.rig is None
+    for number, pose in enumerate(seen.poses):
+        expected = seen.poses[0].compose(rig.take([number]))
+        np.testing.assert_allclose(pose.difference(expected), 0, atol=1e-12)
+        rows = table.camera == number
+        image = project(seen.lenses[number], pose.into_body(table.xyz[rows][None])[0])
+        assert seen.lenses[number].cx == FISH180.cx + number
+        assert rows.any() == (number != 2)  # which looks away from all landmarks
+        np.testing.assert_allclose(table.uv[rows], image.uv, atol=1e-9)
+    assert 'lens' not in scalars(Scenario(rig=str(tmp_path)))
+
+
+def test_a_rig_without_a_lens_is_refused(tmp_path):
+    four_cameras(tmp_path)
+    (tmp_path / 'cam2.yaml').unlink()
+    with pytest.raises(LensError, match='the rig has the camera cam2, and there is no lens of it'):
+        simulate_scenario(Scenario(rig=str(tmp_path)))
