@@ -22,11 +22,12 @@ from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors, shared_names
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.of_cameras import OfCameras
-from fisheye_svp_ros.effects.viewpoint_shift import SHIFT_SIGMA, ViewpointShiftEffect
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
 
+SHIFT_SIGMA = 4e-3  # m: of e0 before the data; small lenses that were measured have 1 to 6 mm
 PRIOR_ODDS = 0.3  # of a shift, before the data
 MIN_WEIGHT = PRIOR_ODDS / (1 + PRIOR_ODDS)  # below it the data are evidence against a shift
 

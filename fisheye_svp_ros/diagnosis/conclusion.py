@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -53,12 +53,23 @@ class Conclusion:
 
     def ray_error_mrad(self) -> dict[str, Any]:
         """Return the expected ray errors, mrad, of the worst camera, and of each of several."""
-        each = {camera: {side: [one.in_mrad() for one in found] for side, found in both.items()}
-                for camera, both in self.ray_error.items()}
+        each = {camera: self.ray_error_of(camera) for camera in self.ray_error}
         if len(each) < 2:
             return next(iter(each.values()), {})
         worst = max(each.values(), key=lambda both: both['given'][0]['value'])
         return {**worst, 'cameras': each}
+
+    def ray_error_of(self, camera: str) -> dict[str, list[dict[str, float]]]:
+        """Return the expected ray errors, mrad, of a camera's lens as given and as extended."""
+        return {side: [one.in_mrad() for one in found]
+                for side, found in self.ray_error.get(camera, {}).items()}
+
+    def with_ray_error(self, lens: Lens, camera: str) -> Lens:
+        """Return the extended lens of a camera with its ray errors in its `uncertainty`."""
+        found = self.ray_error_of(camera)
+        if not found:
+            return lens
+        return replace(lens, uncertainty={**(lens.uncertainty or {}), 'ray_error_mrad': found})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the keys of diagnosis.json that are its own."""

@@ -412,11 +412,13 @@ def _conclude(
     lenses = with_uncertainty(
         evaluation.model_errors, averaged.linear, evaluation.noise_px,
         evaluation.uncertainty['image_px']['misfit'], lenses_of)
-    lenses = {name: averaged.with_shift_entry(lens, name) for name, lens in lenses.items()}
     advice = advise(evaluation, causes, significant)
     conclusion = conclude(
         evaluation, causes, components, advice, candidates, problem.inputs.lenses, lenses_of,
         any(pair.verdict == 'contradict' for pair in cameras))
+    lenses = {
+        name: conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
+        for name, lens in lenses.items()}
     return Diagnosis(
         evaluation,
         Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,

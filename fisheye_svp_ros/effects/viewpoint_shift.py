@@ -12,8 +12,6 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import Lens
 
-SHIFT_SIGMA = 4e-3  # m: of e0 before any data; fisheye lenses that were measured have 1 to 6 mm
-
 
 @dataclass(frozen=True)
 class ViewpointShiftEffect(Effect):
@@ -38,12 +36,9 @@ class ViewpointShiftEffect(Effect):
         return tuple(Parameter(f'e{i}', 'm', 0.01) for i in range(self.order))
 
     def prior_sigma(self, scene: Scene) -> Array:
-        """Return those of a shift of such a size at the edge of the field, of each higher order.
-
-        Of e0 a wider one: a shift larger than known ones is to be named, and not something else.
-        """
-        edge = scene.lens.max_incidence ** (2.0 * np.arange(1, self.order))
-        return np.array([self.parameters[0].large, *(SHIFT_SIGMA / edge)])
+        """Return those of a large shift, each order by what it does at the edge of the field."""
+        large = np.array([parameter.large for parameter in self.parameters])
+        return np.asarray(large / scene.lens.max_incidence ** (2.0 * np.arange(self.order)))
 
     def columns(self, scene: Scene) -> Array:
         shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]

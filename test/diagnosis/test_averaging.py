@@ -9,11 +9,15 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
-from fisheye_svp_ros.diagnosis.averaging import PRIOR_ODDS, AveragedModel, OpenShifts
+from fisheye_svp_ros.diagnosis.averaging import (
+    PRIOR_ODDS,
+    SHIFT_SIGMA,
+    AveragedModel,
+    OpenShifts,
+)
 from fisheye_svp_ros.diagnosis.diagnosis import extended_lenses
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
-from fisheye_svp_ros.effects.viewpoint_shift import SHIFT_SIGMA
 from fisheye_svp_ros.optics.curves import Gennery
 
 
@@ -92,6 +96,8 @@ def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() ->
     known, bare = (d.uncertainty['image_px'] for d in (found, closed))
     assert known['parameters'] > bare['parameters']
     assert LensErrors.from_lens(found.lens).model.names[-1] == 'e0'
+    assert found.lens.uncertainty is not None
+    assert found.lens.uncertainty['ray_error_mrad'] == found.conclusion.ray_error_mrad()
 
 
 def test_a_refuted_shift_is_not_written() -> None:
