@@ -18,7 +18,7 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images guided detectors docs bench compare rectification hand-eye kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare rectification hand-eye kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -72,6 +72,10 @@ detectors: $(VENV)/ready
 # goes on where it was interrupted.
 blind-independent: $(VENV)/ready
 	$(BIN)/python -m benchmark.independent --trials 69 -o $(OUT)/blind_independent
+
+# What averaging over a viewpoint shift is worth, into docs/results/averaging.md and a picture.
+averaging: $(VENV)/ready
+	$(BIN)/python -m benchmark.averaging --sets 120
 
 # The live guide tried on rendered images by somebody who holds the board, into docs/results/next/.
 guided: $(VENV)/ready

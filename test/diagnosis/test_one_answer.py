@@ -112,6 +112,8 @@ def test_a_lens_that_half_a_diagnosis_would_make_worse_is_not_recommended(
     assert lens['say'] == 'undecided'
     bound, = (one for one in lens['bound'] if one['effect'] == 'viewpoint_shift')
     assert bound['value'] > 0.0047
+    shift, = found['lens']['averaged_shift']
+    assert shift['weight'] > 0.9 and abs(shift['e0'] - 0.0047) < shift['stderr']
 
 
 @pytest.mark.parametrize('name', SETS)
