@@ -1,6 +1,7 @@
 """Writes what is said about parameters twice: the tables of nodes.md and config/*.yaml.
 
 Both come from the tables in the code; a test compares.  Run: python docs/parameters.py
+What at least `_SHARED` nodes have alike stands in a table of its own.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import re
 import sys
 import textwrap
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,8 @@ from fisheye_svp_ros.io.parameters import Row  # noqa: E402
 from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 
 _TABLE = '<!-- parameters of {node} -->\n{table}<!-- end -->'
+_SHARED = 3  # nodes
+_COMMON = 'several nodes'
 
 
 def markdown(table: list[Row]) -> str:
@@ -30,6 +35,21 @@ def markdown(table: list[Row]) -> str:
         cells = (f'`{row.name}`', f'`{default}`', row.unit, row.constraint(), row.description)
         lines.append('| ' + ' | '.join(cells) + ' |')
     return '\n'.join(lines) + '\n'
+
+
+def common_rows(tables: Iterable[list[Row]]) -> list[Row]:
+    """Return the rows that several nodes have alike, in their order."""
+    counts = Counter(row for table in tables for row in table)
+    return [row for row, count in counts.items() if count >= _SHARED]
+
+
+def node_section(table: list[Row], common: list[Row]) -> str:
+    """Return what nodes.md says of the parameters of one node."""
+    own = [row for row in table if row not in common]
+    names = ', '.join(f'`{row.name}`' for row in table if row in common)
+    shared = textwrap.fill(f'[Of several nodes](#parameters-of-several-nodes): {names}.', 100,
+                           break_long_words=False, break_on_hyphens=False)
+    return '\n'.join([*([markdown(own)] if own else []), *([shared + '\n'] if names else [])])
 
 
 def parameter_file(node: str, table: list[Row]) -> str:
@@ -48,18 +68,19 @@ def parameter_file(node: str, table: list[Row]) -> str:
 def documents() -> dict[Path, str]:
     """Return what the files should hold."""
     page = ROOT / 'docs' / 'reference' / 'nodes.md'
-    text, wanted = page.read_text(encoding='utf-8'), {}
-    for node in NODES:
-        if not (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists():
-            continue
-        table = executables.parameters(node)
+    text = page.read_text(encoding='utf-8')
+    tables = {node: executables.parameters(node) for node in NODES
+              if (ROOT / 'fisheye_svp_ros' / 'nodes' / f'{node}.py').exists()}
+    common = common_rows(tables.values())
+    sections = {node: node_section(table, common) for node, table in tables.items()}
+    for node, section in {_COMMON: markdown(common), **sections}.items():
         pattern = re.escape(_TABLE.format(node=node, table='\0')).replace('\0', '.*?')
-        new = _TABLE.format(node=node, table=markdown(table))
+        new = _TABLE.format(node=node, table=section)
         text, found = re.subn(pattern, lambda _, new=new: new, text, flags=re.DOTALL)
         if not found:
             raise SystemExit(f'docs/reference/nodes.md has no place for the parameters of {node}')
-        wanted[ROOT / 'config' / f'{node}.yaml'] = parameter_file(node, table)
-    return {**wanted, page: text}
+    return {page: text, **{ROOT / 'config' / f'{node}.yaml': parameter_file(node, table)
+                           for node, table in tables.items()}}
 
 
 def _yaml(value: Any) -> str:

@@ -2,8 +2,8 @@
 
 import re
 
-_LONGEST = 1500  # characters; what is quoted may be a whole file
-_UNPRINTED = re.compile(r'\s*[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\s*')
+_MAX_LENGTH = 1500  # characters; what is quoted may be a whole file
+_CONTROL_CHARACTERS = re.compile(r'\s*[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\s*')
 
 
 class FisheyeSvpError(Exception):
@@ -11,9 +11,9 @@ class FisheyeSvpError(Exception):
 
     def __init__(self, text: object = '') -> None:
         text = str(text)
-        if len(text) > _LONGEST:
-            text = f'{text[:_LONGEST // 2]} ... {text[-_LONGEST // 2:]}'
-        super().__init__(_UNPRINTED.sub(' ', text))
+        if len(text) > _MAX_LENGTH:
+            text = f'{text[:_MAX_LENGTH // 2]} ... {text[-_MAX_LENGTH // 2:]}'
+        super().__init__(_CONTROL_CHARACTERS.sub(' ', text))
 
 
 class LensError(FisheyeSvpError):

@@ -233,15 +233,15 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 def project(lens: AnyLens, points: Array) -> Image:
     """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
-    return forward.project(load_lens(lens), _last_of(3, points, 'points'))
+    return forward.project(load_lens(lens), _check_last_axis(3, points, 'points'))
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
     """Return the rays of image points (..., 2), px: origin (0, 0, s(theta)), unit direction."""
-    return forward.back_project(load_lens(lens), _last_of(2, uv, 'uv'))
+    return forward.back_project(load_lens(lens), _check_last_axis(2, uv, 'uv'))
 
 
-def _last_of(size: int, values: Array, name: str) -> Array:
+def _check_last_axis(size: int, values: Array, name: str) -> Array:
     numbers = np.asarray(values, dtype=float)
     if numbers.shape[-1:] != (size,):
         raise ParameterError(f'{name} has the shape {numbers.shape}; (..., {size}) is needed')

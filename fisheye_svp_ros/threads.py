@@ -31,7 +31,7 @@ def single_threaded(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """
 
     @wraps(function)
-    def limited(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+    def wrapper(*args: _P.args, **kwargs: _P.kwargs) -> _R:
         if any(os.environ.get(name) for name in VARIABLES) or not find_spec('threadpoolctl'):
             return function(*args, **kwargs)
         from threadpoolctl import threadpool_limits
@@ -39,4 +39,4 @@ def single_threaded(function: Callable[_P, _R]) -> Callable[_P, _R]:
         with threadpool_limits(1, user_api='blas'):
             return function(*args, **kwargs)
 
-    return limited
+    return wrapper

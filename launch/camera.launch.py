@@ -6,7 +6,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from fisheye_svp_ros.nodes.launching import (
     COMMON,
     arguments,
-    composed,
+    compose_nodes,
     file_arguments,
     node,
     value,
@@ -32,7 +32,7 @@ def nodes(context):
         if value(context, frame):
             given[name][word] = value(context, frame)
     if value(context, 'composed') == 'true':
-        return [composed(context, given, topics)]
+        return [compose_nodes(context, given, topics)]
     return [node(context, name, own, topics) for name, own in given.items()]
 
 

@@ -12,7 +12,7 @@ from helpers.photographs import BOARD, LENS, photograph, poses, true_corners, wr
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands import notes
-from fisheye_svp_ros.commands.watch import _for_people
+from fisheye_svp_ros.commands.watch import _display_unit
 
 
 def test_photographs_are_searched_as_by_the_command(tmp_path: Path) -> None:
@@ -72,10 +72,10 @@ def test_lenses_of_a_rig_do_not_go_into_a_folder_called_yaml(
 
 
 def test_people_read_mm_and_degrees() -> None:
-    assert _for_people('position_error_m') == ('position_error_mm', 1000.0)
-    name, scale = _for_people('rotation_error_rad')
+    assert _display_unit('position_error_m') == ('position_error_mm', 1000.0)
+    name, scale = _display_unit('rotation_error_rad')
     assert (name, round(scale, 3)) == ('rotation_error_deg', 57.296)
-    assert _for_people('rms_px') == ('rms_px', 1.0)
+    assert _display_unit('rms_px') == ('rms_px', 1.0)
 
 
 def test_the_note_on_formats_comes_once_a_day(

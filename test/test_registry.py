@@ -59,7 +59,7 @@ class Trefoil(Effect):
         return Parameter('cosine', 'px', 1.0), Parameter('sine', 'px', 1.0)
 
     def columns(self, scene):
-        x, y = np.moveaxis(scene.normalised(), -1, 0)
+        x, y = np.moveaxis(scene.normalized_uv(), -1, 0)
         wave = (x + 1j * y) ** 3
         outward = np.stack([x, y], axis=-1)
         return np.stack([wave.real[..., None] * outward, wave.imag[..., None] * outward], axis=-1)

@@ -30,7 +30,7 @@ _START = """
 import sys, time
 begun = time.perf_counter()
 from fisheye_svp_ros.nodes import executables
-kind = executables._kind(sys.argv[1])
+kind = executables._node_class(sys.argv[1])
 import rclpy
 rclpy.init(args=['--ros-args', '-p', 'lens:=fish214', '-p', 'board:=chessboard:9x6:25mm'])
 node = kind()

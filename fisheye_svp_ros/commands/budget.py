@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> None:
 
     from fisheye_svp_ros.io.files import write_json
     from fisheye_svp_ros.io.share import lens_path
-    from fisheye_svp_ros.reporting.budget_report import Asked, answer, document, draw, rows
+    from fisheye_svp_ros.reporting.budget_report import BudgetRequest, answer, document, draw, rows
     from fisheye_svp_ros.reporting.progress import progress
     from fisheye_svp_ros.reporting.tables import print_table
     from fisheye_svp_ros.scene.rigs import rig
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> None:
         budget = make_budget(Setup(lens, rig(args.style, args.baseline), args.noise))
     points = at_point(budget, spread, args.working_range, limits)
     given = frozenset(name for name, value in limits.items() if value is not None)
-    asked = Asked(lens.name, spread, args.working_range, given,
+    asked = BudgetRequest(lens.name, spread, args.working_range, given,
                   lens.port is not None, bool(budget.own))
     print_table(
         f'{lens.name}: landmarks within {np.degrees(spread):.0f} degrees of the axis, at '

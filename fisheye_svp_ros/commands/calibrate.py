@@ -114,10 +114,10 @@ def run(args: argparse.Namespace) -> None:
             say(warning)
     lenses = {camera: one.lens for camera, one in found.items()}
     if len(lenses) > 1:
-        calibrate_cameras(_joined([one.table for one in found.values()]), lenses, args.output)
+        calibrate_cameras(_join_tables([one.table for one in found.values()]), lenses, args.output)
 
 
-def _joined(tables: Sequence[Observations]) -> Observations:
+def _join_tables(tables: Sequence[Observations]) -> Observations:
     """Return the rows of several tables of the same cameras."""
     rows: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables])
             for name in ('frame', 'landmark', 'uv', 'xyz', 'camera', 'board', 't', 'sigma')}
@@ -147,13 +147,13 @@ def _calibrate_camera(
     note_huge(table)
     air = load_with_notes(args.lens) if args.lens else None
 
-    def fitted(rows: Observations) -> Calibration:
+    def fit_rows(rows: Observations) -> Calibration:
         if air and port:
             return calibrate_port(rows, air, port, args.free)
         return calibrate(rows, args.model, size, args.free, name, port)
 
     with progress('calibrating'):
-        result, kept, gross = calibrate_without_outliers(table, fitted)
+        result, kept, gross = calibrate_without_outliers(table, fit_rows)
     note_gross_errors(table, gross)
     hand_eye = None
     if args.poses:

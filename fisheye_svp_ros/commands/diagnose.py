@@ -168,7 +168,7 @@ def _print(
     """Print what the first screen of the report says, and the photographs to take next."""
     from fisheye_svp_ros.reporting import external_text, shot_list
     from fisheye_svp_ros.reporting.diagnosis_report import command_to_go_on
-    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED
+    from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
     from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
     from fisheye_svp_ros.reporting.tables import print_lines, print_table
 
@@ -179,11 +179,11 @@ def _print(
         *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis))])
     if wanted:
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
-                    shot_list.rows(wanted), words=shot_list.WORDS)
+                    shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
     if args.output:
         files = ['report.html', 'diagnosis.json']
         if diagnosis.offers_extended:
-            files += [str(Path(camera) / EXTENDED) for camera in diagnosis.lenses]
+            files += [str(Path(camera) / LENS_FILE) for camera in diagnosis.lenses]
         files += ['rig.yaml'] * bool(diagnosis.rig_chain)
         print(f'{args.output}: {", ".join(files)}, residuals.csv')
 
@@ -201,7 +201,7 @@ def _write(
     wanted: NextViews | None,
 ) -> None:
     from fisheye_svp_ros.reporting.diagnosis_report import write_report
-    from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED, not_offered
+    from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
     from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
     folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.model)
@@ -211,7 +211,7 @@ def _write(
         document['next'] = wanted.to_list()
     write_json(folder / 'diagnosis.json', document)
     for camera, lens in diagnosis.lenses.items():
-        save_lens(lens, folder / camera / EXTENDED, not_offered(diagnosis))
+        save_lens(lens, folder / camera / LENS_FILE, refusal_reason(diagnosis))
     if diagnosis.rig_chain:
         cameras, rig = diagnosis.rig_chain
         save_rig(rig, folder / 'rig.yaml', cameras)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _MAX_LISTED = 12
 _UNCERTAIN = 0.9
-_LARGER = 0.2  # of all boards; a wrong count is seen where the next squares are lit and in sight
+_MIN_LARGER_SHARE = 0.2  # of all boards: a wrong count shows where the next squares are visible
 _TIME = re.compile(r'([\d.]+) *(s|ms|us|ns)')
 _UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
@@ -178,7 +178,7 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
             f'{100 * _UNCERTAIN:.0f} % sure, since {args.board} looks the same when turned')
     found = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
-    if larger and larger >= _LARGER * found:
+    if larger and larger >= _MIN_LARGER_SHARE * found:
         say(f'{larger} of {found} boards look larger than {args.board}, which counts inner '
             'corners: count them again, or corners are not the same ones in all photographs')
     if 2 * found < len(detection.searched):

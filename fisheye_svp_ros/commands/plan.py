@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> None:
             write_json(args.output / 'plan.json',
                        {'photographs': wanted.to_list(), 'stderr': planned.stderr})
     print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
-                shot_list.HEADER, shot_list.rows(wanted), words=shot_list.WORDS)
+                shot_list.HEADER, shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
     print('  standard errors to expect: '
           + ', '.join(f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
                       for name, error in planned.stderr.items()))

@@ -24,7 +24,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import make_observations
-from fisheye_svp_ros.simulate.render import Exposure, Field, Placed, Print, render
+from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
 Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
@@ -103,7 +103,7 @@ def _cameras(given: str) -> Cameras:
 
 
 def _random_poses(
-    cameras: Cameras, boards: tuple[Placed, ...], args: argparse.Namespace,
+    cameras: Cameras, boards: tuple[BoardPose, ...], args: argparse.Namespace,
     rng: np.random.Generator,
 ) -> Pose:
     """Return poses (P,) of the first camera; the cameras of a rig look at the target in turn."""
@@ -127,7 +127,7 @@ def parabola(corners: Array, height: float) -> Field:
 
 
 def write_photographs(
-    cameras: Cameras, boards: tuple[Placed, ...], poses: Pose, exposure: Exposure, seed: int,
+    cameras: Cameras, boards: tuple[BoardPose, ...], poses: Pose, exposure: Exposure, seed: int,
     folder: Path, truth: Path,
 ) -> int:
     """Write photographs from poses (P,) of the first camera, and the truth; return how many.

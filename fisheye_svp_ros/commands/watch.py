@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> None:
         watcher.destroy_node()
 
 
-def _for_people(name: str) -> tuple[str, float]:
+def _display_unit(name: str) -> tuple[str, float]:
     """Return the name of a metric with the unit that people read, and the factor to it."""
     for unit, (shown, scale) in _UNITS.items():
         if name.endswith(f'_{unit}'):
@@ -62,7 +62,7 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
         lost = f', {results.lost} not solved ({results.note})' if results.lost else ''
         table.add_row(node, f'{results.sets} sets{lost}')
         for name, metric in results.metrics.items():
-            shown, scale = _for_people(name)
+            shown, scale = _display_unit(name)
             values = metric.latest, metric.total / metric.count, metric.largest
             table.add_row('', shown, *(f'{scale * value:.6g}' for value in values))
     return table

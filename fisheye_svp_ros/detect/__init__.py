@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(1 << 26))
 
 
-class _Room(ModuleType):
+class _CallablePackage(ModuleType):
     """A package that is a function of the library, too: both have the name `detect`."""
 
     def __call__(
@@ -44,4 +44,4 @@ class _Room(ModuleType):
                       source=', '.join(paths), sync=sync)
 
 
-sys.modules[__name__].__class__ = _Room
+sys.modules[__name__].__class__ = _CallablePackage

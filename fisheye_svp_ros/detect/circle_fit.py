@@ -131,7 +131,7 @@ def _fit_circles(
         & (np.abs(contrast) > CONTRAST * judged.noise)
         & ((problem.weight * cut.inside).sum(axis=1) > 0.95 * problem.weight.sum(axis=1))
     )
-    sigma, ok = judged.common(ok)
+    sigma, ok = judged.shrink_sigma(ok)
     return Corners(uv, sigma if known else sigma + np.nan, blur, -contrast, ok)
 
 
@@ -160,9 +160,9 @@ class _Problem(WindowProblem):
         turn, size, _ = np.linalg.svd(radius * np.swapaxes(self._axes, -1, -2))
         matrix = (turn / size[:, None]) @ np.swapaxes(turn, -1, -2)
         values[:, 2:5] = matrix.reshape(-1, 4)[:, [0, 1, 3]]
-        return self.lit(values, 6)
+        return self.fit_brightness(values, 6)
 
-    def lost(self, values: Array) -> Mask:
+    def outside_domain(self, values: Array) -> Mask:
         return np.asarray((np.abs(values[:, 5]) > 3)
                           | (np.linalg.det(_matrix(values)) <= 0))
 

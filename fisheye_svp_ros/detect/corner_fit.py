@@ -67,7 +67,7 @@ def fit_corners(
         & (np.abs(np.sin(values[:, 2] - values[:, 3])) > 0.17)
         & (problem.weight.sum(axis=1) > 0.7 * np.pi * radius**2)
     )
-    sigma, ok = judged.common(ok)
+    sigma, ok = judged.shrink_sigma(ok)
     return Corners(uv, sigma, blur, contrast, ok)
 
 
@@ -94,9 +94,9 @@ class _Problem(WindowProblem):
             normal = np.stack([along[:, 1], -along[:, 0]], axis=-1)
             normal *= np.sign((normal * other).sum(axis=1, keepdims=True))
             values[:, 2 + edge] = np.arctan2(normal[:, 1], normal[:, 0])
-        return self.lit(values, 8)
+        return self.fit_brightness(values, 8)
 
-    def lost(self, values: Array) -> Mask:
+    def outside_domain(self, values: Array) -> Mask:
         return np.asarray(np.abs(values[:, 6:8]).max(axis=1) > 4)
 
     def model(self, values: Array, index: Index) -> tuple[Array, Array]:

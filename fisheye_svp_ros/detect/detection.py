@@ -15,12 +15,12 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.effort import Effort, Look
 from fisheye_svp_ros.detect.extent import goes_on
-from fisheye_svp_ros.detect.finders import FIRST_LOOKS, at_inverted, default_detector
+from fisheye_svp_ros.detect.finders import FIRST_LOOKS, default_detector, invert_image
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
-from fisheye_svp_ros.detect.points import OVER_EXPOSED, Points, find_points, full_scale_share
+from fisheye_svp_ros.detect.points import SATURATED_SHARE, Points, find_points, full_scale_share
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
@@ -133,8 +133,8 @@ def detect(
 
     search(tasks())
     postponed = [number for number, task in enumerate(begun)
-                 if task.look is Look.FIRST and results[number].points is None]
-    if effort.found:
+                 if task.look is Look.FIRST_SEARCH and results[number].points is None]
+    if effort.has_found_board:
         search((begun[number]._replace(look=effort.look(number, True))
                 for number in postponed), postponed)
     searched = _add_notes(_one_size([results[number] for number in sorted(results)]))
@@ -193,17 +193,17 @@ def examine(task: _Task) -> SearchedPhotograph:
 def _look(pixels: Pixels, task: _Task) -> tuple[Points | str, bool]:
     """Return what `find_points` does, and whether the board is found inverted alone."""
     _, pattern, detector, look = task
-    if look is Look.FIRST:
+    if look is Look.FIRST_SEARCH:
         return find_points(pixels, pattern, detector, finder=FIRST_LOOKS[detector]), False
-    if look is Look.INVERTED:
-        points = find_points(pixels, pattern, detector, finder=at_inverted(FIRST_LOOKS[detector]))
+    if look is Look.INVERTED_IMAGE:
+        points = find_points(pixels, pattern, detector, finder=invert_image(FIRST_LOOKS[detector]))
         if isinstance(points, Points):
             return points, True
     points = find_points(pixels, pattern, detector)
     if look is not Look.SAMPLE or isinstance(points, str):
         return points, False
     own, inverted = (find_points(pixels, pattern, detector, finder=finder) for finder in (
-        FIRST_LOOKS[detector], at_inverted(FIRST_LOOKS[detector])))
+        FIRST_LOOKS[detector], invert_image(FIRST_LOOKS[detector])))
     return points, isinstance(own, str) and isinstance(inverted, Points)
 
 
@@ -240,7 +240,7 @@ def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, 
         notes = list(one.notes)
         if one.points.blur > max(_BLUR_LIMITS, _BLUR_LIMITS * blur):
             notes.append(f'blurred by {one.points.blur:.1f} px')
-        if one.bright > OVER_EXPOSED:
+        if one.bright > SATURATED_SHARE:
             notes.append(f'over-exposed: {100 * one.bright:.0f} % of the board at full scale')
         for other in (o for o in done if o.points is not None and o.camera == one.camera):
             if one.digest == other.digest:

@@ -15,10 +15,10 @@ _FIRST_ONES, _ONE_OF = 3, 24  # photographs that are searched thoroughly in any 
 class Look(Enum):
     """What is done with a photograph; SAMPLE: thorough, and whether the board is inverted."""
 
-    FIRST = 'first'
+    FIRST_SEARCH = 'first'
     SAMPLE = 'sample'
     THOROUGH = 'thorough'
-    INVERTED = 'inverted'
+    INVERTED_IMAGE = 'inverted'
 
 
 class Effort:
@@ -30,7 +30,7 @@ class Effort:
         self._found = self._inverted = 0
 
     @property
-    def found(self) -> bool:
+    def has_found_board(self) -> bool:
         """Whether any photograph showed the board."""
         return self._found > 0
 
@@ -43,7 +43,7 @@ class Effort:
         """Return how to look at a photograph; repeatable: it can be read once more."""
         if not self._has_first_look:
             return Look.THOROUGH
-        if self.found:
-            return Look.INVERTED if self._inverted == self._found else Look.THOROUGH
+        if self.has_found_board:
+            return Look.INVERTED_IMAGE if self._inverted == self._found else Look.THOROUGH
         sample = number < _FIRST_ONES or number % _ONE_OF == 0 or not repeatable
-        return Look.SAMPLE if sample else Look.FIRST
+        return Look.SAMPLE if sample else Look.FIRST_SEARCH

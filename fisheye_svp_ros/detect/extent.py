@@ -11,10 +11,10 @@ from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.detect.points import Points
 
 # By three corners of a line, how far a parabola gets one and a half squares before the first
-_BEYOND = np.array([35.0, -42.0, 15.0]) / 8
-_ALIKE = 0.35  # of the step from dark to bright
-_MOST = 0.8  # of the squares of a side
-_FEWEST = 3
+_EXTRAPOLATION = np.array([35.0, -42.0, 15.0]) / 8
+_CONTRAST_TOLERANCE = 0.35  # of the step from dark to bright
+_MIN_MATCH_SHARE = 0.8  # of the squares of a side
+_MIN_SQUARES = 3
 _SMOOTHING = 1.0  # px
 
 
@@ -36,14 +36,14 @@ def _side_goes_on(image: Array, grid: Array) -> bool:
     """Do so for the side of the first row of a grid (R, C, 2), px."""
     middles = (grid[:, 1:] + grid[:, :-1]) / 2
     inside = (middles[0] + middles[1]) / 2
-    beyond = np.tensordot(_BEYOND, middles[:3], axes=1)
+    beyond = np.tensordot(_EXTRAPOLATION, middles[:3], axes=1)
     own, next_ones = _light(image, inside), _light(image, beyond)
     known = np.isfinite(own) & np.isfinite(next_ones)
-    if known.sum() < _FEWEST:
+    if known.sum() < _MIN_SQUARES:
         return False
     own, next_ones = own[known], next_ones[known]
     step = np.ptp(own)
-    return bool((np.abs(next_ones - own) < _ALIKE * step).mean() >= _MOST)
+    return bool((np.abs(next_ones - own) < _CONTRAST_TOLERANCE * step).mean() >= _MIN_MATCH_SHARE)
 
 
 def _light(image: Array, uv: Array) -> Array:

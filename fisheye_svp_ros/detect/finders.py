@@ -55,7 +55,7 @@ def _search_scaled(find: Finder) -> Finder:
     return search
 
 
-def at_inverted(find: Finder) -> Finder:
+def invert_image(find: Finder) -> Finder:
     """Return a finder that searches the inverted image."""
     return lambda image, pattern: find(np.asarray(255 - image, np.uint8), pattern)
 

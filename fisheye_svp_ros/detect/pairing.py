@@ -57,26 +57,26 @@ def pair_photographs(
     if len(set(cameras)) < 2:
         return Pairing(own)
     if np.isfinite(t).all():
-        joined, apart = _nearest(names, t, SYNC if sync is None else sync)
-        return Pairing(joined, 'stamp', apart, _alone(joined, names))
-    way, alone = 'name', _alone(own, names)
+        joined, apart = _pair_by_stamp(names, t, SYNC if sync is None else sync)
+        return Pairing(joined, 'stamp', apart, _count_unpaired(joined, names))
+    way, alone = 'name', _count_unpaired(own, names)
     if len(alone) == len(own):
         numbers = [['', *_NUMBER.findall(key)][-1] for key in own]
         counted = tuple(number.lstrip('0') or '0' for number in numbers)
         each = list(zip(cameras, counted, strict=True))
         if all(0 < len(one) <= _DIGITS for one in numbers) and len({*each}) == len(each) and (
-                len(_alone(counted, names)) < len(own)):
-            own, way, alone = counted, 'number', _alone(counted, names)
+                len(_count_unpaired(counted, names)) < len(own)):
+            own, way, alone = counted, 'number', _count_unpaired(counted, names)
     return Pairing(own, way, 0.0, alone)
 
 
-def _nearest(cameras: Index, t: Array, sync: float) -> tuple[tuple[str, ...], float]:
+def _pair_by_stamp(cameras: Index, t: Array, sync: float) -> tuple[tuple[str, ...], float]:
     """Return the keys of moments, and how far, s, the stamps of one are apart at most."""
     moment, apart = np.arange(len(t)), 0.0  # by the photograph that stands for it
     leaders = moment[:0]
     for camera in sorted(set(cameras.tolist())):
         mine = np.flatnonzero(cameras == camera)
-        for theirs, own in _near(t, leaders, mine, sync):
+        for theirs, own in _runs_of_stamps(t, leaders, mine, sync):
             away = np.abs(t[own, None] - t[theirs])
             # Squares keep the order where many are within reach of one another.
             cost = np.where(away > sync, _FORBIDDEN, away / sync) ** 2
@@ -88,7 +88,9 @@ def _nearest(cameras: Index, t: Array, sync: float) -> tuple[tuple[str, ...], fl
     return tuple(map(str, moment.tolist())), apart
 
 
-def _near(t: Array, one: Index, other: Index, sync: float) -> Iterator[tuple[Index, Index]]:
+def _runs_of_stamps(
+    t: Array, one: Index, other: Index, sync: float
+) -> Iterator[tuple[Index, Index]]:
     """Yield photographs of both cameras in runs whose stamps follow within `sync`, s."""
     both = np.concatenate([one, other])
     order = np.argsort(t[both], kind='stable')
@@ -98,7 +100,7 @@ def _near(t: Array, one: Index, other: Index, sync: float) -> Iterator[tuple[Ind
             yield both[run[first]], both[run[~first]]
 
 
-def _alone(keys: Sequence[str], cameras: Index) -> tuple[int, ...]:
+def _count_unpaired(keys: Sequence[str], cameras: Index) -> tuple[int, ...]:
     of_key: dict[str, set[str]] = {}
     for key, camera in zip(keys, cameras.tolist(), strict=True):
         of_key.setdefault(key, set()).add(camera)

@@ -23,7 +23,7 @@ from fisheye_svp_ros.detect.one_view import imaging
 from fisheye_svp_ros.detect.patterns import Pattern, local_axes
 from fisheye_svp_ros.detect.photographs import Pixels
 
-OVER_EXPOSED = 0.02  # of a board's pixels at the end of the scale
+SATURATED_SHARE = 0.02  # of a board's pixels at the end of the scale
 _MIN_SHARE = 0.5  # of the points found must turn out to be what the pattern says
 _MARGIN = 0.3  # of its size, around the place where a board was last
 _GLANCE = 350  # px, of these surroundings; without a board larger ones take up to half a second
@@ -89,7 +89,7 @@ def _search(
     elif len(index) == len(pattern.points):
         uv = _fix_handedness(uv, pattern)
     measured = _measure(pixels, index, uv, pattern, detector, censored=True)
-    if isinstance(measured, str) and full_scale_share(pixels, uv) > OVER_EXPOSED:
+    if isinstance(measured, str) and full_scale_share(pixels, uv) > SATURATED_SHARE:
         # Where little light is left within the scale, only its end tells where an edge is: too far
         # on the dark side, but on both sides of a corner, or all around a circle, alike.
         again = _measure(pixels, index, uv, pattern, detector, censored=False)

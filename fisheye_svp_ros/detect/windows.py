@@ -67,7 +67,7 @@ class FitQuality(NamedTuple):
     gain2: Array
     freedom: Array
 
-    def common(self, ok: Mask) -> tuple[Array, Mask]:
+    def shrink_sigma(self, ok: Mask) -> tuple[Array, Mask]:
         """Return sigma (N,) drawn towards the noise of all that are ok (N,), and which still are.
 
         Something else is in the windows of the others.
@@ -130,10 +130,10 @@ class WindowProblem(ABC):
         """Return what windows (A, P) look like, and derivatives (A, P, U)."""
 
     @abstractmethod
-    def lost(self, values: Array) -> Mask:
+    def outside_domain(self, values: Array) -> Mask:
         """Return which states (A, U) are outside the domain."""
 
-    def lit(self, values: Array, at: int) -> Array:
+    def fit_brightness(self, values: Array, at: int) -> Array:
         """Return states (N, U) with what suits a window best at `at`: brightness and contrast."""
         values[:, at + 1] = 1.0
         (shape, _), weight = self.model(values, np.arange(len(values))), self.weight
@@ -148,7 +148,7 @@ class WindowProblem(ABC):
         """Return the states (N, U) of least squares, from a start."""
         return levenberg_marquardt(self, (values,), _ITERATIONS).state[0]
 
-    def parts(self, values: Array, index: Index) -> tuple[Array, Array, Array]:
+    def linearize(self, values: Array, index: Index) -> tuple[Array, Array, Array]:
         """Return residuals (A, P), derivatives of the model (A, P, U) and weights (A, P)."""
         image, jacobian = self.model(values, index)
         residual = self.cut.data[index] - image
@@ -158,13 +158,13 @@ class WindowProblem(ABC):
 
     def linearise(self, state: Arrays, index: Index) -> tuple[Array, Arrays]:
         with np.errstate(**IN_SILENCE):
-            residual, jacobian, weight = self.parts(state[0], index)
+            residual, jacobian, weight = self.linearize(state[0], index)
         weight = weight / self._noise[index, None] ** 2
         transposed = np.swapaxes(jacobian * weight[..., None], -1, -2)
         hessian = transposed @ jacobian
         gradient = -(transposed @ residual[..., None])[..., 0]
         cost = (weight * residual**2).sum(axis=1)
-        return np.where(self.lost(state[0]) | ~np.isfinite(cost), np.inf, cost), (
+        return np.where(self.outside_domain(state[0]) | ~np.isfinite(cost), np.inf, cost), (
             hessian, gradient)
 
     def retract(self, state: Arrays, step: Arrays) -> Arrays:
@@ -177,7 +177,7 @@ class WindowProblem(ABC):
         from one to the other counts; halos of sharpening are the same on both, and move nothing.
         """
         cut = self.cut
-        residual, jacobian, weight = self.parts(values, np.arange(len(values)))
+        residual, jacobian, weight = self.linearize(values, np.arange(len(values)))
         weighted = np.swapaxes(jacobian * weight[..., None], -1, -2)
         hessian, pull = weighted @ jacobian, (weighted @ residual[..., None])[..., 0]
         scale = np.sqrt(np.maximum(np.einsum('nii->ni', hessian), 1e-30))
@@ -192,7 +192,7 @@ class WindowProblem(ABC):
         whole = np.zeros((len(values), 2 + _EACH, cut.side**2))
         whole[..., cut.round] = np.concatenate([weight[:, None], residual[:, None], noise], axis=1)
         if symmetric:
-            share, left = _odd_part(whole, values[:, :2], cut.side)
+            share, left = _antisymmetric_residuals(whole, values[:, :2], cut.side)
         else:
             share, left = whole[:, :1], whole[:, 1:]
         products = (share * left) @ np.swapaxes(left, -1, -2)
@@ -256,7 +256,7 @@ def _unit_noise(side: int) -> Array:
     return np.asarray(smooth.reshape(_PROBES, -1))
 
 
-def _odd_part(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
+def _antisymmetric_residuals(windows: Array, corner: Array, side: int) -> tuple[Array, Array]:
     """Return weights (N, 1, P), and the parts of residuals (N, K, P) odd about corners (N, 2), px.
 
     windows (N, 1 + K, P): weights, then residuals.

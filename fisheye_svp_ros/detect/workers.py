@@ -44,7 +44,7 @@ class _Worker:
         self.pipe.send(function)
         self.number, self.deadline = -1, 0.0
 
-    def give(self, number: int, item: Any, seconds: float) -> None:
+    def assign_item(self, number: int, item: Any, seconds: float) -> None:
         self.number, self.deadline = number, time.monotonic() + seconds
         with suppress(ConnectionError):  # of a process that has died; whoever listens hears so
             self.pipe.send(item)
@@ -69,7 +69,7 @@ def bounded_map(
         while True:
             while len(busy) < (os.cpu_count() or 1) and (item := next(waiting, None)):
                 busy.append(_Worker(function))
-                busy[-1].give(*item, fresh)
+                busy[-1].assign_item(*item, fresh)
             if not busy:
                 return
             remaining = min(worker.deadline for worker in busy) - time.monotonic()
@@ -90,7 +90,7 @@ def bounded_map(
                     busy.remove(worker)
                     worker.stop()
                 else:
-                    worker.give(*following, seconds)
+                    worker.assign_item(*following, seconds)
     finally:
         for worker in busy:
             worker.stop()
@@ -111,7 +111,7 @@ class BoundedCalls:
 
     def start(self, item: Any, seconds: float) -> None:
         """Start a call, which may take so long; none may be under way."""
-        self._worker.give(self._worker.number + 1, item, seconds)
+        self._worker.assign_item(self._worker.number + 1, item, seconds)
         self._busy = True
 
     def result(self) -> Any:
@@ -138,7 +138,7 @@ class BoundedCalls:
 
     def _replace(self) -> None:
         self._worker = _Worker(self._function)
-        self._worker.give(0, self._first, _START)
+        self._worker.assign_item(0, self._first, _START)
         self._busy = True
 
 

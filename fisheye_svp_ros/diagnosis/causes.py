@@ -70,7 +70,7 @@ def parameters_of(effect: Effect, values: Array, errors: Array) -> dict[str, dic
     """Return value, standard error and unit of each parameter (P,) of an effect, by name."""
     return {
         p.name: {'value': float(v), 'stderr': float(e), 'unit': p.unit}
-        for p, v, e in zip(effect.parameters, effect.reported(values), errors, strict=True)
+        for p, v, e in zip(effect.parameters, effect.report_values(values), errors, strict=True)
     }
 
 

@@ -17,9 +17,9 @@ from fisheye_svp_ros.diagnosis.selection import Selection, without_cause
 from fisheye_svp_ros.effects.base import Effect
 
 _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
-REFUTED = 'held-out frames refute it'
+REFUTED_BY_FRAMES = 'held-out frames refute it'
 REFUTED_BY_FILE = 'the held-out file refutes it'
-NOTHING = 'it gains nothing on held-out frames beyond its error'
+NO_GAIN = 'it gains nothing on held-out frames beyond its error'
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def weakest_cause(evaluation: Evaluation) -> Doubt | None:
 def _refutation(change: HeldOutChange) -> str:
     if change.z > 1:
         return ''
-    return REFUTED if change.z < -1 else NOTHING
+    return REFUTED_BY_FRAMES if change.z < -1 else NO_GAIN
 
 
 def _confounded_pairs(tests: EffectTests) -> list[tuple[str, Index, list[str]]]:
@@ -132,7 +132,7 @@ def confirm(
         evaluation = evaluate(selection)
         doubt = weakest_cause(evaluation)
         if doubt is None:
-            return evaluation, _with_refused(selection, candidates)
+            return evaluation, _add_refused_causes(selection, candidates)
         effect, columns, values = next(
             cause for cause in selection.causes if cause[0].name == doubt.effect)
         test = EffectTests(selection.null).test_removal(
@@ -141,11 +141,11 @@ def confirm(
             doubt.effect, parameters_of(effect, values, evaluation.errors[columns]), test.p_value,
             doubt.why)
         selection = without_cause(selection, doubt.effect)
-        if doubt.why in (REFUTED, REFUTED_BY_FILE):
+        if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE):
             selection = replace(selection, refuted=(*selection.refuted, doubt.effect))
 
 
-def _with_refused(
+def _add_refused_causes(
     selection: Selection, found: Mapping[str, UnconfirmedCause]
 ) -> list[UnconfirmedCause]:
     """Return also what was significant in the selection and did not predict better."""
@@ -154,5 +154,5 @@ def _with_refused(
     for step in selection.trace:
         if (not step.accepted and step.why.endswith('does not predict better')
                 and step.name not in causes and step.name not in every):
-            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, NOTHING)
+            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, NO_GAIN)
     return list(every.values())

@@ -14,8 +14,8 @@ PhotographsAnswer = Literal['enough', 'more', 'retake']
 _OFF_P = 0.02  # of the ray error by what is stated: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
-_ENOUGH = 8  # frames
-_MANY = 0.1  # of the frames
+_MIN_FRAMES = 8  # frames
+_MAX_REJECTED_SHARE = 0.1  # of the frames
 
 
 class Figure(NamedTuple):
@@ -159,10 +159,10 @@ def decide_lens(facts: LensFacts) -> Decision:
         return Decision(
             'undecided', f'{hint.effect} is likely but not confirmed: it may cost up to '
             f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
-    return Decision('keep', _kept(bounds, off), gained, 0.95, bounds)
+    return Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
 
 
-def _kept(bounds: Sequence[Bound], off: LensOffset | None) -> str:
+def _keep_text(bounds: Sequence[Bound], off: LensOffset | None) -> str:
     worst = max(bounds, key=lambda one: one.edge_px, default=None)
     cost = '' if worst is None else (
         f'; what these data do not exclude costs at most {worst.edge_px:.2g} px '
@@ -237,16 +237,16 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     """Return what to do about the photographs."""
     times = facts.heldout_px / max(facts.scatter_px, 1e-9)
     figure = Figure('held_out_over_noise', times, '1')
-    if facts.bad and len(facts.bad) >= _MANY * facts.frames:
+    if facts.bad and len(facts.bad) >= _MAX_REJECTED_SHARE * facts.frames:
         return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
                         'others or are wrong as a whole', figure, None)
-    if facts.frames < _ENOUGH:
-        return Decision('more', f'{facts.frames} frames are few; take {_ENOUGH} or more',
+    if facts.frames < _MIN_FRAMES:
+        return Decision('more', f'{facts.frames} frames are few; take {_MIN_FRAMES} or more',
                         figure, None)
     if facts.lens == 'undecided':
         return Decision('more', 'the lens is undecided; --next 6 says which views decide it',
                         figure, None)
-    if len(facts.unlike) >= _MANY * facts.frames:
+    if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
         return Decision('more', f'{len(facts.unlike)} of {facts.frames} show what no other does',
                         figure, None)
     return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times the noise',

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, together
+from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, combine_cameras
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
 from fisheye_svp_ros.solve.rig_state import Linearization
 
@@ -100,7 +100,7 @@ def simplest_form(kind: type[Effect], linear: Linearization) -> Effect:
     """
     first = [forms[0] for forms in _forms(kind, linear)]
     own = [effect for effect in first if isinstance(effect, OfCameras)]
-    return together(own) if own else first[0]
+    return combine_cameras(own) if own else first[0]
 
 
 def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
@@ -142,7 +142,8 @@ def _common_forms(
         if isinstance(effect, OfCameras):
             alike.setdefault(effect.parts[0][2].key, []).append((effect, own))
     return [
-        (together([effect for effect, _ in forms]), np.concatenate([own for _, own in forms]))
+        (combine_cameras([effect for effect, _ in forms]),
+         np.concatenate([own for _, own in forms]))
         for forms in alike.values() if len(forms) == cameras
     ]
 
@@ -158,7 +159,7 @@ def _longest_pauses(steps: Sequence[Effect]) -> list[Effect]:
 def smooth_fields(linear: Linearization) -> dict[str, Array]:
     """Generic smooth fields (F, M, P) over each variable, at the image stage."""
     scene, views = linear.scene, linear.data.views
-    m = scene.normalised()
+    m = scene.normalized_uv()
     scale = max(float(np.nanmax(np.abs(m[views.used]))), 1e-9)
     x, y = np.moveaxis(np.nan_to_num(m / scale), -1, 0)
     theta = np.nan_to_num(scene.theta / scene.theta_max)
@@ -201,7 +202,7 @@ def intrinsic_walks(linear: Linearization) -> tuple[Array, Array]:
     path = np.cos(np.pi * waves * (place[:, None] + 0.5) / count)
     mine = data.camera_of[:, None] == np.arange(data.cameras)
     moves = (path[..., None] * mine[:, None]).reshape(len(path), -1)
-    growth = np.nan_to_num(scene.normalised())[..., None]
+    growth = np.nan_to_num(scene.normalized_uv())[..., None]
     step = np.concatenate([growth, np.broadcast_to(np.eye(2), (*growth.shape[:-1], 2))], axis=-1)
     columns = step[..., None] * moves[:, None, None, None]
     roughness = np.tile(np.repeat(waves**4.0, data.cameras), step.shape[-1])

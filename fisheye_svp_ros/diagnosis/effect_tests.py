@@ -119,7 +119,7 @@ class EffectTests:
             score = self.score(remaining, columns)
             if not score.rank or _is_negative(effect, score) or effect.per_frame > per_frame:
                 continue
-            if effect.absurd(score.estimate, null.linear.scene):
+            if effect.is_implausible(score.estimate, null.linear.scene):
                 continue
             gain, count = score.statistic, score.rank
             if effect.per_frame:  # what it is in single frames is one variance

@@ -75,7 +75,7 @@ def with_uncertainty(
 
 def _numbers(lens: Lens) -> dict[str, float]:
     """Return all numbers of a lens: of its curves, its corrections and those of its target."""
-    target = Target.of(lens.target, lens.name)
+    target = Target.from_entries(lens.target, lens.name)
     terms = (*ForwardModel(lens).terms, *(target.terms if target else ()))
     return {**lens.parameters, **{
         name: float(value) for term in terms for name, value in
@@ -186,7 +186,7 @@ class LensErrors:
     def linearize(self, views: Views, pose: Pose) -> Linearization:
         """Linearise views of this lens, with the numbers that are uncertain free."""
         model = ForwardModel(self.lens)
-        views, terms = model.labelled(views), model.terms_for(views)
+        views, terms = model.assign_boards(views), model.terms_for(views)
         bare = replace(self.lens, corrections={}, target={})
         own = [name for name in self.model.names if name in bare.parameters]
         state = RigState(pose, identity(1), bare, terms)

@@ -33,10 +33,10 @@ from fisheye_svp_ros.solve.ray_errors import (
 )
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared
 
-_BOUNDED = ('viewpoint_shift', 'sensor_tilt', 'decentering')
+_BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
 _EDGE = 0.9  # of the points by incidence angle: beyond is the edge
-_NEAR = 1  # of ray_errors.RANGES: 1 m
+_NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 LensesOf = Callable[[RigState], Mapping[str, Lens]]
 
@@ -115,15 +115,15 @@ def find_bounds(null: NullModel) -> list[Bound]:
         if effect.budget_stage() == 'target':
             columns.append(mine)
             prior.append(null.prior_precision(mine, effect))
-        elif effect.name in _BOUNDED and not null.effect_kinds & set(effect.kinds) and (
+        elif effect.name in _BOUNDED_EFFECTS and not null.effect_kinds & set(effect.kinds) and (
                 effect.name not in smallest or len(mine) < len(smallest[effect.name][1])):
             smallest[effect.name] = effect, mine
-    return [_bound(null, effect, mine, np.concatenate([*columns, mine]),
+    return [_bound_of(null, effect, mine, np.concatenate([*columns, mine]),
                    np.concatenate([*prior, null.prior_precision(mine, effect)]))
             for effect, mine in smallest.values()]
 
 
-def _bound(null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array) -> Bound:
+def _bound_of(null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array) -> Bound:
     information, count, scale = null.information, len(mine), null.scale[mine]
     inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
     value = (inverse @ information[every, -1])[-count:] / scale
@@ -179,13 +179,13 @@ def find_lens_rays(
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
 
-        def extended(step: Array, name: str = name) -> Lens:
+        def extend_lens(step: Array, name: str = name) -> Lens:
             shared = np.zeros(len(of_lens))
             shared[of_lens] = step
             return lenses_of(linear.state.retract(linear.free, frames, shared))[name]
 
         uv = typical_points(views.uv[mine])
-        model, there = ray_model(extended, covariance, uv)
+        model, there = ray_model(extend_lens, covariance, uv)
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
@@ -204,8 +204,8 @@ def _difference(model: RayModel, points: Array) -> Array:
 
 def _offset(model: RayModel, off: Sequence[Array], given: Lens, uv: Array) -> LensOffset:
     """Return how far a lens is off the nearer of two fits, and how often chance does as much."""
-    nearer = min(_rms(one[_NEAR]) for one in off)
-    expected = model.sample()[_NEAR]
+    nearer = min(_rms(one[_NEAR_RANGE]) for one in off)
+    expected = model.sample()[_NEAR_RANGE]
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
@@ -227,8 +227,8 @@ def _stated_sample(lens: Lens, uv: Array) -> Array | None:
     known = {'f': lens.fx, **lens.parameters}
     values = np.array([known[name] for name in stated.names])
 
-    def changed(step: Array) -> Lens:
+    def perturb_lens(step: Array) -> Lens:
         return lens.with_parameters(stated.names, [*(values + step).tolist()])
 
-    sample: Array = ray_model(changed, stated.covariance, uv)[0].sample(seed=1)[_NEAR]
+    sample: Array = ray_model(perturb_lens, stated.covariance, uv)[0].sample(seed=1)[_NEAR_RANGE]
     return sample

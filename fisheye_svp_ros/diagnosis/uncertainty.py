@@ -76,7 +76,7 @@ def _reporting_matrix(null: NullModel) -> Array:
     found = np.eye(len(null.scale))
     for effect, columns, _ in null.terms:
         scale = null.scale[columns]
-        own = effect.reported(np.eye(len(columns)))
+        own = effect.report_values(np.eye(len(columns)))
         found[np.ix_(columns, columns)] = scale[:, None] * own / scale
     return found
 

@@ -22,11 +22,11 @@ class AspectEffect(PlaneEffect):
     parameters = (Parameter('relative', '1', 0.01),)
 
     def plane_columns(self, scene: Scene) -> Array:
-        return np.asarray((scene.normalised() * [0.5, -0.5])[..., None])
+        return np.asarray((scene.normalized_uv() * [0.5, -0.5])[..., None])
 
     def extend(self, lens: Lens, values: Array) -> Lens:
         half = float(values[0]) / 2
         return replace(lens, fx=lens.fx * (1 + half), fy=lens.fy * (1 - half))
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         return values

@@ -30,7 +30,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.scene.observations import Views
 
-_ABSURD = 30.0  # times what would be a large value of a parameter
+_MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
 STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 
 
@@ -101,10 +101,10 @@ class Scene:
                 twist[order] = _velocities(self.pose.take(order), self.times[order])
         return twist
 
-    def normalised(self) -> Array:
+    def normalized_uv(self) -> Array:
         """Image points (S, N, 2) relative to the principal point, over the focal length."""
         if self.cameras:
-            return gather_rows([(rows, own.normalised()) for rows, _, own in self.cameras])
+            return gather_rows([(rows, own.normalized_uv()) for rows, _, own in self.cameras])
         centre, focal = (self.lens.cx, self.lens.cy), (self.lens.fx, self.lens.fy)
         return np.asarray((self.uv - np.array(centre)) / np.array(focal))
 
@@ -164,19 +164,19 @@ class Effect(ABC):
         """Return standard deviations (P,) of the values about 0 before any data; inf: unknown."""
         return np.full(len(self.parameters), np.inf)
 
-    def absurd(self, values: Array, scene: Scene) -> bool:
+    def is_implausible(self, values: Array, scene: Scene) -> bool:
         """Whether there can be no such values (P,), whatever the data say.
 
         A scale that poses take up all but entirely would have to be a hundred per cent.
         """
         sizes = zip(values, self.parameters, strict=True)
-        return all(abs(value) > _ABSURD * parameter.large for value, parameter in sizes)
+        return all(abs(value) > _MAX_PLAUSIBLE * parameter.large for value, parameter in sizes)
 
-    def curved(self, lens: Lens, values: Array) -> Lens:
+    def with_curves(self, lens: Lens, values: Array) -> Lens:
         """Return the lens with what this effect adds to its curves; others leave them alone."""
         return lens
 
-    def reported(self, values: Array) -> Array:
+    def report_values(self, values: Array) -> Array:
         """Return values (P, ...) without what something else that is free takes up."""
         return values
 
@@ -190,7 +190,7 @@ class Effect(ABC):
 
         Raises LensError where the lens holds another form of the same effect.
         """
-        curved = self.curved(lens, values)
+        curved = self.with_curves(lens, values)
         if curved is not lens and IMAGE_HEIGHTS.name_of(type(curved.image_height)):
             return curved
         held: Mapping[str, Any] = getattr(lens, self.place)
@@ -203,14 +203,14 @@ class Effect(ABC):
         changes: dict[str, Any] = {self.place: {**held, self.name: self.to_dict(values)}}
         return replace(lens, **changes)
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         """Return the values that leave the effect what it is when fx and fy grow by a ratio.
 
         What changes the curves grows with them, what moves image points stays what it is, in px.
         """
         return values
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         """Return the form that holds this one and another of the same effect."""
         return other
 
@@ -243,7 +243,7 @@ class Effect(ABC):
     def key(self) -> str:
         """A short name of this form, unique within a data set."""
         parts = [
-            f'{f.name}={_short(getattr(self, f.name))}' for f in fields(self)
+            f'{f.name}={_shorten(getattr(self, f.name))}' for f in fields(self)
             if f.metadata.get('key', True)
         ]
         return f'{self.name}({", ".join(parts)})' if parts else self.name
@@ -252,7 +252,7 @@ class Effect(ABC):
         """Return structure and values as the lens YAML holds them."""
         names = [parameter.name for parameter in self.parameters]
         numbers = dict(zip(names, map(float, values), strict=True))
-        structure = {name: _plain(value) for name, value in asdict(self).items()}
+        structure = {name: _to_json(value) for name, value in asdict(self).items()}
         return {**structure, 'parameters': numbers}
 
     @classmethod
@@ -289,7 +289,7 @@ class PlaneEffect(Effect):
         focal = np.array([scene.lens.fx, scene.lens.fy])
         return np.asarray(self.plane_columns(scene) * focal[:, None])
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         return values / ratio
 
 
@@ -308,7 +308,7 @@ class NoiseEffect(Effect):
         """Factor (S, N) on the standard deviation of the noise."""
         return 1.0
 
-    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
+    def record_points(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         """Return noisy image points (S, N, 2), px, NaN for none, as a table would have them."""
         return uv
 
@@ -358,16 +358,16 @@ def _velocities(pose: Pose, t: Array) -> Array:
     return np.asarray((d0 * h1 + d1 * h0) / (h0 + h1) + offset * 2 * (d1 - d0) / (h0 + h1))
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     if isinstance(value, tuple):
-        shown = ' '.join(_short(item) for item in value[:4])
+        shown = ' '.join(_shorten(item) for item in value[:4])
         return shown + (' ...' if len(value) > 4 else '')
     return f'{value:.4g}' if isinstance(value, float) else str(value)
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [_to_json(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 

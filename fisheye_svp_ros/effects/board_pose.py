@@ -39,7 +39,7 @@ class BoardPoseEffect(Effect):
         forms: list[Effect] = [cls((one,)) for one in others]
         return forms if len(others) == 1 else [cls(tuple(others)), *forms]
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         return replace(self, boards=tuple(dict.fromkeys((*self.boards, *other.boards))))
 
     @property

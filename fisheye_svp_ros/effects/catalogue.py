@@ -14,7 +14,7 @@ from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.registry import Registry
 
-_OWN = (  # modules of this folder, each with the effect of its name: DotCentroidEffect and so on
+_MODULES = (  # of this folder, each with the effect of its name: DotCentroidEffect and so on
     'viewpoint_shift', 'radial_profile', 'focal_length', 'principal_point', 'aspect', 'skew',
     'decentering', 'sensor_tilt', 'flat_port', 'focal_drift', 'session_step', 'landmark_survey',
     'landmark_scale', 'target_shape', 'board_pose', 'dot_centroid', 'detector_bias',
@@ -30,7 +30,7 @@ def _effect(name: str) -> type[Effect]:
 
 
 CATALOGUE: Registry[type[Effect]] = Registry(
-    'effects', {name: _effect(name) for name in _OWN}, Effect)
+    'effects', {name: _effect(name) for name in _MODULES}, Effect)
 
 
 def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:

@@ -23,7 +23,7 @@ class DecenteringEffect(PlaneEffect):
     parameters = (Parameter('p1', '1', 0.005), Parameter('p2', '1', 0.005))
 
     def plane_columns(self, scene: Scene) -> Array:
-        x, y = np.moveaxis(scene.normalised(), -1, 0)
+        x, y = np.moveaxis(scene.normalized_uv(), -1, 0)
         r2 = x * x + y * y
         p1 = np.stack([2 * x * y, r2 + 2 * y * y], axis=-1)
         p2 = np.stack([r2 + 2 * x * x, 2 * x * y], axis=-1)

@@ -13,7 +13,7 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.boards import spacing
 
 _RIM = 12  # points on the rim of the dot whose image is taken as a polygon
-_EQUAL = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon the disc's moments
+_RIM_SCALE = np.sqrt(3 / (2 + np.cos(2 * np.pi / _RIM)))  # gives the polygon the disc's moments
 _PROBE = 0.02  # radius of the probing dot over its distance: small, yet far above rounding
 
 
@@ -36,7 +36,7 @@ class DotCentroidEffect(Effect):
 
     parameters = (Parameter('radius_squared', 'm^2', 1e-4, positive=True),)
 
-    def absurd(self, values: Array, scene: Scene) -> bool:
+    def is_implausible(self, values: Array, scene: Scene) -> bool:
         """Whether the dots would reach the centres of their neighbours on every board."""
         views = scene.views
         places = [views.points[views.used & (views.board == board.id)]
@@ -57,7 +57,7 @@ class DotCentroidEffect(Effect):
             angle = 2 * np.pi * np.arange(_RIM) / _RIM
             rim = np.cos(angle)[:, None] * board.axes[0] + np.sin(angle)[:, None] * board.axes[1]
             turned = rim @ scene.pose.rotation[np.nonzero(mine)[0]]
-            points = in_camera[mine][:, None] + (_EQUAL * radius)[:, None, None] * turned
+            points = in_camera[mine][:, None] + (_RIM_SCALE * radius)[:, None, None] * turned
             centre = project(scene.lens, in_camera[mine], limited=False).uv
             bias = _polygon_centroid(project(scene.lens, points, limited=False).uv) - centre
             column[mine] = np.nan_to_num(bias / (radius**2)[:, None])[..., None]

@@ -30,9 +30,9 @@ def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = N
             lens = replace(lens, target={LANDMARKS: rows})
     # All effects were found at the same focal length, so that their order does not matter.
     images = [term for term in terms if term[0].stage == 'image']
-    ratio = reduce(_extended, images, lens).focal / lens.focal
-    refocused = [(effect, effect.refocused(values, ratio)) for effect, values in terms]
-    lens = reduce(_extended, sorted(refocused, key=lambda term: term[0].stage == 'ray'), lens)
+    ratio = reduce(_extend_lens, images, lens).focal / lens.focal
+    refocused = [(effect, effect.rescale_values(values, ratio)) for effect, values in terms]
+    lens = reduce(_extend_lens, sorted(refocused, key=lambda term: term[0].stage == 'ray'), lens)
     if curve_limit(lens) < lens.max_incidence:
         lens = replace(lens, max_incidence=monotone_limit(lens))
     return lens
@@ -40,11 +40,11 @@ def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = N
 
 def curved_lens(lens: Lens, terms: Iterable[Term]) -> Lens:
     """Return a lens with what effects add to its curves; its field ends where they do."""
-    curved = reduce(lambda one, term: term[0].curved(one, term[1]), terms, lens)
+    curved = reduce(lambda one, term: term[0].with_curves(one, term[1]), terms, lens)
     if curved is lens:
         return lens
     return replace(curved, max_incidence=min(lens.max_incidence, curve_limit(curved)))
 
 
-def _extended(lens: Lens, term: Term) -> Lens:
+def _extend_lens(lens: Lens, term: Term) -> Lens:
     return term[0].extend(lens, term[1])

@@ -44,5 +44,5 @@ class FlatPortEffect(Effect):
         shift = FlatPort(1.0, self.refractive_index).columns(scene.theta)[..., :1]
         return np.stack([shift, np.zeros_like(shift)], axis=-2)
 
-    def curved(self, lens: Lens, values: Array) -> Lens:
+    def with_curves(self, lens: Lens, values: Array) -> Lens:
         return lens.with_shift(FlatPort(float(values[0]), self.refractive_index))

@@ -50,7 +50,7 @@ class FocalDriftEffect(PlaneEffect):
 
     def plane_columns(self, scene: Scene) -> Array:
         powers = np.nan_to_num(self._polynomials(scene.times))
-        return np.asarray(scene.normalised()[..., None] * powers[:, None, None, :])
+        return np.asarray(scene.normalized_uv()[..., None] * powers[:, None, None, :])
 
     def _polynomials(self, t: Array) -> Array:
         x = np.clip(2 * (t - self.start) / self.duration - 1, -1, 1)

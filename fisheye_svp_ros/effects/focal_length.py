@@ -20,11 +20,11 @@ class FocalLengthEffect(PlaneEffect):
     parameters = (Parameter('relative', '1', 0.02),)
 
     def plane_columns(self, scene: Scene) -> Array:
-        return scene.normalised()[..., None]
+        return scene.normalized_uv()[..., None]
 
     def extend(self, lens: Lens, values: Array) -> Lens:
         growth = 1 + float(values[0])
         return replace(lens, fx=lens.fx * growth, fy=lens.fy * growth)
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         return values

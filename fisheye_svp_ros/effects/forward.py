@@ -95,7 +95,7 @@ class ForwardModel:
             lens = lens[0]
         own = load_effects(lens.corrections, lens.name) if terms is None else terms
         self.terms = tuple(own)
-        self._target = Target.of(lens.target, lens.name) if terms is None else None
+        self._target = Target.from_entries(lens.target, lens.name) if terms is None else None
         self._given = lens
         self.lens = curved_lens(lens, self.terms)
 
@@ -123,7 +123,7 @@ class ForwardModel:
             return self
         return ForwardModel(self._given, self.terms)
 
-    def still(self) -> ForwardModel:
+    def without_motion(self) -> ForwardModel:
         """Return the model of a camera that does not move; itself where that is the same."""
         kept = tuple(term for term in self.terms if not term[0].of_motion)
         if len(kept) == len(self.terms):
@@ -137,9 +137,9 @@ class ForwardModel:
         target = self.seeing(views)._target
         return self.terms if target is None else (*self.terms, *target.terms)
 
-    def labelled(self, views: Views) -> Views:
+    def assign_boards(self, views: Views) -> Views:
         """Return views with the landmarks of the lens's target on the boards that they are of."""
-        return views if self._target is None else self._target.labelled(views)
+        return views if self._target is None else self._target.assign_boards(views)
 
     @property
     def noise_terms(self) -> list[tuple[NoiseEffect, Array]]:
@@ -159,7 +159,7 @@ class ForwardModel:
         """
         if self.plain:
             return camera.project(self.lens, pose.into_body(views.points), limited)
-        linear = self._through(pose, views, limited)
+        linear = self._linearize(pose, views, limited)
         return Image(linear.uv, linear.valid)
 
     def linearise(self, pose: Pose, views: Views) -> LinearViews:
@@ -168,7 +168,7 @@ class ForwardModel:
         The derivatives leave out that image and detector effects vary over the image: `d_pose` and
         `through` have it for a solver, which else does not come to rest where points have errors.
         """
-        return self._through(pose, views, limited=False)
+        return self._linearize(pose, views, limited=False)
 
     def d_pose(self, linear: LinearViews, views: Views) -> Array:
         """Return derivatives (S, N, 2, 6) by the pose, with how effects vary over the image."""
@@ -189,11 +189,11 @@ class ForwardModel:
         """Return the derivatives (S, N, 2, 2) of the displacements of a stage by image points."""
         scene = Scene(views, self.lens, linear.pose, uv, linear.image.incidence)
 
-        def moved(step: Array) -> Array:
-            return np.asarray(self._moved(replace(scene, uv=uv + step), stage))
+        def displace(step: Array) -> Array:
+            return np.asarray(self._displace(replace(scene, uv=uv + step), stage))
 
-        steps = _STEP * np.eye(2)
-        return np.stack([moved(step) - moved(-step) for step in steps], axis=-1) / (2 * _STEP)
+        moves = [displace(step) - displace(-step) for step in _STEP * np.eye(2)]
+        return np.stack(moves, axis=-1) / (2 * _STEP)
 
     def back_project(self, uv: Array) -> Rays:
         """Return the rays of image points (S, N, 2), px, in the camera frame."""
@@ -204,7 +204,7 @@ class ForwardModel:
         pose = identity(len(uv))
         for _ in range(4):
             scene = Scene(views, self.lens, pose, ideal)
-            ideal = uv - self._moved(scene, 'image') - self._moved(scene, 'detector')
+            ideal = uv - self._displace(scene, 'image') - self._displace(scene, 'detector')
         return camera.back_project(self.lens, ideal)
 
     def scene(self, pose: Pose, views: Views, linear: LinearViews) -> Scene:
@@ -271,10 +271,10 @@ class ForwardModel:
             columns[rows] = block
         return columns
 
-    def _through(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
+    def _linearize(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
         if self.cameras:
             return self._by_camera(pose, views, limited)
-        views = self.labelled(views)
+        views = self.assign_boards(views)
         points = self._seen_points(pose, views)
         ideal, valid, d_pose = engines.linearise_views(self.lens, *pose, points, limited)
         linear = LinearViews(ideal, valid, d_pose, ideal, ideal, self.lens, pose, points, limited)
@@ -283,12 +283,12 @@ class ForwardModel:
         uv = [ideal]
         for stage in ('image', 'detector'):
             scene = Scene(views, self.lens, pose, uv[-1], linear.image.incidence)
-            uv.append(uv[-1] + self._moved(scene, stage))
+            uv.append(uv[-1] + self._displace(scene, stage))
         return replace(linear, uv=uv[2], optical=uv[1])
 
     def _by_camera(self, pose: Pose, views: Views, limited: bool) -> LinearViews:
         parts = tuple(
-            CameraViews(rows, i, model._through(pose.take(rows), views.take(rows), limited))
+            CameraViews(rows, i, model._linearize(pose.take(rows), views.take(rows), limited))
             for rows, i, model in self.split(views))
         uv, d_pose, ideal, optical, points = (
             gather_rows([(rows, getattr(own, name)) for rows, _, own in parts])
@@ -301,11 +301,11 @@ class ForwardModel:
         """Return the points (S, N, 3), m, where target and pose effects make them be seen."""
         points = views.points
         if self._acts('target', 'pose'):
-            points = points + self._moved(Scene(views, self.lens, pose, views.uv), 'target')
+            points = points + self._displace(Scene(views, self.lens, pose, views.uv), 'target')
         if self._acts('pose'):
             # When a row was exposed depends on where the point is seen: predict that first.
             seen = camera.project(self.lens, pose.into_body(points), limited=False).uv
-            move = np.asarray(self._moved(Scene(views, self.lens, pose, seen), 'pose'))
+            move = np.asarray(self._displace(Scene(views, self.lens, pose, seen), 'pose'))
             turn = rotation_from_vector(-move[..., 3:])
             place = pose.position[..., None, :]
             points = place + (turn @ (points - place - move[..., :3])[..., None])[..., 0]
@@ -316,7 +316,7 @@ class ForwardModel:
         terms = self.terms if self._target is None else (*self.terms, *self._target.terms)
         return any(effect.stage in stages for effect, _ in terms)
 
-    def _moved(self, scene: Scene, stage: str) -> Array | float:
+    def _displace(self, scene: Scene, stage: str) -> Array | float:
         moved: Array | float = 0.0
         for effect, values in self.terms:
             if effect.stage == stage:

@@ -37,7 +37,7 @@ class LandmarkSurveyEffect(Effect):
             raise Untestable(f'no landmark is seen {MIN_VIEWS} times')
         return [cls(tuple(int(i) for i in often), everywhere=True)]
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         if other.everywhere:
             return other
         return replace(self, landmarks=tuple(dict.fromkeys((*self.landmarks, *other.landmarks))))

@@ -65,11 +65,11 @@ class OfCameras(Effect):
             start = stop
         return None
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         known = {number: (label, effect) for number, label, effect in self.parts}
         for number, label, effect in other.parts:
             if number in known:
-                effect = known[number][1].joined(effect)
+                effect = known[number][1].merge_with(effect)
             known[number] = label, effect
         return type(self)(tuple((number, *known[number]) for number in sorted(known)))
 
@@ -87,7 +87,7 @@ def by_camera(camera: int, label: str, effects: Iterable[Effect]) -> Sequence[Of
     return [of_cameras(type(effect))(((camera, label, effect),)) for effect in effects]
 
 
-def together(effects: Sequence[OfCameras]) -> OfCameras:
+def combine_cameras(effects: Sequence[OfCameras]) -> OfCameras:
     """Return forms of one effect of different cameras as one, its parameters in their order."""
     return type(effects[0])(tuple(part for effect in effects for part in effect.parts))
 

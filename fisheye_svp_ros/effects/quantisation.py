@@ -23,5 +23,5 @@ class QuantisationEffect(NoiseEffect):
 
     parameters = (Parameter('step', 'px', 1.0),)
 
-    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
+    def record_points(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         return np.asarray(np.round(uv / values[0]) * values[0])

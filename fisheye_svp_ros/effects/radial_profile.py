@@ -13,7 +13,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene
 from fisheye_svp_ros.optics.lens import Lens
 
-_MOST = 8  # polynomials
+_MAX_TERMS = 8  # polynomials
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,10 @@ class RadialProfileEffect(Effect):
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
         own, limit = len(scene.lens.image_height.coefficient_names), round(scene.theta_max, 6)
-        finest = cls(_MOST, limit, own % _MOST + 1)
+        finest = cls(_MAX_TERMS, limit, own % _MAX_TERMS + 1)
         return [*(cls(terms, limit) for terms in (1, 2, 4)), finest]
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         return replace(other, terms=max(self.terms, other.terms),
                        first=min(self.first, other.first))
 
@@ -51,12 +51,12 @@ class RadialProfileEffect(Effect):
         height = height[..., self.first - 1 :]
         return np.stack([np.zeros_like(height), height], axis=-2)
 
-    def curved(self, lens: Lens, values: Array) -> Lens:
+    def with_curves(self, lens: Lens, values: Array) -> Lens:
         every = np.concatenate([np.zeros(self.first - 1), values])
         change = ChebyshevHeight(self.theta_max, tuple((every / lens.focal).tolist()))
         return replace(lens, image_height=lens.image_height.plus(change))
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         return values * ratio
 
 

@@ -49,7 +49,7 @@ class RigFlexEffect(Effect):
         labels = [f't{i + 1}' for i in range(self.degree)] or [f'f{f}' for f in self.frames]
         return tuple(Parameter(f'{a}_{label}', 'rad', 0.01) for label in labels for a in 'xyz')
 
-    def reported(self, values: Array) -> Array:
+    def report_values(self, values: Array) -> Array:
         """Take the mean of single frames away: that is how the rig stands."""
         if self.degree:
             return values

@@ -23,5 +23,5 @@ class SensorTiltEffect(PlaneEffect):
     parameters = (Parameter('about_x', 'rad', 0.01), Parameter('about_y', 'rad', 0.01))
 
     def plane_columns(self, scene: Scene) -> Array:
-        m = scene.normalised()
+        m = scene.normalized_uv()
         return np.stack([m * m[..., 1:], -m * m[..., :1]], axis=-1)

@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, Untestable
 
-_MOST = 32  # starts at pauses, and as many more, evenly spread
+_MAX_STARTS = 32  # starts at pauses, and as many more, evenly spread
 _PAUSE = 2.0  # times the median time between instants
 _STEP = (('relative', '1', 0.01), ('cx', 'px', 5.0), ('cy', 'px', 5.0))
 
@@ -48,19 +48,19 @@ class SessionStepEffect(Effect):
         return [cls((float(start),), timed) for start in _starts(instants)]
 
     def beside_intrinsics(self, scene: Scene) -> Effect:
-        return replace(self, means=tuple(self._after(scene).mean(axis=0).tolist()))
+        return replace(self, means=tuple(self._step_design(scene).mean(axis=0).tolist()))
 
     def holds_for(self, t: Array, known: Array) -> bool:
         return self.timed and super().holds_for(t, known)
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         means: dict[float, float] = {}
         for step in (self, other):
             none = (0.0,) * len(step.starts)
             means |= zip(step.starts, step.means or none, strict=True)
         return replace(self, starts=tuple(means), means=tuple(means.values()))
 
-    def refocused(self, values: Array, ratio: float) -> Array:
+    def rescale_values(self, values: Array, ratio: float) -> Array:
         return np.asarray((values.reshape(-1, len(_STEP)) / [ratio, 1.0, 1.0]).ravel())
 
     @property
@@ -73,14 +73,14 @@ class SessionStepEffect(Effect):
 
     def columns(self, scene: Scene) -> Array:
         focal = np.array([scene.lens.fx, scene.lens.fy])
-        growth = (scene.normalised() * focal)[..., None]
+        growth = (scene.normalized_uv() * focal)[..., None]
         shift = np.broadcast_to(np.eye(2), (*scene.uv.shape, 2))
         step = np.concatenate([growth, shift], axis=-1)
-        after = self._after(scene) - (self.means or 0.0)
+        after = self._step_design(scene) - (self.means or 0.0)
         columns = step[..., None, :] * after[:, None, None, :, None]
         return np.asarray(columns.reshape(*scene.uv.shape, len(self.parameters)))
 
-    def _after(self, scene: Scene) -> Array:
+    def _step_design(self, scene: Scene) -> Array:
         """Return 1.0 where views (S,) come after the starts (K,), 0.0 where before: (S, K)."""
         instant = scene.times if self.timed else scene.views.frame
         return np.asarray(instant[:, None] >= np.array(self.starts), dtype=float)
@@ -89,9 +89,9 @@ class SessionStepEffect(Effect):
 def _starts(instants: Array) -> Array:
     """Return the instants to ask for: of a recording of many every few, and those after pauses."""
     starts, pauses = instants[2:-1], np.diff(instants)[1:-1]
-    if len(starts) <= 2 * _MOST:
+    if len(starts) <= 2 * _MAX_STARTS:
         return starts
-    after = np.argsort(-pauses, kind='stable')[:_MOST]
+    after = np.argsort(-pauses, kind='stable')[:_MAX_STARTS]
     after = after[pauses[after] > _PAUSE * np.median(pauses)]
-    spread = np.linspace(0, len(starts) - 1, _MOST).round().astype(int)
+    spread = np.linspace(0, len(starts) - 1, _MAX_STARTS).round().astype(int)
     return np.asarray(starts[np.union1d(after, spread)])

@@ -25,5 +25,5 @@ class SkewEffect(PlaneEffect):
 
     def plane_columns(self, scene: Scene) -> Array:
         column = np.zeros((*scene.uv.shape, 1))
-        column[..., 0, 0] = scene.normalised()[..., 1]
+        column[..., 0, 0] = scene.normalized_uv()[..., 1]
         return column

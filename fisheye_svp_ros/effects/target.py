@@ -20,7 +20,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.scene.observations import Observations, Views, group_views
 
 LANDMARKS = 'landmarks'
-_SAME_PLACE = 1e-5  # m; no two targets are told apart by less
+_POSITION_TOLERANCE = 1e-5  # m; no two targets are told apart by less
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Target:
     points: Array
 
     @classmethod
-    def of(cls, entries: Mapping[str, Any], where: str) -> Target | None:
+    def from_entries(cls, entries: Mapping[str, Any], where: str) -> Target | None:
         """Return the target of a lens from its `target` mapping; None where that is empty.
 
         Raises LensError, naming `where` and the entry, for one that is impossible.
@@ -56,7 +56,7 @@ class Target:
         ids, first = np.unique(table[:, 0].astype(np.int64), return_index=True)
         return cls(terms, ids, table[first, 1].astype(np.int64), table[first, 2:])
 
-    def labelled(self, views: Views) -> Views:
+    def assign_boards(self, views: Views) -> Views:
         """Return views with the target's landmarks on the boards that they belong to.
 
         Those that it was found without are where the views say; where these have no boards, or
@@ -97,7 +97,7 @@ class Target:
         slot = np.searchsorted(self.landmark, views.landmark).clip(max=len(self.landmark) - 1)
         known = self.landmark[slot] == views.landmark
         off = np.abs(self.points[slot] - views.points).max(axis=-1)
-        return slot, known, known & (off < _SAME_PLACE)
+        return slot, known, known & (off < _POSITION_TOLERANCE)
 
 
 def landmark_rows(seen: Observations) -> list[list[float]]:
@@ -114,11 +114,11 @@ def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Obs
     """
     if rows is None:
         return seen
-    target, views = Target.of({LANDMARKS: rows}, seen.source), group_views(seen)
+    target, views = Target.from_entries({LANDMARKS: rows}, seen.source), group_views(seen)
     assert target is not None
     mine = views.used & target.shown(views).any(axis=1, keepdims=True)
     board = seen.board.copy()
-    board[views.row[mine]] = target.labelled(views).board[mine]
+    board[views.row[mine]] = target.assign_boards(views).board[mine]
     return replace(seen, board=board)
 
 

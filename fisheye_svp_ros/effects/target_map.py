@@ -29,7 +29,7 @@ class BoardMap(NamedTuple):
     slide: Array
 
     @property
-    def spread_out(self) -> bool:
+    def spans_plane(self) -> bool:
         """Whether the landmarks are not all on one line."""
         across = np.linalg.svd(self.place - self.place.mean(axis=0), compute_uv=False)
         return bool(across[-1] > 1e-6 * across[0])
@@ -48,7 +48,7 @@ class KnownTarget(NamedTuple):
     points: Array
 
     @classmethod
-    def of(cls, views: Views) -> KnownTarget:
+    def from_views(cls, views: Views) -> KnownTarget:
         """Return the landmarks that views show."""
         numbers, first = np.unique(views.landmark[views.used], return_index=True)
         return cls(numbers, views.board[views.used][first], views.points[views.used][first])
@@ -84,7 +84,7 @@ def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
 
 def board_maps(views: Views, terms: Sequence[Term], lens: Lens) -> list[BoardMap]:
     """Return how effects on the target, among some terms, displace the landmarks of views."""
-    known = KnownTarget.of(views)
+    known = KnownTarget.from_views(views)
     return known.maps(known.moved(terms, lens))
 
 

@@ -50,7 +50,7 @@ class TargetShapeEffect(Effect):
             forms.extend(cls(2, (one,)) for one in every)
         return forms
 
-    def joined(self, other: Self) -> Effect:
+    def merge_with(self, other: Self) -> Effect:
         boards = tuple(dict.fromkeys((*self.boards, *other.boards)))
         return TargetShapeEffect(max(self.degree, other.degree), boards)
 

@@ -44,5 +44,5 @@ class ViewpointShiftEffect(Effect):
         shift = Gennery().columns(scene.theta)[..., 1 : 1 + self.order]
         return np.stack([shift, np.zeros_like(shift)], axis=-2)
 
-    def curved(self, lens: Lens, values: Array) -> Lens:
+    def with_curves(self, lens: Lens, values: Array) -> Lens:
         return lens.with_shift(Gennery(0.0, *map(float, values)))

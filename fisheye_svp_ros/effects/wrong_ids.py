@@ -20,7 +20,7 @@ class WrongIdsEffect(NoiseEffect):
 
     parameters = (Parameter('fraction', '1', 0.02),)
 
-    def recorded(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
+    def record_points(self, uv: Array, values: Array, rng: np.random.Generator) -> Array:
         swapped = uv.copy()
         for view, seen in enumerate(np.asarray(np.isfinite(uv).all(axis=-1))):
             points = rng.permutation(np.flatnonzero(seen))

@@ -36,7 +36,7 @@ from fisheye_svp_ros.io.recording_files import (
 
 _MAX_LISTED = 3  # places of damage
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
-_FOREVER = QosTime(9223372036, 854775807)  # as rmw has it
+_UNLIMITED_TIME = QosTime(9223372036, 854775807)  # as rmw has it
 
 
 class OfferedQos(NamedTuple):
@@ -252,8 +252,8 @@ def _profile(offered: OfferedQos) -> Qos:
         reliability=QosReliability.RELIABLE if offered.reliable else QosReliability.BEST_EFFORT,
         durability=(QosDurability.TRANSIENT_LOCAL if offered.latched
                     else QosDurability.VOLATILE),
-        deadline=_FOREVER, lifespan=_FOREVER, liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=_FOREVER, avoid_ros_namespace_conventions=False,
+        deadline=_UNLIMITED_TIME, lifespan=_UNLIMITED_TIME, liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=_UNLIMITED_TIME, avoid_ros_namespace_conventions=False,
     )
 
 

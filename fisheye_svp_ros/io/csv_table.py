@@ -79,7 +79,7 @@ class CsvTable:
             self.refuse(np.abs(column) > _MAX_VALUE, name, needed)
         return values
 
-    def whole(self, name: str, most: int = 2**53) -> Index:
+    def integers(self, name: str, most: int = 2**53) -> Index:
         """Return a column of whole numbers (N,) from 0 to `most`."""
         values = self._numbers(name)
         bad = (values != np.floor(values)) | (values < 0) | (values > most)

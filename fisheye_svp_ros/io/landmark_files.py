@@ -51,5 +51,5 @@ def load_landmarks(path: str | Path) -> Landmarks:
     Raises ObservationError naming file, line and column.
     """
     table = CsvTable(Path(path), ('landmark', 'x', 'y', 'z'))
-    landmarks = Landmarks(table.whole('landmark', MOST_LANDMARK), table.numbers('x', 'y', 'z'))
+    landmarks = Landmarks(table.integers('landmark', MOST_LANDMARK), table.numbers('x', 'y', 'z'))
     return check_landmarks(landmarks, str(path))

@@ -97,7 +97,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     image = _section(document, 'image', where)
     target = _effects(document, 'target', where)
     own = _effects(document, 'corrections', where)
-    Target.of(target, where)
+    Target.from_entries(target, where)
     lens = Lens(
         name=str(document.get('name', Path(where).stem)),
         width=_pixels(image, 'width', f'{where}: image'),

@@ -25,7 +25,7 @@ def read(path: str | Path) -> Observations:
     Raises ObservationError, naming file, line and column.
     """
     table = CsvTable(Path(path), REQUIRED_COLUMNS)
-    frame, landmark = table.whole('frame'), table.whole('landmark', MOST_LANDMARK)
+    frame, landmark = table.integers('frame'), table.integers('landmark', MOST_LANDMARK)
     names = table.text('camera') if 'camera' in table else ('',) * len(frame)
     cameras = tuple(dict.fromkeys(names))
     # Results of a camera go to a folder of its name, in that of all.
@@ -46,7 +46,7 @@ def read(path: str | Path) -> Observations:
         uv,
         table.numbers('x', 'y', 'z'),
         camera=camera,
-        board=table.whole('board') if 'board' in table else None,
+        board=table.integers('board') if 'board' in table else None,
         t=table.numbers('t')[:, 0] if 't' in table else None,
         sigma=sigma,
         cameras=cameras,

@@ -17,8 +17,8 @@ from fisheye_svp_ros.io.files import read_text
 # Parameters by the pattern of full node names that they are for, such as /localizer, /* or /**.
 ByNode = dict[str, dict[str, Any]]
 
-_TRUE_WORDS = {'Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
-_FALSE = {'N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
+_TRUE_STRINGS = {'Y', 'y', 'yes', 'Yes', 'YES', 'true', 'True', 'TRUE', 'on', 'On', 'ON'}
+_FALSE_STRINGS = {'N', 'n', 'no', 'No', 'NO', 'false', 'False', 'FALSE', 'off', 'Off', 'OFF'}
 _PATTERN = re.compile(r'(/(\*\*?|\w+))+')
 _INTEGER = re.compile(r'[+-]?(0[xX][0-9a-fA-F]+|[0-9]+)')
 _NOT_FINITE = re.compile(r'([+-]?)\.(inf|Inf|INF|nan|NaN|NAN)')
@@ -96,8 +96,8 @@ def _value(node: yaml.Node | None) -> Any:
 
 
 def _scalar(text: str) -> bool | int | float | str:
-    if text in _TRUE_WORDS or text in _FALSE:
-        return text in _TRUE_WORDS
+    if text in _TRUE_STRINGS or text in _FALSE_STRINGS:
+        return text in _TRUE_STRINGS
     if _INTEGER.fullmatch(text):
         digits = text.lstrip('+-')
         base = 16 if digits[:2] in {'0x', '0X'} else 8 if digits[0] == '0' else 10

@@ -33,7 +33,7 @@ def read_poses(path: str | Path) -> FramePoses:
     Raises ObservationError, naming file, line and column.
     """
     table = CsvTable(Path(path), COLUMNS)
-    frame = table.whole('frame')
+    frame = table.integers('frame')
     table.refuse_repeats(frame[:, None], 'frame')
     quaternion = table.numbers('qx', 'qy', 'qz', 'qw')
     norm = np.linalg.norm(quaternion, axis=-1)

@@ -77,7 +77,7 @@ class Result(ABC):
 
     def save(self, path: str | Path) -> None:
         """Write a JSON file that `load` reads back; raise OutputError where it cannot."""
-        write_json(path, {_KIND_KEY: type(self).__name__, **_to_plain(self)})
+        write_json(path, {_KIND_KEY: type(self).__name__, **_to_json(self)})
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -89,27 +89,27 @@ class Result(ABC):
         try:
             if document.pop(_KIND_KEY) != cls.__name__:
                 raise ValueError(f'it holds another result than {cls.__name__}')
-            found: Self = _from_plain(document, cls)
+            found: Self = _from_json(document, cls)
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as cause:
             raise ObservationError(f'{path}: not a saved {cls.__name__} ({cause})') from cause
         return found
 
 
-def _to_plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, Lens):
         return lens_to_dict(value)
     if isinstance(value, Pose):
-        return {name: _to_plain(part) for name, part in value._asdict().items()}
+        return {name: _to_json(part) for name, part in value._asdict().items()}
     if is_dataclass(value):
-        return {field.name: _to_plain(getattr(value, field.name)) for field in fields(value)}
+        return {field.name: _to_json(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
-        return {key: _to_plain(item) for key, item in value.items()}
+        return {key: _to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_plain(item) for item in value]
+        return [_to_json(item) for item in value]
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def _from_plain(value: Any, hint: Any) -> Any:
+def _from_json(value: Any, hint: Any) -> Any:
     """Return what `_plain` made plain, as the annotation of its field has it."""
     kinds = [kind for kind in get_args(hint) if kind is not type(None)]
     if hint in (Array, Index):
@@ -122,14 +122,14 @@ def _from_plain(value: Any, hint: Any) -> Any:
         return Pose(*(np.array(value[name], dtype=float) for name in Pose._fields))
     if isinstance(hint, type) and is_dataclass(hint):
         hints = get_type_hints(hint)
-        return hint(**{field.name: _from_plain(value[field.name], hints[field.name])
+        return hint(**{field.name: _from_json(value[field.name], hints[field.name])
                        for field in fields(hint)})
     if get_origin(hint) is dict:
-        return {key: _from_plain(item, kinds[1]) for key, item in value.items()}
+        return {key: _from_json(item, kinds[1]) for key, item in value.items()}
     if get_origin(hint) is tuple:
         return tuple(value)
     if len(kinds) == 1 and get_origin(hint) is not list:
-        return _from_plain(value, kinds[0])
+        return _from_json(value, kinds[0])
     return value
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 from fisheye_svp_ros.errors import ParameterError
 
-LARGEST = 1 << 26  # bytes of a file that somebody else names
+MAX_FILE_BYTES = 1 << 26  # bytes of a file that somebody else names
 _NAME = re.compile(r'[\w-]{0,100}')
 
 
-def allowed(name: str, folder: str, what: str) -> str:
+def check_access(name: str, folder: str, what: str) -> str:
     """Return a name in config/, or a file, as given; raise ParameterError if it is out of bounds.
 
     folder: below which a file must lie, symbolic links followed; empty: no file at all.
@@ -30,6 +30,7 @@ def allowed(name: str, folder: str, what: str) -> str:
     if not inside:
         raise ParameterError(f'{what}: {name[:100]!r} is not below {folder}, the folder of this '
                              'node')
-    if not 0 <= size <= LARGEST:
-        raise ParameterError(f'{what}: {name[:100]!r} is no file, or above {LARGEST >> 20} MB')
+    if not 0 <= size <= MAX_FILE_BYTES:
+        raise ParameterError(
+            f'{what}: {name[:100]!r} is no file, or above {MAX_FILE_BYTES >> 20} MB')
     return name

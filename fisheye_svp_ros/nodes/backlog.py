@@ -37,7 +37,7 @@ class Arrivals:
         self._since = now
         return False
 
-    def done(self, now: float, began: float) -> None:
+    def finish_set(self, now: float, began: float) -> None:
         """Take note that a set is solved."""
         self._since, self.latency = now, now - began
 

@@ -15,13 +15,13 @@ from rclpy.node import Node
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import rows, with_values
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import allowed
+from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.declaration import declare, unknown_parameters
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import INPUT, RELIABLE, create_with_qos
 from fisheye_svp_ros.nodes.silence import LIMIT, explain_silence, silent_inputs
 from fisheye_svp_ros.nodes.subscriptions import Input
-from fisheye_svp_ros.nodes.timers import every
+from fisheye_svp_ros.nodes.timers import start_timer
 from fisheye_svp_ros.study.settings import Settings
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
@@ -30,11 +30,11 @@ _KINDS_OF_ERRORS = 100  # that are told from each other
 T = TypeVar('T')
 
 
-class Finished(Exception):
+class NodeExit(Exception):
     """A node has done all that it was started for."""
 
 
-class Failed(Finished):
+class NodeFailure(NodeExit):
     """A node cannot go on with what it was started for."""
 
 
@@ -72,7 +72,7 @@ class BaseNode(Node):  # type: ignore[misc]
         self._candidate: tuple[Settings, Any] | None = None
         self._waited_for: list[Any] = []
         self._diagnostics = self.announce(DiagnosticArray, '/diagnostics')
-        self.every(1.0, self._publish_diagnostics)
+        self.start_timer(1.0, self._publish_diagnostics)
 
     def start(self) -> None:
         """Take the initial parameters into use, and every later change of them.
@@ -82,7 +82,7 @@ class BaseNode(Node):  # type: ignore[misc]
         self.take_up()
         self.introduce()
         self.add_on_set_parameters_callback(self._consider)
-        self.add_post_set_parameters_callback(self.guarded(self._adopt))
+        self.add_post_set_parameters_callback(self.guard_callback(self._adopt))
 
     def take_up(self) -> None:
         """Take the parameters as they are into use; raise FisheyeSvpError where that fails."""
@@ -95,7 +95,7 @@ class BaseNode(Node):  # type: ignore[misc]
     def configure(self, prepared: Any) -> None:
         """Take new settings into use; nothing in it may fail."""
 
-    def guarded(self, callback: Callable[..., T]) -> Callable[..., T | None]:
+    def guard_callback(self, callback: Callable[..., T]) -> Callable[..., T | None]:
         """Return a callback that what goes wrong in it does not get out of.
 
         Bad input is named in the log and on /diagnostics; an error of this package is logged with
@@ -107,7 +107,7 @@ class BaseNode(Node):  # type: ignore[misc]
         def run(*arguments: Any) -> T | None:
             try:
                 return callback(*arguments)
-            except Finished:
+            except NodeExit:
                 raise
             except FisheyeSvpError as error:
                 self._complain(error)
@@ -129,9 +129,9 @@ class BaseNode(Node):  # type: ignore[misc]
             text = ''.join(traceback.format_exception(error)).rstrip()
             self.get_logger().error(f'internal error, told once: {text}')
 
-    def every(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
+    def start_timer(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
         """Have a function called every `period` seconds, of real time where no clock is given."""
-        return every(self, period, self.guarded(callback), clock)
+        return start_timer(self, period, self.guard_callback(callback), clock)
 
     def announce(self, kind: Any, topic: str, qos: Any = RELIABLE, wait: bool = False) -> Any:
         """Create a publisher; wait: it counts for `has_listeners`."""
@@ -182,7 +182,7 @@ class BaseNode(Node):  # type: ignore[misc]
             try:
                 unread = Unread(topic, kind, bytes(data), read, count)
                 use(unread.stamp, unread)
-            except Finished:
+            except NodeExit:
                 raise
             except FisheyeSvpError as error:
                 self.drop(topic, error)
@@ -229,7 +229,7 @@ class BaseNode(Node):  # type: ignore[misc]
                 return SetParametersResult(successful=True)  # of ROS itself, such as a QoS
             for row in rows(self.SETTINGS):
                 if row.file and isinstance(values.get(row.name), str):
-                    allowed(values[row.name], self.settings.folder, row.name)
+                    check_access(values[row.name], self.settings.folder, row.name)
             settings = with_values(self.settings, values)
             self._candidate = settings, self.prepare(settings)
         except FisheyeSvpError as error:

@@ -18,7 +18,7 @@ from fisheye_svp_ros.detect.photographs import Pixels
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
@@ -29,8 +29,8 @@ from fisheye_svp_ros.study.settings import CameraSettings
 
 _TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 _CAMERA_FRAME = 'camera_optical_frame'
-_SET_BACK = 10**9  # ns by which a clock is not early but set back
-_LONG = 15.0  # s without an answer after which a set is published again
+_CLOCK_RESET_NS = 10**9  # ns by which a clock is not early but set back
+_REPUBLISH_TIMEOUT = 15.0  # s without an answer after which a set is published again
 
 
 class CameraTopics:
@@ -117,7 +117,7 @@ class CameraNode(BaseNode):
         Where the clock was set back, as by a recording that starts over, stamps follow it.
         """
         now = int(self.get_clock().now().nanoseconds)
-        return now if now < self._stamp - _SET_BACK else max(now, self._stamp + 1)
+        return now if now < self._stamp - _CLOCK_RESET_NS else max(now, self._stamp + 1)
 
     def play(self, steps: Iterator[Any]) -> None:
         """Start stepping through other sets."""
@@ -128,7 +128,7 @@ class CameraNode(BaseNode):
                 self._hear_answers_on(topic)
         if self._timer is not None:
             self.destroy_timer(self._timer)
-        self._timer = self.every(1 / self.settings.rate, self._tick, self.get_clock())
+        self._timer = self.start_timer(1 / self.settings.rate, self._tick, self.get_clock())
 
     def camera(self, name: str) -> CameraTopics:
         """Return the topics of a camera."""
@@ -160,7 +160,7 @@ class CameraNode(BaseNode):
         if not self._unanswered:
             if self.has_listeners():
                 self._advance()
-        elif time.monotonic() - self._sent > _LONG:
+        elif time.monotonic() - self._sent > _REPUBLISH_TIMEOUT:
             # Who answers may not have known of this node yet when it did.
             waiting = ' '.join(sorted(self._unanswered))
             self.get_logger().warning(f'no answer on {waiting}; publishing the set once more')
@@ -170,10 +170,10 @@ class CameraNode(BaseNode):
         try:
             self._step = next(self._steps, None)
         except FisheyeSvpError as error:  # a file that was there at the start is not any more
-            raise Failed(str(error)) from error
+            raise NodeFailure(str(error)) from error
         if self._step is None:
             self._timer.cancel()
-            raise Finished('all sets are published')
+            raise NodeExit('all sets are published')
         self._stamp = self.stamp_of(self._step)
         self._send()
 

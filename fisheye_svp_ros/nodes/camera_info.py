@@ -12,7 +12,7 @@ from fisheye_svp_ros.io.lens_formats.ros import lens_of
 from fisheye_svp_ros.optics.lens import Lens
 
 CAMERA_INFO = 'camera_info'  # the value of the parameter `lens`, and the topic
-_KEPT = 1000  # of each camera, for sets that wait
+_MAX_MESSAGES = 1000  # of each camera, for sets that wait
 
 
 class CameraInfos:
@@ -31,7 +31,7 @@ class CameraInfos:
         heard = self._heard.setdefault(topic, {})
         heard.pop(stamp, None)
         heard[stamp] = unread
-        if len(heard) > _KEPT:
+        if len(heard) > _MAX_MESSAGES:
             del heard[next(iter(heard))]
 
     def size(self, topic: str, stamp: int) -> tuple[int, int] | None:

@@ -23,20 +23,20 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError, ParameterE
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.parameters import parameter
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import allowed
+from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED, compressed_topic
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
 from fisheye_svp_ros.planning.guide import NUMBERS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
 
-_RAW, _COMPRESSED = 'image', f'image{COMPRESSED}'
-_QUICK = {'saddle': 'quick'}  # a live camera has another image soon
-_LATEST = 100  # images of which one topic may be ahead of the other
+_RAW, _COMPRESSED = 'image', f'image{COMPRESSED_SUFFIX}'
+_LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
+_MAX_LEAD = 100  # images of which one topic may be ahead of the other
 _LOOK = 0.005  # s, how often what a search found is looked for
 
 
@@ -102,7 +102,7 @@ class Detector(BaseNode):
         self._pattern: Pattern
         self._near: Array | None = None
         self._size: tuple[int, ...] | None = None
-        self._taken: deque[tuple[int, str]] = deque(maxlen=_LATEST)
+        self._taken: deque[tuple[int, str]] = deque(maxlen=_MAX_LEAD)
         self._waiting: tuple[int, Unread] | None = None
         self._searched: tuple[int, str, Pixels] | None = None
         self._infos = CameraInfos(self.get_logger().info)
@@ -123,7 +123,7 @@ class Detector(BaseNode):
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None
         self._searches = BoundedCalls(search, blank)
-        self._look = self.every(_LOOK, self._work)
+        self._look = self.start_timer(_LOOK, self._work)
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to detect."""
@@ -144,7 +144,7 @@ class Detector(BaseNode):
         """Return the pattern; raise ParameterError where the text names none."""
         kind, _, file = settings.board.partition(':')
         if kind == 'aprilgrid' and settings is not self.settings:
-            allowed(file, self.settings.folder, 'board')
+            check_access(file, self.settings.folder, 'board')
         if settings.detections and kind != 'aprilgrid':
             raise ParameterError(f'board is {settings.board!r}; with detections it must be an '
                                  'aprilgrid')
@@ -189,7 +189,7 @@ class Detector(BaseNode):
     @property
     def _detector(self) -> str:
         name = default_detector(self._pattern)
-        return _QUICK.get(name, name)
+        return _LIVE_DETECTORS.get(name, name)
 
     def _work(self) -> None:
         """Publish what a search found; start the next one; look again while it is under way."""

@@ -41,7 +41,7 @@ def run(*names: str, args: list[str] | None = None) -> int:
     args: as for rclpy.init().
     """
     with ending_quietly():
-        kinds = [_kind(name) for name in names]
+        kinds = [_node_class(name) for name in names]
         from fisheye_svp_ros.nodes import running
     return running.run(kinds, args)
 
@@ -50,10 +50,11 @@ def parameters(name: str) -> list[Row]:
     """Return the parameters of a node, its own before those of every node; rclpy must be there."""
     from fisheye_svp_ros.io.parameters import rows
 
-    return sorted(rows(_kind(name).SETTINGS), key=lambda row: row.name == 'wait_for_subscribers')
+    return sorted(rows(_node_class(name).SETTINGS),
+                  key=lambda row: row.name == 'wait_for_subscribers')
 
 
-def _kind(name: str) -> type[BaseNode]:
+def _node_class(name: str) -> type[BaseNode]:
     module = import_module(f'fisheye_svp_ros.nodes.{name}')
     kind: type[BaseNode] = getattr(module, name.title().replace('_', ''))
     return kind

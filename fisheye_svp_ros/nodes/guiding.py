@@ -41,7 +41,7 @@ from fisheye_svp_ros.planning.guide import (
 from fisheye_svp_ros.planning.plan import nominal_lens
 from fisheye_svp_ros.reporting.guide_picture import draw_guide, guide_words
 
-_LONGEST = 60.0  # s, to choose the next photograph
+_PLANNING_TIMEOUT = 60.0  # s, to choose the next photograph
 _PICTURES = QoSProfile(depth=2)
 _NS = 1e9
 _FAST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
@@ -111,8 +111,8 @@ class Guiding:
         self._frame = frame
         if guide.look(stamp / _NS, seen):
             self._save(pixels)
-        self._tell('score', guide.score)
-        self._tell_wanted(guide)
+        self._publish_metric('score', guide.score)
+        self._publish_next_board(guide)
         if self.heard():
             self._pictures.publish(
                 messages.image_message(draw_guide(pixels, guide, seen), stamp, frame))
@@ -131,7 +131,7 @@ class Guiding:
                 self._fail(guide, result)
         if guide.thinking and not calls.busy and self._calls is not None:
             self._considering = True
-            calls.start(guide.session, _LONGEST)
+            calls.start(guide.session, _PLANNING_TIMEOUT)
 
     def _begin(self, stamp: int, pixels: Pixels) -> None:
         height, width = pixels.shape
@@ -153,16 +153,16 @@ class Guiding:
     def _adopt(self, guide: Guide, stand: SessionState) -> None:
         guide.adopt(stand)
         self._trouble = ''
-        self._tell('photographs', len(guide.session.taken))
+        self._publish_metric('photographs', len(guide.session.taken))
         if stand.stderr is not None:
-            self._tell('stderr', stand.stderr)
+            self._publish_metric('stderr', stand.stderr)
         self._node.get_logger().info('guide: ' + '; '.join(filter(None, guide_words(guide))))
 
     def _fail(self, guide: Guide, result: Any) -> None:
         """Go on without the last photograph; without any there is nothing to go on with."""
         self._failures += 1
         late = isinstance(result, TimedOut)
-        self._trouble = f'guide: {f"nothing within {_LONGEST:g} s" if late else result}'
+        self._trouble = f'guide: {f"nothing within {_PLANNING_TIMEOUT:g} s" if late else result}'
         if not (late or isinstance(result, FisheyeSvpError)):
             self._node.unforeseen(result)
         self._node.get_logger().warning(self._trouble, throttle_duration_sec=1.0)
@@ -171,7 +171,7 @@ class Guiding:
             self._calls = None
         guide.fail()
 
-    def _tell_wanted(self, guide: Guide) -> None:
+    def _publish_next_board(self, guide: Guide) -> None:
         """Publish where the board is wanted, in the camera's frame, once it is another place."""
         outline = guide.outline
         if outline is None or guide.stand is None or outline is self._told:
@@ -190,5 +190,5 @@ class Guiding:
         write_observations(self._folder / 'observations.csv',
                            observations_of(taken, self._pattern.points))
 
-    def _tell(self, name: str, value: float) -> None:
+    def _publish_metric(self, name: str, value: float) -> None:
         self._metrics[name].publish(messages.number_message(value))

@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import nanoseconds
 
-_SHORTEST = 12  # bytes: the head of CDR and a stamp
+_MIN_BYTES = 12  # bytes: the head of CDR and a stamp
 
 
 @dataclass
@@ -38,7 +38,7 @@ class Unread:
     def stamp(self) -> int:
         """The stamp of its header, which every message starts with that a node listens to, ns."""
         try:
-            if len(self._data) < _SHORTEST:
+            if len(self._data) < _MIN_BYTES:
                 raise ObservationError(f'{self.topic}: {len(self._data)} bytes are no message')
             order = '<' if self._data[1] & 1 else '>'
             sec, nanosec = struct.unpack_from(f'{order}iI', self._data, 4)
@@ -52,7 +52,7 @@ class Unread:
         if self._outcome is None:
             self._counts.read += 1
             try:
-                self._outcome = self._decoded(), None
+                self._outcome = self._decode_data(), None
             except ObservationError as error:
                 self._outcome = None, error
         value, refusal = self._outcome
@@ -60,7 +60,7 @@ class Unread:
             raise refusal
         return value
 
-    def _decoded(self) -> Any:
+    def _decode_data(self) -> Any:
         try:
             message = deserialize_message(self._data, self._kind)
         except Exception as cause:

@@ -168,7 +168,7 @@ class StampJoin:
             return self._tracks[topic].distance(stamp)
         return min((abs(stamp - one) for one in self._recent[topic]), default=None)
 
-    def ready(self, now: float, patience: float) -> Iterator[Pending]:
+    def pop_complete(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that are ready."""
         for one in list(self._pending.values()):
             if any(topic not in one.items for topic in self._required):
@@ -185,7 +185,7 @@ class StampJoin:
             del self._pending[one.stamp]
             yield one._replace(stamp=one.stamps[self._required[0]])
 
-    def given_up(self, now: float, patience: float) -> Iterator[Pending]:
+    def pop_expired(self, now: float, patience: float) -> Iterator[Pending]:
         """Yield and forget the sets that lack a required item and are out of patience."""
         for track in self._tracks.values():
             track.expire(now - patience)

@@ -21,7 +21,7 @@ PROGRAM = 'fisheye-svp'
 STYLES = ('parallel', 'vergent', 'divergent')
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
 _FLAG = ('true', 'false', 'True', 'False')  # launch itself and Python's own words
-_WORDS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'),
+_NODE_ARGUMENTS = {'detector': (), **dict.fromkeys(('synthetic_camera', 'measured_camera'),
                                          ('lens', 'world_frame', 'camera_frame'))}
 _OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator')
 
@@ -86,12 +86,12 @@ def node(
     return Node(
         # With its name, since what is for one node wins over what a file says of all.
         executable=name, name=name,
-        parameters=[*_files(context, name), {**_given(context, name), **given}],
-        remappings=list(remappings), **_common(context),
+        parameters=[*_files(context, name), {**_node_parameters(context, name), **given}],
+        remappings=list(remappings), **_node_options(context),
     )
 
 
-def composed(
+def compose_nodes(
     context: Any, given: Mapping[str, Mapping[str, Any]], remappings: Sequence[Any] = ()
 ) -> Any:
     """Return one process with several nodes; given: parameters by their names, in their order.
@@ -104,17 +104,17 @@ def composed(
         values: dict[str, Any] = {}
         for file in _files(context, name):
             values |= parameters_of(f'{space}/{name}', read_parameter_file(Path(file)))
-        values |= {**_given(context, name), **own}
+        values |= {**_node_parameters(context, name), **own}
         document[f'{space}/{name}'] = {'ros__parameters': values}
     with NamedTemporaryFile('w', prefix='composed_', suffix='.yaml', delete=False) as stream:
         yaml.safe_dump(document, stream)
     return Node(
         executable=PROGRAM, arguments=['run', *given], parameters=[stream.name],
-        remappings=list(remappings), **_common(context),
+        remappings=list(remappings), **_node_options(context),
     )
 
 
-def _common(context: Any) -> dict[str, Any]:
+def _node_options(context: Any) -> dict[str, Any]:
     return {
         'package': PACKAGE, 'namespace': value(context, 'namespace'), 'output': 'screen',
         'ros_arguments': ['--log-level', value(context, 'log_level')],
@@ -130,9 +130,9 @@ def _files(context: Any, name: str) -> list[str]:
     return [*filter(None, files.values())]
 
 
-def _given(context: Any, name: str) -> dict[str, Any]:
+def _node_parameters(context: Any, name: str) -> dict[str, Any]:
     """Return the arguments that are parameters of a node and not empty."""
-    words = _WORDS.get(name, ('lens', 'svp'))
+    words = _NODE_ARGUMENTS.get(name, ('lens', 'svp'))
     flags = ('use_sim_time', 'publish_tf') if name in _OF_TF else ('use_sim_time',)
     return {word: value(context, word) for word in words if value(context, word)} | {
         flag: value(context, flag) == 'true' for flag in flags if value(context, flag)}

@@ -29,10 +29,10 @@ from fisheye_svp_ros.study.solutions import SetSolutions, localize_sets, residua
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import LensErrors
 
-_AS_WELL = 1.5  # a set may fit this much worse than the one before it, by chance
-_NEAR = 0.1  # rad, and of the distance of the nearest landmark
-_EXACT = 1e-6  # px; what fits better fits perfectly
-_SEARCHED_EACH = 10  # sets, of those that fit badly one after the other
+MAX_RMS_RATIO = 1.5  # a set may fit this much worse than the one before it, by chance
+MAX_POSE_CHANGE = 0.1  # rad, and of the distance of the nearest landmark
+PERFECT_FIT_PX = 1e-6  # px; what fits better fits perfectly
+OUTLIER_SEARCH_INTERVAL = 10  # sets, of those that fit badly one after the other
 
 
 class Localizer(SolverNode):
@@ -71,7 +71,7 @@ class Localizer(SolverNode):
             sigma = errors.inflate_sigma(self.settings.sigma_px)
             views = views._replace(weight=np.full_like(views.weight, 1 / sigma))
         true: Pose | None = items.get('true_pose')
-        found = self._localized(model, views, true).require()
+        found = self._localize(model, views, true).require()
         solution = found.solution
         pose, world = solution.pose.take(0), landmarks.frame
         camera = self.settings.camera_frame or seen.frame
@@ -100,7 +100,7 @@ class Localizer(SolverNode):
             self._errors = _errors_of(lens)
         return self._errors
 
-    def _localized(
+    def _localize(
         self, model: ForwardModel, views: Views, true: Pose | None
     ) -> SetSolutions[Localization]:
         """Solve from where the camera was, which is faster; from anywhere if that is not near.
@@ -108,14 +108,14 @@ class Localizer(SolverNode):
         A wrong lens is wrong in every set; to search each for gross errors would take 20 ms more.
         """
         start, before = self._before
-        searched = self._misfits % _SEARCHED_EACH == 0
+        searched = self._misfits % OUTLIER_SEARCH_INTERVAL == 0
         found = localize_sets(model, views, true, start, examined=True, searched=searched)
         if start is not None and not (
-            _rms_px(found) < _AS_WELL * before and _is_near(start, found.solution.pose, views)
+            _rms_px(found) < MAX_RMS_RATIO * before and _is_near(start, found.solution.pose, views)
         ):
             found = localize_sets(model, views, true, examined=True)
         rms, pose = _rms_px(found), found.solution.pose
-        self._before = (pose, max(rms, _EXACT)) if np.isfinite(rms) else (None, 0.0)
+        self._before = (pose, max(rms, PERFECT_FIT_PX)) if np.isfinite(rms) else (None, 0.0)
         whole = found.metrics['points'][0] == views.used.sum()
         self._misfits = self._misfits + 1 if found.reasons[0] and whole else 0
         return found
@@ -137,5 +137,5 @@ def _is_near(start: Pose, pose: Pose, views: Views) -> bool:
     """Say whether a camera that went from one pose (1,) to another sees nearly the same."""
     change = pose.difference(start)[0]
     nearest = np.linalg.norm(pose.into_body(views.points)[0], axis=-1).min()
-    return bool(np.linalg.norm(change[:3]) < _NEAR * nearest
-                and np.linalg.norm(change[3:]) < _NEAR)
+    return bool(np.linalg.norm(change[:3]) < MAX_POSE_CHANGE * nearest
+                and np.linalg.norm(change[3:]) < MAX_POSE_CHANGE)

@@ -49,7 +49,7 @@ def epipolar_shapes(lens: Lens, pose: Pose, curves: Array, uv: Array) -> list[Se
 
     The longer side of the image is the side of the base; curves are cut where they are NaN.
     """
-    def place(pixels: Array) -> Array:
+    def to_frustum(pixels: Array) -> Array:
         size = np.array([lens.width, lens.height])
         sideways = (pixels - (size - 1) / 2) * 2 * _HALF_BASE / size.max()
         ahead = np.full((*sideways.shape[:-1], 1), _CAMERA_SIZE)
@@ -58,6 +58,6 @@ def epipolar_shapes(lens: Lens, pose: Pose, curves: Array, uv: Array) -> list[Se
     steps = np.stack([curves[:, :-1], curves[:, 1:]], axis=2).reshape(-1, 2, 2)
     known = steps[np.isfinite(steps).all(axis=(1, 2))].reshape(-1, 2)
     return [
-        Segments('epipolar curves', place(known), (0.8, 0.2, 0.2, 0.8), 0.0003),
-        Segments('image points', place(uv), (0.1, 0.1, 0.1, 1.0), 0.001, lines=False),
+        Segments('epipolar curves', to_frustum(known), (0.8, 0.2, 0.2, 0.8), 0.0003),
+        Segments('image points', to_frustum(uv), (0.1, 0.1, 0.1, 1.0), 0.001, lines=False),
     ]

@@ -26,14 +26,14 @@ from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO
 from fisheye_svp_ros.nodes.quality import LATCHED
 from fisheye_svp_ros.nodes.set_collection import (
     CollectedSet,
-    collected_set,
     is_repeated,
+    make_set,
     scenario_of,
     table_of,
 )
 from fisheye_svp_ros.nodes.solver import Items, SolverNode
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.reporting.diagnosis_text import not_offered
+from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason
 from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.observations import STEREO, Observations
 from fisheye_svp_ros.solve.measured_poses import posable_observations
@@ -42,7 +42,7 @@ from fisheye_svp_ros.study.settings import RigSettings
 T = TypeVar('T')
 
 _ALARMING = {'recalibrate', 'use_extended', 'retake'}  # decisions that warn
-_MOST = 24  # parameters of a cause that are worth a topic each
+_MAX_PARAMETER_TOPICS = 24  # parameters of a cause that are worth a topic each
 
 
 @dataclass(frozen=True)
@@ -100,8 +100,8 @@ class ModelCritic(SolverNode):
         self._running: _Running | None = None
         self._verdict: Diagnosis | None = None
         self.create_service(
-            Trigger, '~/write_extended_lens', self.guarded(self._write_extended_lens))
-        self.every(0.2, self._tick)
+            Trigger, '~/write_extended_lens', self.guard_callback(self._write_extended_lens))
+        self.start_timer(0.2, self._tick)
         self.start()
 
     @property
@@ -125,16 +125,16 @@ class ModelCritic(SolverNode):
                  settings.max_frames)
         if asked != self._asked:
             self._asked = asked
-            self._ask_anew()
+            self._restart()
 
     def solve(self, stamp: int, landmarks: decoding.LandmarkSet, items: Items) -> None:
         """Take in one more frame; start over where the scenario is another one."""
-        seen = collected_set(stamp, landmarks, items, self.cameras)
+        seen = make_set(stamp, landmarks, items, self.cameras)
         self.lens(stamp, items)  # raises where nobody names one
         scenario = scenario_of(items)
         if scenario != self._scenario:
             self._scenario, self._frames, self._repeated = scenario, {}, 0
-            self._ask_anew()
+            self._restart()
         self._latest = stamp, items
         if is_repeated(seen, list(self._frames.values())):
             self._repeated += 1
@@ -144,7 +144,7 @@ class ModelCritic(SolverNode):
         for old in list(self._frames)[: -self.settings.max_frames]:
             del self._frames[old]
 
-    def _ask_anew(self) -> None:
+    def _restart(self) -> None:
         self._question += 1
         self._judged, self._verdict = False, None
 
@@ -228,7 +228,7 @@ class ModelCritic(SolverNode):
             return response
         path = Path(self.settings.output).absolute()
         try:
-            save_lens(self._verdict.lens, path, not_offered(self._verdict))
+            save_lens(self._verdict.lens, path, refusal_reason(self._verdict))
         except FisheyeSvpError as error:
             response.message = str(error)
             return response
@@ -272,7 +272,7 @@ def figures(found: Diagnosis) -> dict[str, float]:
         'gain': gain.value, 'gain_low': gain.low, 'gain_high': gain.high,
     }
     for cause in found.causes:
-        if len(cause.parameters) > _MOST:
+        if len(cause.parameters) > _MAX_PARAMETER_TOPICS:
             continue
         for name, entry in cause.parameters.items():
             unit = _suffix(entry['unit'])

@@ -14,13 +14,13 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fisheye_svp_ros.io.bags import BagWriter, OfferedQos
-from fisheye_svp_ros.nodes.timers import every
+from fisheye_svp_ros.nodes.timers import start_timer
 
-_COUNTED = ('/image_points', '/result')
+_COUNTED_TOPICS = ('/image_points', '/result')
 _LOOK_EVERY = 0.2  # s, for topics that are new
 _FLUSH_EVERY = 1.0  # s; a crash loses no more
-_QUIET = 0.5  # s without a message after which nothing is on its way any more
-_LONGEST = 2.0  # s to wait for that
+_IDLE_TIME = 0.5  # s without a message after which nothing is on its way any more
+_MAX_WAIT = 2.0  # s to wait for that
 
 
 class Recorder(Node):  # type: ignore[misc]
@@ -32,8 +32,8 @@ class Recorder(Node):  # type: ignore[misc]
         self._bag = bag
         self._wanted = wanted
         self._warned: set[str] = set()
-        every(self, _LOOK_EVERY, self._look)
-        every(self, _FLUSH_EVERY, bag.flush)
+        start_timer(self, _LOOK_EVERY, self._look)
+        start_timer(self, _FLUSH_EVERY, bag.flush)
 
     def spin(self) -> None:
         """Record until SIGINT or SIGTERM, and then what is on its way; a second one ends that."""
@@ -49,7 +49,7 @@ class Recorder(Node):  # type: ignore[misc]
             # Only a whole wait that brought nothing says so: this process may have been held up.
             # Where others go on publishing, it is enough that nothing waits to be taken.
             start, count = time.monotonic(), self._bag.count
-            patience = _QUIET if start - signals[0] < _LONGEST else 0.0
+            patience = _IDLE_TIME if start - signals[0] < _MAX_WAIT else 0.0
             executor.spin_once(timeout_sec=patience)
             quiet = self._bag.count == count and time.monotonic() - start >= patience
 
@@ -59,10 +59,10 @@ class Recorder(Node):  # type: ignore[misc]
         # last a node publishes, so where its publisher is known, those found now are all.
         names = [name for name, _ in self.get_topic_names_and_types()]
         complete = {name for name in names
-                    if name.endswith(_COUNTED) and self.count_publishers(name)}
+                    if name.endswith(_COUNTED_TOPICS) and self.count_publishers(name)}
         found = self.get_topic_names_and_types()
-        for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED)):
-            if topic in self.topics or (topic.endswith(_COUNTED) and topic not in complete):
+        for topic, types in sorted(found, key=lambda entry: entry[0].endswith(_COUNTED_TOPICS)):
+            if topic in self.topics or (topic.endswith(_COUNTED_TOPICS) and topic not in complete):
                 continue
             if self._wanted.fullmatch(topic):
                 self._take(topic, types)

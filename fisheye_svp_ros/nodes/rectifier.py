@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.image_topics import COMPRESSED, compressed_topic
+from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import SENSOR
 from fisheye_svp_ros.optics.lens import Lens
@@ -35,7 +35,7 @@ from fisheye_svp_ros.scene.observations import STEREO
 from fisheye_svp_ros.study.settings import Settings
 
 _INFO = f'image/{CAMERA_INFO}'  # of the raw images; `camera_info` is that of the rectified ones
-_LATEST = 100  # images of which one topic may be ahead of the other
+_MAX_LEAD = 100  # images of which one topic may be ahead of the other
 
 
 @dataclass(frozen=True)
@@ -107,18 +107,18 @@ class Rectifier(BaseNode):
         self._outputs[camera] = (
             self.announce(Image, f'{camera}image_rect', SENSOR, wait=True),
             self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR))
-        self._taken[camera] = deque(maxlen=_LATEST)
+        self._taken[camera] = deque(maxlen=_MAX_LEAD)
         take = partial(self._take, camera)
         image, topic = f'{camera}image', f'{camera}{_INFO}'
         self.collect(Image, image, _read_raw, take, SENSOR)
-        self.collect(CompressedImage, image + COMPRESSED, _read_compressed, take, SENSOR,
+        self.collect(CompressedImage, image + COMPRESSED_SUFFIX, _read_compressed, take, SENSOR,
                      name=compressed_topic(self, image))
         self.collect(CameraInfo, topic, read_camera_info, partial(self._infos.hear, topic),
                      SENSOR, latched=True)
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to rectify."""
-        images = [(f'{c}image', f'{c}image{COMPRESSED}') for c in self._cameras]
+        images = [(f'{c}image', f'{c}image{COMPRESSED_SUFFIX}') for c in self._cameras]
         infos = [(f'{c}{_INFO}',) for c in self._cameras]
         return [*images, *(infos if self.settings.lens == CAMERA_INFO else [])]
 

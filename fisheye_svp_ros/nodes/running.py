@@ -14,7 +14,7 @@ from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.nodes.base import BaseNode, Failed, Finished
+from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.session import RCLError
 
 _SAME_INTERRUPT = 1.0  # s between two interrupts that are one
@@ -61,9 +61,9 @@ def _run(kinds: Sequence[type[BaseNode]]) -> int:
         _spin(nodes)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
-    except Failed as error:
+    except NodeFailure as error:
         return _refuse(kinds, error)
-    except Finished:
+    except NodeExit:
         pass
     except (FisheyeSvpError, ParameterException, NameValidationException) as error:
         return _refuse(kinds[len(nodes):][:1] or kinds, error)
@@ -88,7 +88,7 @@ def _spin(nodes: Sequence[BaseNode]) -> None:
     while rclpy.ok():
         try:
             executor.spin()
-        except (ExternalShutdownException, Finished):
+        except (ExternalShutdownException, NodeExit):
             raise
         except Exception as error:  # of the client library, about what came over the wire
             nodes[0].unforeseen(error)

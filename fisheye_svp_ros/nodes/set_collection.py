@@ -12,7 +12,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes.solver import Items, known_points
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
-_STILL = 1.0  # px: what image points of a still camera move by at most
+_MAX_MOTION_PX = 1.0  # px: what image points of a still camera move by at most
 # What tells the sets of one scenario from each other; all else tells scenarios apart.
 _WITHIN_SCENARIO = ('set', 'frame')
 
@@ -27,7 +27,7 @@ class CollectedSet(NamedTuple):
     camera: Index
 
 
-def collected_set(
+def make_set(
     stamp: int, landmarks: decoding.LandmarkSet, items: Items, cameras: Sequence[str]
 ) -> CollectedSet:
     """Return one set of cameras given by namespace, each with its slash.
@@ -53,7 +53,7 @@ def is_repeated(seen: CollectedSet, earlier: Sequence[CollectedSet]) -> bool:
         return False
     copies = any(np.array_equal(seen.landmark, one.landmark) and np.array_equal(seen.uv, one.uv)
                  for one in earlier)
-    return copies or _median_move(seen, earlier[-1]) < _STILL
+    return copies or _median_move(seen, earlier[-1]) < _MAX_MOTION_PX
 
 
 def _median_move(one: CollectedSet, other: CollectedSet) -> float:

@@ -28,7 +28,7 @@ from fisheye_svp_ros.io.decoding import (
     read_pose,
 )
 from fisheye_svp_ros.nodes import messages
-from fisheye_svp_ros.nodes.access import allowed
+from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.backlog import Arrivals, Counts, report
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.inputs import Unread
@@ -82,7 +82,7 @@ class SolverNode(ManagedNode):
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
-        self._wake = self.create_guard_condition(self.guarded(self._work))
+        self._wake = self.create_guard_condition(self.guard_callback(self._work))
         self.collect(
             PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
         self._collect(DiagnosticArray, 'scenario', read_key_values)
@@ -91,7 +91,7 @@ class SolverNode(ManagedNode):
         # Last, because a camera that sees this subscription counts on the others.
         for topic in self._image_points:
             self._collect(PointCloud2, topic, read_image_points)
-        self.every(0.1, self._wake.trigger)
+        self.start_timer(0.1, self._wake.trigger)
 
     def start(self) -> None:
         """Take the parameters into use, as every node does; call it after all `announce`."""
@@ -165,7 +165,7 @@ class SolverNode(ManagedNode):
         scenario = items.get('scenario', {})
         if 'lens' not in scenario:
             raise ParameterError('no scenario names a lens; set the parameter lens')
-        name = allowed(scenario['lens'], self.settings.folder, 'scenario: lens')
+        name = check_access(scenario['lens'], self.settings.folder, 'scenario: lens')
         scale = shift_scale(scenario.get('shift_scale', '1.0'))
         return lens_of(name, scale, self.settings)
 
@@ -238,11 +238,11 @@ class SolverNode(ManagedNode):
         if self._arrivals.go_on(now):
             self._wake.trigger()
             return
-        for one in self._join.ready(now, patience):
+        for one in self._join.pop_complete(now, patience):
             self._backlog.append(one)
             self._compare_stamps(one)
-        for one in self._join.given_up(now, patience):
-            self._give_up(one)
+        for one in self._join.pop_expired(now, patience):
+            self._drop_set(one)
         while len(self._backlog) > self.settings.backlog:
             self._backlog.popleft()
             self._counts.dropped += 1
@@ -251,7 +251,7 @@ class SolverNode(ManagedNode):
         if self._backlog:
             one = self._backlog.popleft()
             self._attempt(one)
-            self._arrivals.done(time.monotonic(), one.since)
+            self._arrivals.finish_set(time.monotonic(), one.since)
         elif self._unread:
             self._look_at(*self._unread.popleft())
         if self._backlog or self._unread:
@@ -311,7 +311,7 @@ class SolverNode(ManagedNode):
         self._counts.unsolved += 1
         self.publish_result(stamp, {}, problem)
 
-    def _give_up(self, one: Pending) -> None:
+    def _drop_set(self, one: Pending) -> None:
         self._counts.incomplete += 1
         missing = [topic for topic in self._image_points if topic not in one.items]
         for topic, stamp in one.stamps.items():

@@ -9,7 +9,7 @@ from geometry_msgs.msg import TransformStamped, Vector3Stamped
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.quality import LATCHED
-from fisheye_svp_ros.nodes.set_collection import CollectedSet, collected_set, scenario_of, table_of
+from fisheye_svp_ros.nodes.set_collection import CollectedSet, make_set, scenario_of, table_of
 from fisheye_svp_ros.nodes.solver import Items, SolverNode, true_rig
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.scene.observations import STEREO, stereo_views
@@ -45,7 +45,7 @@ class StereoCalibrator(SolverNode):
         # A recording that starts over tells nothing new.
         known = ([seen for seen in self._window if seen.stamp != stamp]
                  if scenario == self._scenario else [])
-        one = collected_set(stamp, landmarks, items, self.CAMERAS)
+        one = make_set(stamp, landmarks, items, self.CAMERAS)
         window = [*known, one][-self.settings.views:]
         left, right = stereo_views(table_of(window, self.CAMERAS), self.settings.sigma_px)
         found = solve_rigs(self.models(stamp, items), left, right, true=true_rig(items)).require()

@@ -92,7 +92,7 @@ class Input:
 
     def _add_subscription(self, kind: _Kind, qos: Any) -> None:
         node = self._node
-        adapt = node.guarded(lambda _: self.adapt())
+        adapt = node.guard_callback(lambda _: self.adapt())
         events = SubscriptionEventCallbacks(
             matched=adapt if self._latched else None,
             incompatible_qos=None if self._is_fixed() else adapt)

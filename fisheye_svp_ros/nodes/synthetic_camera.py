@@ -86,7 +86,7 @@ class SyntheticCamera(CameraNode):
         """Refuse settings of which a scenario cannot be simulated."""
         super().prepare(settings)
         if settings.photograph:
-            _printed(settings.photograph)
+            _print_of_board(settings.photograph)
         check_sweep(settings, self._sweep)
         return settings
 
@@ -124,11 +124,11 @@ class SyntheticCamera(CameraNode):
 
     def _photograph(self, step: SweepSet, camera: int, pose: Pose) -> Pixels:
         rng = np.random.default_rng([step.scenario.seed, step.number, step.place])
-        printed = _printed(self.settings.photograph)
+        printed = _print_of_board(self.settings.photograph)
         return render(step.simulation.lenses[camera], printed, pose, Exposure(), rng)
 
 
-def _printed(board: str) -> Print:
+def _print_of_board(board: str) -> Print:
     pattern = parse_pattern(board)
     if pattern.kind != 'chessboard':
         raise ParameterError(f'photograph is {board!r}; only a chessboard can be rendered')

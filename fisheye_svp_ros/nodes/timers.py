@@ -8,7 +8,7 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 
 
-def every(
+def start_timer(
     node: Any, period: float, callback: Callable[[], object], clock: Any = None
 ) -> Any:
     """Have a node call a function every `period` seconds, of real time where no clock is given."""

@@ -35,7 +35,7 @@ class Transforms:
             self._publisher = node.announce(self._kind, topic, qos)
             for topic, asked in TRANSFORMS.items():
                 node.create_subscription(
-                    self._kind, topic, node.guarded(self._compare), asked, raw=True)
+                    self._kind, topic, node.guard_callback(self._compare), asked, raw=True)
 
     def publish(self, pose: Pose, stamp: int, frame: str, child: str) -> None:
         """Publish the pose of a frame in its parent; warn where frame ids cannot be used."""

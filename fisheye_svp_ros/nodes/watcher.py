@@ -14,14 +14,14 @@ from rclpy.node import Node
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.nodes.quality import RELIABLE
-from fisheye_svp_ros.nodes.timers import every
+from fisheye_svp_ros.nodes.timers import start_timer
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
 _LOOK_EVERY = 0.5  # s, for nodes that are new
 
 
 @dataclass
-class Followed:
+class MetricHistory:
     """What one metric of a node has been: its latest value, mean and largest magnitude."""
 
     latest: float = math.nan
@@ -42,7 +42,7 @@ class Results:
     sets: int = 0
     lost: int = 0
     note: str = ''
-    metrics: dict[str, Followed] = field(default_factory=dict)
+    metrics: dict[str, MetricHistory] = field(default_factory=dict)
 
 
 class Watcher(Node):  # type: ignore[misc]
@@ -51,7 +51,7 @@ class Watcher(Node):  # type: ignore[misc]
     def __init__(self) -> None:
         super().__init__('watcher')
         self.results: dict[str, Results] = {}
-        every(self, _LOOK_EVERY, self._look)
+        start_timer(self, _LOOK_EVERY, self._look)
 
     def spin(self, show: Callable[[], None]) -> None:
         """Follow until SIGINT or SIGTERM; `show` is called after whatever came."""
@@ -84,6 +84,6 @@ class Watcher(Node):  # type: ignore[misc]
                 results.lost, results.note = results.lost + 1, message.status[0].message
             for name, value in numbers.items():
                 if math.isfinite(value):
-                    results.metrics.setdefault(name, Followed()).add(value)
+                    results.metrics.setdefault(name, MetricHistory()).add(value)
 
         return hear

@@ -145,7 +145,7 @@ class Rectification:
     @cached_property
     def _model(self) -> ForwardModel:
         # Corrections of a target are of no scene; rows are exposed together in a still camera.
-        return ForwardModel(replace(self.lens, target={})).still()
+        return ForwardModel(replace(self.lens, target={})).without_motion()
 
     @property
     def _center(self) -> Array:

@@ -34,7 +34,7 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     step = max(lens.width, lens.height) / _SAMPLES
     uv = np.stack(np.meshgrid(np.arange(0.0, lens.width, step), np.arange(0.0, lens.height, step)),
                   axis=-1).reshape(-1, 2)
-    model = ForwardModel(replace(lens, target={})).still()
+    model = ForwardModel(replace(lens, target={})).without_motion()
     rays = model.back_project(uv[None]).reshape((len(uv),))
     uv, origin, direction = uv[rays.valid], rays.origin[rays.valid], rays.direction[rays.valid]
     points = meet_sphere(origin, direction, np.zeros(3), range_m)

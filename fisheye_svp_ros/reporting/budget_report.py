@@ -14,16 +14,16 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.reporting.plots import OURS, PUBLISHED, picture
 from fisheye_svp_ros.study.budget import QUANTITIES, UNITS, Budget, Point
 
-_SHORT = 30.0  # times, from the least to the largest error
-_PEOPLE = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
-_WORDS = {
+_LINEAR_AXIS_RATIO = 30.0  # times, from the least to the largest error
+_DISPLAY_UNITS = {'m': ('mm', 1e3), 'rad': ('deg', float(np.degrees(1.0))), 'px': ('px', 1.0)}
+_LABELS = {
     'position': 'position of the camera', 'axis': 'viewing axis', 'residual': 'mean residual',
     'epipolar': 'epipolar distance', 'depth': 'stereo points',
 }
-_KEPT = {True: 'yes', False: 'no', None: '-'}
+_YES_NO = {True: 'yes', False: 'no', None: '-'}
 
 
-class Asked(NamedTuple):
+class BudgetRequest(NamedTuple):
     """What the user asked for: lens; spread, rad; working range, m; quantities with a limit.
 
     port: whether the lens is behind one, so that the question is that of its calibration in air;
@@ -50,22 +50,22 @@ class Asked(NamedTuple):
         return ('error', f'{self.model} causes', 'noise causes', *own, 'limit', 'unit', 'kept',
                 'nearest range', 'largest spread')
 
-    def judged(self, points: Sequence[Point]) -> list[Point]:
+    def relevant_points(self, points: Sequence[Point]) -> list[Point]:
         """Return the points that the answer rests on."""
         return [point for point in points if not self.given or point.quantity in self.given]
 
 
-def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
+def rows(points: Sequence[Point], asked: BudgetRequest) -> list[tuple[str, ...]]:
     """Return the table's rows, under the header."""
     found = []
-    for point in asked.judged(points):
-        unit, factor = _PEOPLE[UNITS[point.quantity]]
+    for point in asked.relevant_points(points):
+        unit, factor = _DISPLAY_UNITS[UNITS[point.quantity]]
         own = (point.parameters, point.misfit) if asked.own else ()
         found.append((
-            _WORDS[point.quantity],
+            _LABELS[point.quantity],
             *(f'{factor * value:.3g}' if np.isfinite(value) else '-'
               for value in (point.error, point.noise, *own, point.limit)),
-            unit, _KEPT[point.kept],
+            unit, _YES_NO[point.kept],
             f'{point.nearest_range:.2f} m' if np.isfinite(point.nearest_range) else 'nowhere',
             f'{np.degrees(point.largest_spread):.0f} deg'
             if np.isfinite(point.largest_spread) else 'nowhere',
@@ -73,21 +73,21 @@ def rows(points: Sequence[Point], asked: Asked) -> list[tuple[str, ...]]:
     return found
 
 
-def answer(points: Sequence[Point], asked: Asked) -> str:
+def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
     """Return the answer to whether shift and port may be neglected, as a sentence."""
     where = (f'for landmarks within {np.degrees(asked.spread):.0f} degrees of the axis at '
              f'{asked.working_range:g} m')
-    judged = asked.judged(points)
+    judged = asked.relevant_points(points)
     broken = [point for point in judged if point.kept is False]
     unknown = [point for point in judged if point.kept is None]
     if not broken and not unknown:
         return f'Yes: {where} {asked.model} keeps every limit.'
-    untold = ' and '.join(_WORDS[one.quantity] for one in unknown) + ' cannot be computed there'
+    untold = ' and '.join(_LABELS[one.quantity] for one in unknown) + ' cannot be computed there'
     if not broken:
         return (f'Not known: {where} {asked.model} keeps {len(judged) - len(unknown)} of '
                 f'{len(judged)} limits; {untold}.')
     worst = max(broken, key=lambda point: point.error / point.limit)
-    unit, factor = _PEOPLE[UNITS[worst.quantity]]
+    unit, factor = _DISPLAY_UNITS[UNITS[worst.quantity]]
     limit = 'what you allow' if asked.given else 'what noise causes'
     needed = max(point.nearest_range for point in (*broken, *unknown))
     neglected = 'will do' if asked.port else 'may be neglected'
@@ -95,7 +95,7 @@ def answer(points: Sequence[Point], asked: Asked) -> str:
               else 'no range within the budget helps')
     return (
         f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits, worst the '
-        f'{_WORDS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
+        f'{_LABELS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
         f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}'
         + (f'; {untold}.' if unknown else '.')
     )
@@ -107,13 +107,13 @@ def negligible(points: Sequence[Point]) -> bool | None:
     return False if False in kept else None if None in kept else True
 
 
-def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str, Any]:
+def document(budget: Budget, points: Sequence[Point], asked: BudgetRequest) -> dict[str, Any]:
     """Return the mapping of budget.json, SI and px."""
     return {
         'lens': asked.lens,
         'spread_rad': asked.spread,
         'range_m': asked.working_range,
-        'negligible': negligible(asked.judged(points)),
+        'negligible': negligible(asked.relevant_points(points)),
         'answer': answer(points, asked),
         'at_point': [
             {**point._asdict(), 'unit': UNITS[point.quantity],
@@ -129,12 +129,12 @@ def document(budget: Budget, points: Sequence[Point], asked: Asked) -> dict[str,
     }
 
 
-def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> None:
+def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetRequest) -> None:
     """Draw SVP errors over range and spread, with the line on which each limit is met."""
     with picture(path, 12.5, 6.4) as figure:
         axes = figure.subplots(2, 3)
         for axis, point in zip(axes.flat, points, strict=False):
-            unit, factor = _PEOPLE[UNITS[point.quantity]]
+            unit, factor = _DISPLAY_UNITS[UNITS[point.quantity]]
             error = np.ma.masked_invalid(factor * budget.error[point.quantity])
             mesh = axis.pcolormesh(
                 budget.ranges, np.degrees(budget.spreads), error, shading='nearest',
@@ -145,7 +145,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
             axis.plot(asked.working_range, np.degrees(asked.spread), '*', color=PUBLISHED,
                       markersize=11)
             kept = {True: 'kept', False: 'broken', None: 'not known'}[point.kept]
-            axis.set_title(f'{_WORDS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
+            axis.set_title(f'{_LABELS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
                            f'{kept}', fontsize=9.5)
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
             axis.xaxis.set_major_formatter('{x:g}')
@@ -155,7 +155,7 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: Asked) -> N
 
 def _label(bar: Any, error: Array) -> None:
     """Write plain numbers beside a logarithmic colour bar; 1, 2, 5 where it is short."""
-    short = error.max() < _SHORT * error.min()
+    short = error.max() < _LINEAR_AXIS_RATIO * error.min()
     bar.ax.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     bar.ax.yaxis.set_major_formatter('{x:g}')
     bar.ax.yaxis.set_minor_formatter('{x:g}' if short else NullFormatter())

@@ -20,7 +20,7 @@ from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typica
 
 _WIDTH = 9.2  # in
 _ARROWS, _TICKS = 2500, 60
-_LONG = 0.03  # of the image, the typical residual
+_ARROW_LENGTH = 0.03  # of the image, the typical residual
 
 
 def write_calibration_report(
@@ -56,12 +56,12 @@ def _rays(one: CalibratedCamera) -> tuple[Array, RayModel]:
     names = one.result.adjusted.names
     values = parameter_values(one.lens, names)
 
-    def changed(step: Array) -> Lens:
+    def perturb_lens(step: Array) -> Lens:
         return one.lens.with_parameters(names, [*np.add(values, step).tolist()])
 
     views = one.result.views
     uv = typical_points(views.uv[views.used])
-    model, there = ray_model(changed, one.trust.covariance, uv)
+    model, there = ray_model(perturb_lens, one.trust.covariance, uv)
     return uv[there], model
 
 
@@ -99,7 +99,7 @@ def _residuals(figure: Any, one: CalibratedCamera) -> None:
     size = np.linalg.norm(residual, axis=1)
     typical = max(float(np.quantile(size, 0.9)), 1e-9)
     key = image.quiver(*uv[::step].T, *residual[::step].T, angles='xy', scale_units='xy',
-                       scale=typical / (_LONG * lens.width), color=OURS, width=0.002)
+                       scale=typical / (_ARROW_LENGTH * lens.width), color=OURS, width=0.002)
     length = round_number(typical)
     image.quiverkey(key, 0.8, 1.04, length, f'{length:g} px', labelpos='E')
     _image(image, lens)

@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.study.lens_trust import LensTrust
 
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
-_ABOVE = 2.0  # times the noise, from which residuals show a model error
-_ASIDE = 0.1  # of the image, by which a principal point is seldom off its centre
-_MIDDLE = 0.7  # of the way to the nearest edge: image points that reach no further are few
+_MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
+_MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre
+_MIN_COVERED_RADIUS = 0.7  # of the way to the nearest edge; less is poor coverage
 
 
 @dataclass(frozen=True)
@@ -53,17 +53,17 @@ class CalibratedCamera:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What there is to say against the lens, a sentence each."""
-        return (*self._of_shift(), *self._of_fit(), *self._of_image(),
+        return (*self._shift_warnings(), *self._fit_warnings(), *self._image_warnings(),
                 *(hand_eye_warnings(self.hand_eye) if self.hand_eye else ()))
 
-    def _of_shift(self) -> list[str]:
+    def _shift_warnings(self) -> list[str]:
         return [
             f'{name} is not settled: from {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm '
             'over all targets that these data admit, whose shape can explain it; ask '
             '`fisheye-svp diagnose`'
             for name, range_ in self.trust.doubtful_shift.items()]
 
-    def _of_fit(self) -> list[str]:
+    def _fit_warnings(self) -> list[str]:
         found, result = [], self.result
         if result.left_out:
             found.append('left out, since their points do not fix a pose (all near one line, or '
@@ -75,7 +75,7 @@ class CalibratedCamera:
             found.append(f'{self.model} leaves {rms:.1f} px: it does not fit this lens, or image '
                          'points and landmarks do not belong together (order, units, axes, image '
                          'size)')
-        elif np.isfinite(sigma) and rms > _ABOVE * 2**0.5 * sigma:
+        elif np.isfinite(sigma) and rms > _MODEL_ERROR_RATIO * 2**0.5 * sigma:
             found.append(f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of '
                          'image points: lens or target has a model error; ask '
                          '`fisheye-svp diagnose`')
@@ -84,17 +84,18 @@ class CalibratedCamera:
                          'fitted curve turns back; another model may suit this lens')
         return found
 
-    def _of_image(self) -> list[str]:
+    def _image_warnings(self) -> list[str]:
         """Say where the image of the lens lies askew, or was not covered."""
         lens, views, found = self.lens, self.result.views, []
         off = lens.cx - (lens.width - 1) / 2, lens.cy - (lens.height - 1) / 2
-        if abs(off[0]) > _ASIDE * lens.width or abs(off[1]) > _ASIDE * lens.height:
+        if (abs(off[0]) > _MAX_CENTER_OFFSET * lens.width
+                or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height):
             found.append(
                 f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the centre of the '
                 'image: was it cropped, or is the image size another one?')
         out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
         edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
-        if out < _MIDDLE * edge:
+        if out < _MIN_COVERED_RADIUS * edge:
             found.append(
                 f'image points lie within {out:.0f} px of the centre, the nearest edge is at '
                 f'{edge:.0f} px: past {np.degrees(self.result.reached):.0f} deg nothing holds the '

@@ -33,7 +33,7 @@ _CELLS = 18  # of the mean field, along the image
 Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 
 
-class Shown(NamedTuple):
+class PlotData(NamedTuple):
     """What the pictures are of: observations without gross errors, lenses by camera, noise (px).
 
     lenses: '' is that of all cameras; table: the observations, which name photographs.
@@ -45,7 +45,7 @@ class Shown(NamedTuple):
     table: Observations
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis, points: PointResiduals) -> Shown:
+    def from_diagnosis(cls, diagnosis: Diagnosis, points: PointResiduals) -> PlotData:
         """Leave out gross errors: they have a table of their own."""
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
@@ -62,7 +62,7 @@ class Shown(NamedTuple):
         return PointResiduals._make(array[mine] for array in self.points)
 
 
-def draw_field(path: Path, shown: Shown) -> None:
+def draw_field(path: Path, shown: PlotData) -> None:
     """Residual vectors over the image: of single points, and means over cells of the image."""
     lenses = list(shown.lenses.items())
     sides = [lens.height / lens.width for _, lens in lenses for _ in range(2)]
@@ -95,7 +95,7 @@ def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> Non
         axis.set_xlabel('u / px')
 
 
-def draw_against(path: Path, shown: Shown, x: Array, label: str, log: bool = False) -> None:
+def draw_against(path: Path, shown: PlotData, x: Array, label: str, log: bool = False) -> None:
     """Radial and tangential residuals against a variable (K,), with binned means."""
     rows = [('radial / px', 0), ('tangential / px', 1)]
     polar = {side: _polar(shown, getattr(shown.points, side)) for side, _ in _SIDES}
@@ -104,7 +104,7 @@ def draw_against(path: Path, shown: Shown, x: Array, label: str, log: bool = Fal
     ], label, log)
 
 
-def draw_phase(path: Path, shown: Shown) -> None:
+def draw_phase(path: Path, shown: PlotData) -> None:
     """Residuals of u and v against the place of u and v within its pixel."""
     phase = np.mod(shown.points.uv + 0.5, 1.0) - 0.5
     _grid(path, shown, [
@@ -114,7 +114,7 @@ def draw_phase(path: Path, shown: Shown) -> None:
     ], 'place of u (above) and v (below) in its pixel / px', False)
 
 
-def draw_histogram(path: Path, shown: Shown) -> None:
+def draw_histogram(path: Path, shown: PlotData) -> None:
     """Residuals of both coordinates over the noise, beside the normal distribution."""
     bins = np.linspace(-6, 6, 73)
     middle = (bins[:-1] + bins[1:]) / 2
@@ -132,7 +132,7 @@ def draw_histogram(path: Path, shown: Shown) -> None:
 
 
 def _grid(
-    path: Path, shown: Shown, rows: list[tuple[str, Array, dict[str, Array]]], label: str,
+    path: Path, shown: PlotData, rows: list[tuple[str, Array, dict[str, Array]]], label: str,
     log: bool,
 ) -> None:
     with picture(path, _WIDTH, 4.4) as figure:
@@ -140,7 +140,7 @@ def _grid(
         for row, (name, x, values) in zip(axes, rows, strict=True):
             highest = 2.2 * shown.noise
             for axis, (side, colour) in zip(row, _SIDES, strict=True):
-                highest = max(highest, _binned(axis, x, values[side], shown.noise, colour))
+                highest = max(highest, _plot_bins(axis, x, values[side], shown.noise, colour))
             row[0].set(ylabel=name, ylim=(-1.2 * highest, 1.2 * highest))
         for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
             axis.set_title(side, color=colour)
@@ -152,7 +152,7 @@ def _grid(
         _legend(figure, axes[0, 1])
 
 
-def _binned(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
+def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> float:
     """Draw points, and of bins of equal count the means, their errors and the scatter.
 
     Returns the largest mean with its error, px.
@@ -183,7 +183,7 @@ def _legend(figure: Figure, axis: Axes) -> None:
 
 
 def draw_groups(
-    path: Path, shown: Shown, group: Index, x: Array | None, label: str,
+    path: Path, shown: PlotData, group: Index, x: Array | None, label: str,
     ticks: Sequence[str] = (),
 ) -> None:
     """Rms of the residuals of each group (K,): landmark or frame, or over a variable (K,).
@@ -254,7 +254,7 @@ def _cell_means(uv: Array, residual: Array, cell: float) -> tuple[Array, Array]:
     return table[:, :2], table[:, 2:]
 
 
-def _polar(shown: Shown, residual: Array) -> Array:
+def _polar(shown: PlotData, residual: Array) -> Array:
     """Return residuals (K, 2) along the radius and across it."""
     centres = np.array([(lens.cx, lens.cy) for lens in shown.lenses.values()])
     arm = shown.points.uv - (centres[shown.points.camera] if len(centres) > 1 else centres[0])
@@ -263,7 +263,7 @@ def _polar(shown: Shown, residual: Array) -> Array:
     return np.stack([(residual * way).sum(axis=1) for way in (radial, across)], axis=-1)
 
 
-def _by_photograph(shown: Shown) -> tuple[Index, None, str, list[str]]:
+def _by_photograph(shown: PlotData) -> tuple[Index, None, str, list[str]]:
     """Return the view of each point, no variable, a label, and the photographs' names."""
     views, which = np.unique(
         np.stack([shown.points.camera, shown.points.frame]), axis=1, return_inverse=True)
@@ -272,7 +272,7 @@ def _by_photograph(shown: Shown) -> tuple[Index, None, str, list[str]]:
     return which.reshape(-1), None, 'photograph', names
 
 
-def residual_pictures(shown: Shown) -> Iterator[Picture]:
+def residual_pictures(shown: PlotData) -> Iterator[Picture]:
     """Yield name, function and arguments of every picture of residuals."""
     points = shown.points
     spread = points.range.max() > 4 * points.range.min()

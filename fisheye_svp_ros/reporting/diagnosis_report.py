@@ -17,7 +17,7 @@ from fisheye_svp_ros.planning.plan import NextViews
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
-from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.first_screen import first_screen, next_command
 from fisheye_svp_ros.reporting.headline import VERDICTS
@@ -90,25 +90,26 @@ def write_report(
         pictures={'target': None, 'evidence': None, 'next': None,
                   **{p.stem: data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
-        **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis), **_rest(diagnosis),
-        next=_next(wanted), uncertainty=list(text.uncertainty_rows(diagnosis)),
+        **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis),
+        **_remaining_structures(diagnosis), next=_next_views(wanted),
+        uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
-        extended=_extended(diagnosis, inputs), not_offered=text.not_offered(diagnosis),
+        extended=_follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
     ))
     return [report, *pictures]
 
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
     """Return the command to go on with, as a shell takes it."""
-    words = _extended(diagnosis, inputs)
+    words = _follow_up_files(diagnosis, inputs)
     lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
     return next_command(diagnosis, words['observations'], words['options'], lenses)
 
 
-def _extended(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
+def _follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
     """Return what commands need to go on: the observations, the extended lenses, the first one."""
-    files = {camera: inputs.folder / camera / text.EXTENDED for camera in diagnosis.lenses}
+    files = {camera: inputs.folder / camera / text.LENS_FILE for camera in diagnosis.lenses}
     options = [word for camera, path in files.items()
                for word in ('--lens', f'{camera}={path}' if camera else str(path))]
     return {
@@ -118,7 +119,7 @@ def _extended(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
     }
 
 
-def _next(wanted: NextViews | None) -> dict[str, Any]:
+def _next_views(wanted: NextViews | None) -> dict[str, Any]:
     if wanted is None:
         return {}
     return {'purpose': shot_list.purpose(wanted), 'header': shot_list.HEADER,
@@ -126,7 +127,7 @@ def _next(wanted: NextViews | None) -> dict[str, Any]:
 
 
 def _draw(diagnosis: Diagnosis, points: PointResiduals, folder: Path) -> Iterator[Path]:
-    for name, draw, arguments in residual_pictures(Shown.of(diagnosis, points)):
+    for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(diagnosis, points)):
         draw(folder / f'{name}.png', *arguments)
         yield folder / f'{name}.png'
     if diagnosis.trace:
@@ -148,12 +149,12 @@ def _target_maps(diagnosis: Diagnosis) -> Iterator[tuple[str, BoardMap]]:
         shown += [(f'{name} alone', (name,)) for name in mapped
                   if CATALOGUE[name].target_map == 'smooth']
     for title, names in shown:
-        yield from ((title, m) for m in diagnosis.board_maps(names) if m.spread_out)
+        yield from ((title, m) for m in diagnosis.board_maps(names) if m.spans_plane)
 
 
 def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
     free = {'poses': diagnosis.model.data.poses is None, 'intrinsics': inputs.free_intrinsics}
-    return text.listed([name for name, fitted in free.items() if fitted]) or 'nothing'
+    return text.join_names([name for name, fitted in free.items() if fitted]) or 'nothing'
 
 
 def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -164,7 +165,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
         ))
         shown = list(cause.parameters.items())[:_ROWS]
         causes.append({
-            **fields, 'what': text.what(cause.effect),
+            **fields, 'what': text.describe_effect(cause.effect),
             'to_separate': cause.to_separate if cause.indistinguishable_from else '',
             'parameters': [
                 (name, text.quantity(entry), f'{entry["value"]:.6g} {entry["unit"]}')
@@ -214,7 +215,7 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
+def _remaining_structures(diagnosis: Diagnosis) -> dict[str, Any]:
     strongest = sorted(diagnosis.remaining, key=lambda structure: -structure.share)
     return {
         'remaining': [
@@ -227,7 +228,7 @@ def _rest(diagnosis: Diagnosis) -> dict[str, Any]:
             }
             for s in {s.variable: s for s in strongest}.values()
         ],
-        'looked_at': text.listed(list(text.VARIABLES.values()), 'or'),
+        'looked_at': text.join_names(list(text.VARIABLES.values()), 'or'),
         'untestable': [
             (effect, why, CATALOGUE[effect].signature)
             for effect, why in diagnosis.untestable.items()

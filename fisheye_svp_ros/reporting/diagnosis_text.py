@@ -19,11 +19,11 @@ from fisheye_svp_ros.diagnosis import (
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
 
-EXTENDED = 'extended_lens.yaml'
+LENS_FILE = 'extended_lens.yaml'
 LENS = {
     'keep': 'Keep the lens',
-    'use_extended': f'Use {EXTENDED}',
-    'recalibrate': f'Do not use the lens as given: calibrate again, or use {EXTENDED}',
+    'use_extended': f'Use {LENS_FILE}',
+    'recalibrate': f'Do not use the lens as given: calibrate again, or use {LENS_FILE}',
     'undecided': 'Do not decide on the lens yet',
 }
 _OF_RIG = {'keep': 'Keep the lenses', 'undecided': 'Do not decide on the lenses yet',
@@ -38,7 +38,7 @@ VARIABLES = {
     'time': 'the time',
     'pixel_phase': 'the place within a pixel',
 }
-_OTHERWISE = {
+_STRUCTURE_TEXTS = {
     'outliers': 'a few points lie far off',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
@@ -79,12 +79,12 @@ STAGE_WORDS = {
     'lens': 'lens (stays in the image)', 'target': 'target (stays with the board)',
     'frame': 'frames (motion, detector, light)', 'noise': 'noise',
 }
-_NAMED = 3  # causes that one sentence can bear
-_UNDETERMINED = 1e-6  # of its standard error: a parameter of which the data know nothing
-_NOTHING = 1e-12  # what rounding leaves of a parameter that does nothing
-_MOST = 6  # names in one sentence
-_ABOVE = 1.5  # times the noise, from which an error is more than that
-_FEW = 4  # parameters that are read one by one
+_MAX_CAUSES = 3  # causes that one sentence can bear
+_UNDETERMINED_RATIO = 1e-6  # of its standard error: a parameter of which the data know nothing
+_ZERO_TOLERANCE = 1e-12  # what rounding leaves of a parameter that does nothing
+_MAX_NAMES = 6  # names in one sentence
+_NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
+_MAX_PARAMETERS = 4  # parameters that are read one by one
 
 
 def lens_words(d: Diagnosis) -> str:
@@ -92,7 +92,7 @@ def lens_words(d: Diagnosis) -> str:
     return (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
 
 
-def not_offered(d: Diagnosis) -> str:
+def refusal_reason(d: Diagnosis) -> str:
     """Return why the extended lens is not to be used, '' where it is."""
     if d.offers_extended:
         return ''
@@ -104,7 +104,7 @@ def only_gross(d: Diagnosis) -> bool:
     return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
 
 
-def what(effect: str) -> str:
+def describe_effect(effect: str) -> str:
     """Return what an effect is, as the end of a sentence."""
     text = CATALOGUE[effect].summary()
     return text[0].lower() + text[1:].rstrip('.')
@@ -131,17 +131,17 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
         return _landmarks(diagnosis, cause)
     named = [
         f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
-        if abs(entry['value']) > max(_NOTHING, _UNDETERMINED * entry['stderr'])
-        or (math.isnan(entry['stderr']) and abs(entry['value']) > _NOTHING)
+        if abs(entry['value']) > max(_ZERO_TOLERANCE, _UNDETERMINED_RATIO * entry['stderr'])
+        or (math.isnan(entry['stderr']) and abs(entry['value']) > _ZERO_TOLERANCE)
     ]
-    if len(named) <= _FEW:
+    if len(named) <= _MAX_PARAMETERS:
         return ', '.join(named)
-    return ', '.join(named[:_FEW]) + f' and {len(named) - _FEW} more'
+    return ', '.join(named[:_MAX_PARAMETERS]) + f' and {len(named) - _MAX_PARAMETERS} more'
 
 
 def _landmarks(diagnosis: Diagnosis, cause: Cause) -> str:
     names = list(dict.fromkeys(name.partition('.')[0] for name in cause.parameters))
-    if len(names) <= _FEW:
+    if len(names) <= _MAX_PARAMETERS:
         values = np.array([entry['value'] for entry in cause.parameters.values()]).reshape(-1, 3)
         far = 1e3 * np.linalg.norm(values, axis=1)
         return ', '.join(f'landmark {n} by {d:.2f} mm' for n, d in zip(names, far, strict=True))
@@ -169,9 +169,9 @@ def remains(diagnosis: Diagnosis, most: int = 3) -> str:
     """Return what the residuals still show, the variables they depend on most first."""
     order = sorted(diagnosis.remaining, key=lambda structure: -structure.share)
     names = list(dict.fromkeys(structure.variable for structure in order))
-    depends = [VARIABLES.get(name, name) for name in names if name not in _OTHERWISE]
-    clauses = [f'they depend on {listed(depends[:most])}'] if depends else []
-    others = (remaining_text(diagnosis, name) for name in names if name in _OTHERWISE)
+    depends = [VARIABLES.get(name, name) for name in names if name not in _STRUCTURE_TEXTS]
+    clauses = [f'they depend on {join_names(depends[:most])}'] if depends else []
+    others = (remaining_text(diagnosis, name) for name in names if name in _STRUCTURE_TEXTS)
     return '; '.join([*clauses, *others])
 
 
@@ -187,7 +187,7 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
         return f'the residuals are {ratio:.2g} times as large as sigma says'
     depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
-    return _OTHERWISE.get(variable, depends)
+    return _STRUCTURE_TEXTS.get(variable, depends)
 
 
 def verdict_sentences(
@@ -197,15 +197,15 @@ def verdict_sentences(
 
     known: errors where the truth is known, of `diagnosis.known_errors`.
     """
-    return _wrong(diagnosis), _gained(diagnosis, known or {}), _next(diagnosis)
+    return _wrong(diagnosis), _gain_sentence(diagnosis, known or {}), _next_step(diagnosis)
 
 
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if d.verdict == 'adequate':
         but = [what for what, told in (('the intrinsics as given', _is_off(d)),
-                                       ('where the cameras stand', _loose(d))) if told]
-        nothing = f'Nothing but {listed(but)}' if but else 'Nothing'
+                                       ('where the cameras stand', _rig_advice(d))) if told]
+        nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
         return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
@@ -213,10 +213,10 @@ def _wrong(d: Diagnosis) -> str:
                 'effect of the catalogue accounts for what is odd about them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; because '.join(
-        f'{what(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
-        for c in d.causes[:_NAMED]
+        f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
+        for c in d.causes[:_MAX_CAUSES]
     )
-    more = len(d.causes) - _NAMED
+    more = len(d.causes) - _MAX_CAUSES
     rest = f'; and for {more} more reason{"s" * (more > 1)} in the table' if more > 0 else ''
     return f'Beyond {noise} the simulation is wrong because {causes}{rest}.'
 
@@ -232,11 +232,11 @@ def _almost(d: Diagnosis) -> str:
 
 
 def _name(cause: Cause) -> str:
-    others = listed(cause.indistinguishable_from, 'or')
+    others = join_names(cause.indistinguishable_from, 'or')
     return f'{cause.effect}, or as well {others}' if others else cause.effect
 
 
-def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
+def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     before, named, best = (quality.heldout_rms_px for quality in (
         d.figures.base, d.figures.named, d.figures.extended))
     moving = [c for c in d.causes if c.effect_class.stage != 'noise']
@@ -250,7 +250,7 @@ def _gained(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
         if d.verdict == 'adequate':
-            why = 'that is the noise' if times < _ABOVE else (
+            why = 'that is the noise' if times < _NOISE_RATIO else (
                 f'that is {times:.1f} times the noise: these frames hold the lens too loosely to '
                 'predict others; --next N says which are wanted')
         if d.causes:
@@ -283,36 +283,36 @@ def _is_off(d: Diagnosis) -> bool:
     return d.decision['lens'].say == 'recalibrate'
 
 
-def _loose(d: Diagnosis) -> list[str]:
+def _rig_advice(d: Diagnosis) -> list[str]:
     """Return what to find out of cameras that no rig holds together."""
-    return [f'find out why no rig holds {listed(pair.cameras)} together (frame numbers of other '
+    return [f'find out why no rig holds {join_names(pair.cameras)} (frame numbers of other '
             'moments, points numbered from the other end, exchanged cameras, a loose mount)'
             for pair in d.cameras if pair.posed_alone and pair.rig]
 
 
-def _next(d: Diagnosis) -> str:
+def _next_step(d: Diagnosis) -> str:
     lens = lens_words(d)
     if d.verdict == 'adequate':
-        blind = f'; these data could not test {listed(list(d.untestable))}' if d.untestable else ''
-        return '; '.join([lens, *_loose(d)]) + f'{blind}.'
-    steps = [lens, *_loose(d)]
+        blind = f'; not testable here: {join_names(list(d.untestable))}' if d.untestable else ''
+        return '; '.join([lens, *_rig_advice(d)]) + f'{blind}.'
+    steps = [lens, *_rig_advice(d)]
     steps += [
-        f'find out why {listed(pair.cameras)} contradict each other about the target: was it bent '
-        'anew or exchanged in between, do they number its landmarks alike? Trust no correction of '
+        f'find out why {join_names(pair.cameras)} contradict each other about the target: was it '
+        'bent or exchanged in between, do they number its landmarks alike? Trust no correction of '
         'it until then' for pair in d.cameras if pair.verdict == 'contradict'
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice
-              if one.gain > 0 and one.what != USE_EXTENDED][:_NAMED]
+              if one.gain > 0 and one.what != USE_EXTENDED][:_MAX_CAUSES]
     steps += [advice_text(one) for one in d.advice if one.what == DIAGNOSE_AIR]
     held = [c.effect for c in d.causes
             if c.effect_class.budget_stage() == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
-        steps.append(f'it holds {listed(held)}')
+        steps.append(f'it holds {join_names(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
-        f'to tell {c.effect} from {listed(c.indistinguishable_from, "and")}: {_remedy(c)}'
+        f'to tell {c.effect} from {join_names(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
@@ -326,14 +326,14 @@ def _next(d: Diagnosis) -> str:
 def advice_text(advice: Advice) -> str:
     """Return one thing to do, with the names of what it is about."""
     frames = [] if advice.photographs else [*dict.fromkeys(advice.frames)]
-    about = [listed(advice.photographs[:_MOST])] if advice.photographs else []
+    about = [join_names(advice.photographs[:_MAX_NAMES])] if advice.photographs else []
     about += [
-        f'{name}s {listed([str(n) for n in numbers[:_MOST]])}' if len(numbers) > 1
+        f'{name}s {join_names([str(n) for n in numbers[:_MAX_NAMES]])}' if len(numbers) > 1
         else f'{name} {numbers[0]}'
         for name, numbers in (('frame', frames), ('board', advice.boards),
                               ('landmark', advice.landmarks)) if numbers
     ]
-    what = advice.what.replace('the extended lens file', EXTENDED)
+    what = advice.what.replace('the extended lens file', LENS_FILE)
     return f'{what} ({", ".join(about)})' if about else what
 
 
@@ -391,6 +391,6 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
         yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
 
 
-def listed(names: Sequence[str], word: str = 'and') -> str:
+def join_names(names: Sequence[str], word: str = 'and') -> str:
     """Return names as one enumerates them."""
     return f' {word} '.join(filter(None, (', '.join(names[:-1]), *names[-1:])))

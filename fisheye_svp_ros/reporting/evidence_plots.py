@@ -16,7 +16,7 @@ from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK
 from fisheye_svp_ros.reporting.plots import picture, round_number
 
-_REFUSED = '#cbd5e1'
+_REJECTED_COLOR = '#cbd5e1'
 _CELLS = 24  # over the longer side of the image
 _TITLES = {'noise': 'noise of a point', 'parameters': 'parameters of the lens',
            'misfit': 'what remains without a name'}
@@ -30,7 +30,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
         left, right = figure.subplots(1, 2)
         left.barh(
             [step.effect[:40] for step in steps], [step.statistic for step in steps],
-            color=[AFTER if step.accepted else _REFUSED for step in steps],
+            color=[AFTER if step.accepted else _REJECTED_COLOR for step in steps],
         )
         left.set(xlabel='score statistic', title='steps of the search', xscale='log')
         if steps:  # bars begin at a power of ten, whose names alone have room below them
@@ -38,15 +38,15 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
             left.set_xlim(left=10.0 ** math.ceil(math.log10(least) - 1))
         left.xaxis.set_minor_formatter(NullFormatter())
         left.plot([], [], 's', color=AFTER, label='accepted')
-        left.plot([], [], 's', color=_REFUSED, label='refused')
+        left.plot([], [], 's', color=_REJECTED_COLOR, label='refused')
         left.legend(loc='lower right', fontsize=8)
-        _held_out(right, diagnosis)
+        _plot_heldout_rms(right, diagnosis)
         for axis in (left, right):
             axis.invert_yaxis()
             axis.grid(visible=False, axis='y')
 
 
-def _held_out(axis: Axes, diagnosis: Diagnosis) -> None:
+def _plot_heldout_rms(axis: Axes, diagnosis: Diagnosis) -> None:
     causes = [c for c in diagnosis.causes if math.isfinite(c.heldout_rms_px)]
     names = ['the lens as given', *(f'+ {cause.effect}' for cause in causes), '+ local offsets']
     rms = [diagnosis.figures.base.heldout_rms_px, *(cause.heldout_rms_px for cause in causes),

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
-from fisheye_svp_ros.reporting.diagnosis_text import compared_row, listed, quantity
+from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names, quantity
 from fisheye_svp_ros.reporting.hand_eye_text import (
     HEADER,
     hand_eye_rows,
@@ -17,9 +17,10 @@ from fisheye_svp_ros.reporting.hand_eye_text import (
 from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
-_APART, _MOST = 3.0, 4
-_ALONE = ('; they do not keep their places, or were not photographed at the same moments, so that '
-          'each view was posed by itself: nothing rests on their rig')
+_SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
+_NO_RIG_NOTE = (
+    '; they do not keep their places, or were not photographed at the same moments, so each view '
+    'has a pose of its own and no result depends on their rig')
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'The two cameras as each other\'s truth'
@@ -77,10 +78,10 @@ def _of_cameras(pair: TwoCameras) -> Section:
 
 
 def _agreement(pair: TwoCameras) -> str:
-    both = listed(pair.cameras)
+    both = join_names(pair.cameras)
     if pair.verdict == 'nothing':
-        return f'Neither {listed(pair.cameras, "nor")} calls for another shape of the target'
-    tried = listed([
+        return f'Neither {join_names(pair.cameras, "nor")} calls for another shape of the target'
+    tried = join_names([
         f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
     ])
     carried = f'the shape of the target found by one alone takes held-out frames of {tried}'
@@ -89,7 +90,7 @@ def _agreement(pair: TwoCameras) -> str:
         return f'{both} bear each other out: {carried}{alike}'
     if pair.verdict == 'undecided':
         return f'{both} do not settle it: {carried}, which is not beyond chance in both{alike}'
-    gone = f', so that {listed(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
+    gone = f', so that {join_names(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
     return f'{both} contradict each other about the target: {carried}{alike}{gone}'
 
 
@@ -97,13 +98,13 @@ def _rig(pair: TwoCameras) -> str:
     if not pair.rig:
         return '; too few frames were seen by both to say how their rig scatters'
     if pair.posed_alone:
-        return _ALONE
+        return _NO_RIG_NOTE
     if pair.verdict in ('nothing', 'contradict'):
         return ''
     said = []
     for label, before, after, less in _rig_rows(pair.rig):
         said.append(f'{label} {before} before and {after} after ({less} less)')
-    return '; found view by view, the rig scatters: ' + listed(said)
+    return '; found view by view, the rig scatters: ' + join_names(said)
 
 
 def _rig_rows(rig: dict[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
@@ -125,14 +126,15 @@ def _of_sets(against: TwoDatasets) -> Section:
          f'{one.standardized_difference:.1f} standard errors apart')
         for name, one in against.parameters.items()
     ]
-    return Section(SETS_TITLE, f'{_lens_holds(against)}{_apart(against)}{_follows(against)}.',
+    return Section(SETS_TITLE, f'{_lens_holds(against)}{_difference_text(against)}'
+                   f'{_follows(against)}.',
                    carried, ('of the lens', 'here', Path(against.source).name, ''), rows)
 
 
 def _lens_holds(against: TwoDatasets) -> str:
     if against.verdict == 'nothing':
         return f'Neither these data nor {against.source} call for a cause that moves with the lens'
-    tried = listed([
+    tried = join_names([
         f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
         for one in against.tried if one is not None
     ])
@@ -141,11 +143,11 @@ def _lens_holds(against: TwoDatasets) -> str:
         'undecided': 'Whether what moves with the lens holds in both sets is not settled',
         'contradict': 'The two sets contradict each other about the lens',
     }[against.verdict]
-    gone = f'; {listed(against.withdrawn)} is withdrawn' if against.withdrawn else ''
+    gone = f'; {join_names(against.withdrawn)} is withdrawn' if against.withdrawn else ''
     return f'{said}: found in one, it takes held-out frames of {tried}{gone}'
 
 
-def _apart(against: TwoDatasets) -> str:
+def _difference_text(against: TwoDatasets) -> str:
     if not against.parameters:
         return ''
     said = ''
@@ -157,9 +159,9 @@ def _apart(against: TwoDatasets) -> str:
     ):
         sizes = [(abs(one.standardized_difference), name)
                  for name, one in against.parameters.items() if ('.' in name) == of_causes]
-        far = sorted((one for one in sizes if one[0] > _APART), reverse=True)
-        each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MOST]]
-        said += f'; {meaning.format(listed(each))}' if each else ''
+        far = sorted((one for one in sizes if one[0] > _SIGNIFICANT_RATIO), reverse=True)
+        each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MAX_PARAMETERS]]
+        said += f'; {meaning.format(join_names(each))}' if each else ''
     return said or '; its parameters agree within their errors'
 
 

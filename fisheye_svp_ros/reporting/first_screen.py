@@ -22,7 +22,7 @@ from fisheye_svp_ros.reporting.diagnosis_text import known_rows, lens_words, siz
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
-_SHOWN = 4  # photographs, and candidates, by name
+_MAX_NAMES = 4  # photographs, and candidates, by name
 _CERTAIN = 0.99  # more cannot be said of a bootstrap
 _THUMBNAIL = 96  # px, the longer side
 
@@ -72,11 +72,11 @@ def first_screen(
     )
     return Screen(
         headline(d), _facts(d, source), _warning(d),
-        tuple(Action(title, do, decision.why[:1].upper() + decision.why[1:], _sure(decision),
-                     tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_SHOWN]),
-                     max(len(some) - _SHOWN, 0))
+        tuple(Action(title, do, decision.why[:1].upper() + decision.why[1:], _confidence(decision),
+                     tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_MAX_NAMES]),
+                     max(len(some) - _MAX_NAMES, 0))
               for title, do, decision, some in answers),
-        _causes(d), _candidates(d), _bound(d.decision['lens']),
+        _causes(d), _candidates(d), _bound_text(d.decision['lens']),
         '; '.join(f'{name} {before} → {after}'
                   for name, before, after, _ in known_rows(known or {})))
 
@@ -124,7 +124,7 @@ def _warning(d: Diagnosis) -> str:
     return ('an error rises: ' + '; '.join(rising)) if rising else ''
 
 
-def _sure(decision: Decision) -> str:
+def _confidence(decision: Decision) -> str:
     if decision.confidence is None:
         return ''
     sure = f'{100 * decision.confidence:.0f} % sure'
@@ -146,12 +146,12 @@ def _candidates(d: Diagnosis) -> str:
     words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (by its evidence '
              f'{100 * one.weight:.0f} % likely: e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} '
              'mm is in the extended lens)' for one in d.averaged.shifts]
-    words += [f'{one.effect} ({one.why})' for one in d.candidates[:_SHOWN]]
-    more = len(d.candidates) - _SHOWN
+    words += [f'{one.effect} ({one.why})' for one in d.candidates[:_MAX_NAMES]]
+    more = len(d.candidates) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
 
 
-def _bound(decision: Decision) -> str:
+def _bound_text(decision: Decision) -> str:
     human = {'m': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg')}
     words = []
     for one in decision.bound:

@@ -12,9 +12,9 @@ from fisheye_svp_ros.planning.guide import MIN_SCORE, DetectedBoard, Guide
 from fisheye_svp_ros.reporting.shot_list import instruction
 
 _WANTED, _SEEN, _READY, _TEXT = (40, 123, 224), (230, 160, 60), (80, 200, 80), (245, 245, 245)
-_LARGEST = 1280  # px, of the picture
+_MAX_WIDTH = 1280  # px, of the picture
 _BAND, _LETTER = 0.034, 0.00075  # height of a line over the width of the picture; size of its text
-_FIXED = 4  # binary places of a pixel that OpenCV draws to
+_FRACTION_BITS = 4  # binary places of a pixel that OpenCV draws to
 
 
 def guide_words(guide: Guide) -> tuple[str, str, str]:
@@ -27,7 +27,7 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
         where = f'{away} away, {place}; {how}; turned {turn} clockwise'
     taken = f'{count} photograph{"" if count == 1 else "s"}'
     if stand is not None and stand.stderr is not None:
-        taken += ', ' + _known(guide)
+        taken += ', ' + _score_text(guide)
     if stand is not None and stand.settled:
         names = ' and '.join(stand.named) or 'no cause'
         if stand.alike:
@@ -41,7 +41,7 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
     return 'hold still' if ready else 'bring the board to the outline', where, taken
 
 
-def _known(guide: Guide) -> str:
+def _score_text(guide: Guide) -> str:
     """Return the number asked for with its standard error, and the one that is wanted."""
     stand, session = guide.stand, guide.session
     assert stand is not None and stand.stderr is not None
@@ -56,7 +56,7 @@ def _known(guide: Guide) -> str:
 
 def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:
     """Return the picture (H, W, 3), blue, green, red, of an image with the guide over it."""
-    zoom = min(1.0, _LARGEST / max(pixels.shape))
+    zoom = min(1.0, _MAX_WIDTH / max(pixels.shape))
     scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
     grey = cv2.resize(cv2.convertScaleAbs(pixels, alpha=scale), None, fx=zoom, fy=zoom,
                       interpolation=cv2.INTER_AREA)
@@ -64,36 +64,37 @@ def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDAr
     outline = guide.outline
     if outline is not None:
         colour = _READY if guide.score >= MIN_SCORE else _WANTED
-        wanted = _places(outline[np.isfinite(outline).all(axis=1)], zoom)
+        wanted = _to_fixed_point(outline[np.isfinite(outline).all(axis=1)], zoom)
         hull = cv2.convexHull(wanted)
-        filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FIXED)
+        filled = cv2.fillConvexPoly(picture.copy(), hull, colour, cv2.LINE_AA, _FRACTION_BITS)
         picture = cv2.addWeighted(filled, 0.25, picture, 0.75, 0)
-        cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FIXED)
+        cv2.polylines(picture, [hull], True, colour, 2, cv2.LINE_AA, _FRACTION_BITS)
         _dots(picture, wanted, colour, 2)
-        cv2.circle(picture, wanted[0].tolist(), 9 << _FIXED, colour, 2, cv2.LINE_AA, _FIXED)
+        cv2.circle(picture, wanted[0].tolist(), 9 << _FRACTION_BITS, colour, 2, cv2.LINE_AA,
+                   _FRACTION_BITS)
     if seen is not None:
-        found = _places(seen.uv, zoom)
+        found = _to_fixed_point(seen.uv, zoom)
         _dots(picture, found, _SEEN, 3)
         first = found[int(np.argmin(seen.ids))].tolist()
-        cv2.circle(picture, first, 9 << _FIXED, _SEEN, 2, cv2.LINE_AA, _FIXED)
-    _words(picture, guide)
+        cv2.circle(picture, first, 9 << _FRACTION_BITS, _SEEN, 2, cv2.LINE_AA, _FRACTION_BITS)
+    _draw_texts(picture, guide)
     return np.asarray(picture)
 
 
-def _places(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:
+def _to_fixed_point(uv: NDArray[np.float64], zoom: float) -> NDArray[np.int32]:
     """Return image points in the fixed point numbers of OpenCV's drawing."""
     places = np.clip((uv + 0.5) * zoom - 0.5, -1e4, 1e4)
-    return np.round(places * (1 << _FIXED)).astype(np.int32)
+    return np.round(places * (1 << _FRACTION_BITS)).astype(np.int32)
 
 
 def _dots(
     picture: NDArray[np.uint8], places: NDArray[np.int32], colour: tuple[int, int, int], size: int
 ) -> None:
     for place in places.tolist():
-        cv2.circle(picture, place, size << _FIXED, colour, -1, cv2.LINE_AA, _FIXED)
+        cv2.circle(picture, place, size << _FRACTION_BITS, colour, -1, cv2.LINE_AA, _FRACTION_BITS)
 
 
-def _words(picture: NDArray[np.uint8], guide: Guide) -> None:
+def _draw_texts(picture: NDArray[np.uint8], guide: Guide) -> None:
     """Write what to do above, with the score as a bar, and where matters stand below."""
     height, width = picture.shape[:2]
     line, size = round(_BAND * width), _LETTER * width

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 from fisheye_svp_ros.diagnosis import Cause, Diagnosis
-from fisheye_svp_ros.reporting.diagnosis_text import EXTENDED, lens_words, only_gross, size, what
+from fisheye_svp_ros.reporting.diagnosis_text import (
+    LENS_FILE,
+    describe_effect,
+    lens_words,
+    only_gross,
+    size,
+)
 
 VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -13,14 +19,14 @@ VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Correct it by {EXTENDED} (this target alone), or flatten or replace it',
+    'correct': f'Correct it by {LENS_FILE} (this target alone), or flatten or replace it',
     'measure_again': 'Measure the board, flatten or replace it',
 }
 PHOTOGRAPHS = {
     'enough': 'Enough photographs', 'more': 'Take more photographs',
     'retake': 'Take photographs again',
 }
-_SHORT = {
+_HEADLINES = {
     'viewpoint_shift': 'The viewpoint of the lens moves',
     'radial_profile': 'The image-height curve of the lens is another one',
     'focal_length': 'The focal length is wrong',
@@ -76,7 +82,7 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
         worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
         which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
-    words = _SHORT.get(cause.effect, _capital(what(cause.effect)))
+    words = _HEADLINES.get(cause.effect, _capital(describe_effect(cause.effect)))
     how = size(d, cause).partition(', ')[0]
     return f'{words} ({how})' if how else words
 

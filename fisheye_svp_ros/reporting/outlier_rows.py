@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-_MOST = 6  # landmarks named in a row
+_MAX_LANDMARKS = 6  # landmarks named in a row
 
 
 class OutlierRow(NamedTuple):
@@ -39,5 +39,5 @@ def outlier_rows(gross: Sequence[Mapping[str, Any]]) -> list[OutlierRow]:
 def _numbers(landmarks: Sequence[int]) -> str:
     """Return landmark numbers, ascending, at most so many and the count of the others."""
     names = [str(number) for number in sorted(landmarks)]
-    more = f' and {len(names) - _MOST} more' if len(names) > _MOST else ''
-    return ', '.join(names[:_MOST]) + more
+    more = f' and {len(names) - _MAX_LANDMARKS} more' if len(names) > _MAX_LANDMARKS else ''
+    return ', '.join(names[:_MAX_LANDMARKS]) + more

@@ -16,7 +16,7 @@ from fisheye_svp_ros.reporting.plots import FAINT, OURS, picture
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 _BLUE, _ORANGE = (168, 95, 31), (40, 123, 224)  # BGR
-_LARGEST = 1600  # px, of an overlay
+_MAX_SIZE = 1600  # px, of an overlay
 
 
 def write_overlays(photographs: Iterable[Photograph], detection: Detection, folder: Path) -> None:
@@ -37,7 +37,7 @@ def write_overlays(photographs: Iterable[Photograph], detection: Detection, fold
 def _overlay(pixels: np.ndarray, searched: SearchedPhotograph) -> np.ndarray:
     scale = 255 / max(float(pixels.max()), 1.0) if pixels.dtype != np.uint8 else 1.0
     grey = cv2.convertScaleAbs(pixels, alpha=scale)
-    zoom = _LARGEST / max(grey.shape)
+    zoom = _MAX_SIZE / max(grey.shape)
     image = cv2.cvtColor(
         cv2.resize(grey, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
     )

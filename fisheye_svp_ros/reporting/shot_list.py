@@ -17,7 +17,7 @@ from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, picture
 from fisheye_svp_ros.simulate.simulation import blank_views
 
 HEADER = ('', 'board at', 'where in the image', 'tilted', 'turned clockwise', 'then')
-WORDS = ('where in the image', 'tilted')
+TEXT_COLUMNS = ('where in the image', 'tilted')
 _SIDES = ('right', 'lower right', 'bottom', 'lower left', 'left', 'upper left', 'top',
           'upper right')
 _COLUMNS, _PANEL = 3, 3.4  # inches
@@ -26,7 +26,7 @@ _HUMAN = {'m': (1e3, 'mm'), 'rad': (180 / np.pi, 'deg')}
 
 def rows(wanted: NextViews) -> list[tuple[str, ...]]:
     """Return the shot list's rows, under HEADER."""
-    return [(str(i + 1), *instruction(wanted.shots, i), then(wanted, i + 1))
+    return [(str(i + 1), *instruction(wanted.shots, i), expected_error(wanted, i + 1))
             for i in range(len(wanted.shots.distance))]
 
 
@@ -43,7 +43,7 @@ def instruction(shots: Shots, i: int) -> tuple[str, str, str, str]:
     return f'{shots.distance[i]:.2f} m', where, tilt, f'{np.degrees(shots.roll[i]):.0f} deg'
 
 
-def then(wanted: NextViews, taken: int) -> str:
+def expected_error(wanted: NextViews, taken: int) -> str:
     """Return what will be known once so many of the photographs are taken."""
     value = wanted.answers[taken]
     if wanted.others:
@@ -61,10 +61,10 @@ def purpose(wanted: NextViews) -> str:
             '; photographs hardly tell: what you know is not there can be left out, '
             + ' '.join(f'--without {name}' for name in wanted.others))
         return (f'to tell {wanted.asked} from {" and ".join(wanted.others)}; now '
-                f'{then(wanted, 0)}{known}')
+                f'{expected_error(wanted, 0)}{known}')
     what = 'the whole lens' if wanted.asked == 'lens' else wanted.asked
     if wanted.unit:
-        return f'for {what}; now {then(wanted, 0)}'
+        return f'for {what}; now {expected_error(wanted, 0)}'
     beside = 'now' if wanted.answers[0] == 1 else 'after the first'
     return f'for {what}; errors in % of those {beside}'
 
@@ -88,7 +88,7 @@ def draw_shots(path: Path, model: ForwardModel, wanted: NextViews) -> None:
             axis.plot(*uv[i][first], 'o', color=PUBLISHED, markersize=6, fillstyle='none')
             away, where, tilt, roll = instruction(shots, i)
             axis.set_title(f'{i + 1}: {away}, {where}\ntilt {tilt}, turn {roll}; '
-                           f'{then(wanted, i + 1)}', fontsize=7.5)
+                           f'{expected_error(wanted, i + 1)}', fontsize=7.5)
         figure.suptitle(purpose(wanted), fontsize=9)
 
 

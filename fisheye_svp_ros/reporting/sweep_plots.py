@@ -99,7 +99,7 @@ def _draw_curves(
 ) -> None:
     """Draw an error over x: the colour tells one other parameter, the line style a second."""
     by = sorted(others, key=lambda name: -len(set(table[name])))[-2:]
-    looks = [_some(list(dict.fromkeys(table[name])), most)
+    looks = [_pick_evenly(list(dict.fromkeys(table[name])), most)
              for name, most in zip(by, (_HUES, len(_LINES)), strict=False)]
     merged = [name for name in others if name not in by]
     with _axes(path, len(metrics), 4.2, 3.6) as (figure, axes):
@@ -128,7 +128,7 @@ def _draw_curves(
         figure.suptitle('; '.join([what, *thinned]), x=0.01, ha='left', fontsize=8)
 
 
-def _some(values: list[Any], most: int) -> list[Any]:
+def _pick_evenly(values: list[Any], most: int) -> list[Any]:
     """Return the first, the last and what lies evenly between, `most` in all."""
     places = np.linspace(0, len(values) - 1, min(most, len(values))).round().astype(int)
     return [values[i] for i in places]
@@ -220,7 +220,7 @@ def _scale(axis: Any, x: Sequence[float], y: Array) -> None:
     if min(x) > 0 and max(x) >= 10 * min(x):
         axis.set_xscale('log')
         if len(x) <= _TICKS:
-            shown = _some(sorted(x), _LABELS)
+            shown = _pick_evenly(sorted(x), _LABELS)
             axis.set_xticks(shown, [f'{value:g}' for value in shown])
             axis.tick_params(axis='x', which='minor', bottom=False, labelbottom=False)
     known = y[np.isfinite(y) & (y > 1e-6)]

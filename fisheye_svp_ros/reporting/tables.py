@@ -18,8 +18,8 @@ UNITS = {  # of the parameters of a lens; 1 where there is none
                      'port_z'), 'm'),
     **dict.fromkeys(('port_tilt_x', 'port_tilt_y'), 'rad'),
 }
-_WIDE = 200  # columns where no terminal says how many it has
-_NARROW = 10  # columns that text is broken into at the narrowest
+_DEFAULT_WIDTH = 200  # columns where no terminal says how many it has
+_MIN_WIDTH = 10  # columns that text is broken into at the narrowest
 
 
 def print_table(
@@ -38,7 +38,7 @@ def print_table(
         widest = max(len(row[i]) for row in cells)
         table.add_column(name, justify=justify, no_wrap=not text,
                          min_width=None if text else widest)
-        least += 3 + (_NARROW if text else widest)
+        least += 3 + (_MIN_WIDTH if text else widest)
     for row in cells[1:]:
         table.add_row(*row)
     out = console()
@@ -59,7 +59,8 @@ def print_lines(lines: Iterable[str]) -> None:
 def console() -> Console:
     """Return the console of standard output, wide enough for a table when it is a file."""
     return Console(
-        width=None if sys.stdout.isatty() else _WIDE, highlight=False, markup=False, emoji=False
+        width=None if sys.stdout.isatty() else _DEFAULT_WIDTH,
+        highlight=False, markup=False, emoji=False
     )
 
 

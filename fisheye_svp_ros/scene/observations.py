@@ -126,7 +126,7 @@ class Views(_Views, Batch):
     __slots__ = ()
 
     @property
-    def seen(self) -> tuple[Array, Array, Array]:
+    def solver_inputs(self) -> tuple[Array, Array, Array]:
         """What solvers look at: points, image points, weights."""
         return self.points, self.uv, self.weight
 

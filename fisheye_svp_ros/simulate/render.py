@@ -84,7 +84,7 @@ class Print:
         return points
 
 
-class Placed(NamedTuple):
+class BoardPose(NamedTuple):
     """A board and its pose in the target: one face of a cube, one wall of a room."""
 
     printed: Print
@@ -118,7 +118,7 @@ class Exposure:
 
 def render(
     lens: Lens,
-    printed: Print | Sequence[Placed],
+    printed: Print | Sequence[BoardPose],
     camera: Pose,
     exposure: Exposure,
     rng: np.random.Generator,
@@ -134,7 +134,7 @@ def render(
     uv = np.stack([u, v], axis=-1)
     theta = back_project(lens, uv).theta
     light = np.full(theta.shape, _ROOM)
-    boards = [Placed(printed, identity())] if isinstance(printed, Print) else printed
+    boards = [BoardPose(printed, identity())] if isinstance(printed, Print) else printed
     window = _window(lens, boards, camera)
     part = uv[window]
     if part.size:
@@ -151,7 +151,7 @@ def render(
     return np.asarray(np.clip(level, 0, 255), dtype=np.uint8)
 
 
-def _window(lens: Lens, boards: Sequence[Placed], camera: Pose) -> tuple[slice, slice]:
+def _window(lens: Lens, boards: Sequence[BoardPose], camera: Pose) -> tuple[slice, slice]:
     """Return the rows and columns in which the sheets lie, and a little more."""
     low, high = np.full(2, np.inf), np.full(2, -np.inf)
     for printed, place in boards:
@@ -172,7 +172,7 @@ def _window(lens: Lens, boards: Sequence[Placed], camera: Pose) -> tuple[slice, 
 
 
 def _of_board(
-    lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array, moved: Field | None
+    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array, moved: Field | None
 ) -> NDArray[np.float32]:
     """Return what a board adds to the light of the parts of pixels uv (H, W, 2)."""
     places = _board_xy(lens, board, camera, exposure, uv)
@@ -184,7 +184,7 @@ def _of_board(
     return _light(board.printed, places) - np.float32(_ROOM)
 
 
-def _board_xy(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
+def _board_xy(lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array) -> Array:
     """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
     flat = uv.reshape(-1, 2)
     parts = [
@@ -194,7 +194,9 @@ def _board_xy(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: A
     return np.concatenate(parts).reshape(uv.shape)
 
 
-def _board_share(lens: Lens, board: Placed, camera: Pose, exposure: Exposure, uv: Array) -> Array:
+def _board_share(
+    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array
+) -> Array:
     printed = board.printed
     rays = back_project(lens, uv)
     origin, direction = rays.origin, rays.direction

@@ -144,7 +144,7 @@ def _simulate_poses(
     if scenario.rig:
         return _simulate_rig(scenario, poses, rng)
     lens = true_lens(scenario.lens, scenario.shift_scale) if lens is None else (
-        _scaled(lens, scenario.shift_scale))
+        _scale_shift(lens, scenario.shift_scale))
     landmarks, rig = scenario_landmarks(scenario), scenario_rig(scenario)
     model, sigma = ForwardModel(lens), scenario.noise_px
     if rig is None:
@@ -157,7 +157,7 @@ def _simulate_poses(
 def _simulate_rig(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
     """Simulate the cameras of a file; poses (P,) of the first of them."""
     names, lenses, places = scenario_cameras(scenario.rig)
-    lenses = tuple(_scaled(lens, scenario.shift_scale) for lens in lenses)
+    lenses = tuple(_scale_shift(lens, scenario.shift_scale) for lens in lenses)
     landmarks, count = scenario_landmarks(scenario), len(poses.position)
     each = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
     seen = simulate_rig([ForwardModel(lens) for lens in lenses], landmarks, each,
@@ -224,10 +224,10 @@ def true_lens(lens: str, shift_scale: float = 1.0) -> Lens:
 
 @lru_cache(maxsize=64)
 def _true_lens(path: Path, version: int, shift_scale: float) -> Lens:
-    return _scaled(load_lens(path), shift_scale)
+    return _scale_shift(load_lens(path), shift_scale)
 
 
-def _scaled(lens: Lens, shift_scale: float) -> Lens:
+def _scale_shift(lens: Lens, shift_scale: float) -> Lens:
     """Return a lens, its viewpoint shift scaled."""
     shift = lens.viewpoint_shift
     if shift is None or shift_scale == 1.0:

@@ -122,7 +122,7 @@ def add_noise(
     inside = np.all((uv >= -0.5) & (uv <= size - 0.5), axis=-1, keepdims=True)
     uv = np.where(inside, uv, np.nan)
     for effect, values in model.noise_terms:
-        uv = effect.recorded(uv, values, rng)
+        uv = effect.record_points(uv, values, rng)
     return uv
 
 

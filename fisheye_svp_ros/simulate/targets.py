@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.simulate.render import Placed, Print
+from fisheye_svp_ros.simulate.render import BoardPose, Print
 
 _TRIES = 400  # a view
 _EDGE, _SPACING = 8.0, 9.0  # px, least distance from the image's edge and between corners
@@ -22,12 +22,12 @@ _MIN_BOARDS = 2  # boards of which something is seen
 _CAMERA_RANGE = 0.3  # of half the room: how far from its middle the camera comes
 
 
-def board(printed: Print) -> tuple[Placed, ...]:
+def board(printed: Print) -> tuple[BoardPose, ...]:
     """Return one board, its own frame that of the target."""
-    return (Placed(printed, identity()),)
+    return (BoardPose(printed, identity()),)
 
 
-def _box(printed: Print, outside: bool) -> tuple[Placed, ...]:
+def _box(printed: Print, outside: bool) -> tuple[BoardPose, ...]:
     """Return six boards on the faces of a cube or the walls of a room, its middle the origin."""
     half = printed.size * (max(printed.columns, printed.rows) + 1 + 2 * printed.margin) / 2
     boards = []
@@ -38,16 +38,16 @@ def _box(printed: Print, outside: bool) -> tuple[Placed, ...]:
             right = np.eye(3)[(axis + 1) % 3]
             turn = np.stack([right, np.cross(into, right), into], axis=-1)
             middle = turn @ printed.corners.mean(axis=0)
-            boards.append(Placed(printed, Pose(turn, half * normal - middle)))
+            boards.append(BoardPose(printed, Pose(turn, half * normal - middle)))
     return tuple(boards)
 
 
-TARGETS: dict[str, Callable[[Print], tuple[Placed, ...]]] = {
+TARGETS: dict[str, Callable[[Print], tuple[BoardPose, ...]]] = {
     'cube': partial(_box, outside=True), 'room': partial(_box, outside=False),
 }
 
 
-def visible(lens: Lens, boards: tuple[Placed, ...], camera: Pose) -> tuple[Array, Array]:
+def visible(lens: Lens, boards: tuple[BoardPose, ...], camera: Pose) -> tuple[Array, Array]:
     """Return image points (B, N, 2), px, of the corners of boards, and whether they are seen."""
     uv, seen = [], []
     for board in boards:
@@ -84,7 +84,7 @@ def board_views(
 
 
 def target_views(
-    lens: Lens, kind: str, boards: tuple[Placed, ...], count: int, ranges: tuple[float, float],
+    lens: Lens, kind: str, boards: tuple[BoardPose, ...], count: int, ranges: tuple[float, float],
     rng: np.random.Generator,
 ) -> Pose:
     """Return `count` poses of the camera in a target's frame from which two boards are seen.
@@ -101,10 +101,10 @@ def target_views(
         turn, place = _placed_in_sight(lens, ranges, rng)
         return Pose(turn @ rotation_from_vector(rng.normal(size=3)), place).inverse()
 
-    def seen(camera: Pose) -> bool:
+    def boards_visible(camera: Pose) -> bool:
         return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _MIN_BOARDS)
 
-    return _draw_poses(count, draw, seen, (
+    return _draw_poses(count, draw, boards_visible, (
         f'lens {lens.name!r} does not see two boards of the {kind} at '
         f'{ranges[0]:g} to {ranges[1]:g} m; choose other ranges'))
 

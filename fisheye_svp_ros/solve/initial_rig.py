@@ -72,7 +72,7 @@ def _camera_terms(labels: Sequence[str], models: Sequence[ForwardModel]) -> list
         for effect, (_, values) in zip(effects, model.terms, strict=True):
             known = held.get(effect.name)
             held[effect.name] = (effect, values) if known is None else (
-                known[0].joined(effect), np.concatenate([known[1], values]))
+                known[0].merge_with(effect), np.concatenate([known[1], values]))
     return list(held.values())
 
 

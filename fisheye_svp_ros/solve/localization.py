@@ -38,7 +38,7 @@ def localize(model: ForwardModel, views: Views, start: Pose | None = None) -> Lo
     Raises GeometryError, naming the frame, for fewer than MIN_POINTS usable points.
     """
     model = model.seeing(views)
-    still = model.still()
+    still = model.without_motion()
     found = _localize(still, views, start)
     for _ in range(_MOTIONS if still is not model else 0):
         moving = views._replace(t=np.where(found.converged[:, None], views.t, np.nan))
@@ -88,7 +88,7 @@ def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localiz
     """Solve from these starts alone; return also whether any target may be flat."""
     quick = None
     if model.plain:
-        quick = engines.localize(model.lens, views.seen, views.row, MIN_POINTS, start)
+        quick = engines.localize(model.lens, views.solver_inputs, views.row, MIN_POINTS, start)
     if quick is None:
         return _by_reference(model, views, start), True
     found, remaining, flat = quick
@@ -209,7 +209,7 @@ class _Localization:
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
     if model.plain and model.lens.port is None:
-        cost, *normal = engines.pose_equations(model.lens, *pose, views.seen)
+        cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)
     return normal_equations(linear.uv, model.d_pose(linear, views), views)

@@ -280,7 +280,7 @@ def with_effect(state: RigState, effect: Effect, values: Array | None = None) ->
     start = np.zeros(len(effect.parameters)) if values is None else values
     for i, (old, known) in enumerate(state.terms):
         if old.name == effect.name:
-            joined = old.joined(effect)
+            joined = old.merge_with(effect)
             both = transfer_values(old, known, joined) + transfer_values(effect, start, joined)
             return replace(state, terms=(*state.terms[:i], (joined, both), *state.terms[i + 1 :]))
     return replace(state, terms=(*state.terms, (effect, start)))

@@ -79,7 +79,8 @@ def _solve_rigs(
     left, right = models
     quick = None
     if left.plain and right.plain:
-        quick = engines.adjust_rigs((left.lens, right.lens), (views[0].seen, views[1].seen), start)
+        quick = engines.adjust_rigs(
+            (left.lens, right.lens), (views[0].solver_inputs, views[1].solver_inputs), start)
     if quick is None:
         return levenberg_marquardt(_Rigs(models, views, len(start[-1])), start)
     everyone = np.ones(len(start[-1]), dtype=bool)

@@ -116,7 +116,7 @@ class TestLocalize:
 
     def test_residuals_are_those_of_the_poses(self, output, scene):
         table = CsvTable(output / 'residuals.csv', ['frame', 'landmark'])
-        np.testing.assert_array_equal(table.whole('landmark'), scene[2].landmark)
+        np.testing.assert_array_equal(table.integers('landmark'), scene[2].landmark)
         du, dv, theta, distance = table.numbers('du', 'dv', 'theta', 'range').T
         rms = json.loads((output / 'localize.json').read_text())['rms_px']
         assert np.sqrt(np.mean(du**2 + dv**2)) == pytest.approx(rms)

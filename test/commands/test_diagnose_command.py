@@ -30,7 +30,7 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
-from fisheye_svp_ros.reporting.diagnosis_plots import Shown, residual_pictures
+from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.diagnosis_text import (
     advice_text,
     cause_rows,
@@ -177,7 +177,7 @@ class TestFiles:
         given = CsvTable(scene / 'shift.csv', ['frame', 'landmark', 'u', 'v'])
         np.testing.assert_array_equal(table.numbers('frame', 'landmark', 'u', 'v'),
                                       given.numbers('frame', 'landmark', 'u', 'v'))
-        assert not table.whole('outlier').any()
+        assert not table.integers('outlier').any()
         found = document(output)
         for side, fit in (('before', 'base'), ('after', 'named')):
             squares = (table.numbers(f'du_{side}', f'dv_{side}') ** 2).sum(axis=1)
@@ -471,7 +471,7 @@ def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
     points = point_residuals(found.simulation, found.model)
-    for name, draw, arguments in residual_pictures(Shown.of(found, points)):
+    for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(found, points)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
 
@@ -494,7 +494,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
     larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
     found = diagnose(replace(table, cameras=('left', 'right'), **both),
                      {'left': LENS, 'right': larger}, options=DiagnosisOptions(quick=True))
-    shown = Shown.of(found, point_residuals(found.simulation, found.model))
+    shown = PlotData.from_diagnosis(found, point_residuals(found.simulation, found.model))
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
     draw(tmp_path / 'field.png', *arguments)
@@ -530,9 +530,9 @@ def test_the_bow_of_a_board_is_measured_between_its_extremes():
     np.testing.assert_allclose(one.height, expected - expected.mean(), atol=1e-9)
     assert one.peak_to_valley == pytest.approx(0.002)
     np.testing.assert_allclose(one.slide, np.zeros_like(one.place), atol=1e-12)
-    assert one.spread_out
+    assert one.spans_plane
     for few in (one.place * [1.0, 0.0], one.place[:2], one.place[:1]):
-        assert not one._replace(place=few).spread_out
+        assert not one._replace(place=few).spans_plane
 
 
 def test_the_depth_of_a_rig_gains_too():

@@ -45,7 +45,7 @@ def test_a_board_that_is_not_there_is_looked_for_a_few_times(
     with pytest.raises(ObservationError, match=r'no board found \(40\)'):
         found(tmp_path)
     assert looks.count(Look.SAMPLE) == 4
-    assert looks.count(Look.FIRST) == 36
+    assert looks.count(Look.FIRST_SEARCH) == 36
 
 
 def test_once_a_board_is_found_all_are_searched_thoroughly(
@@ -65,7 +65,7 @@ def test_once_a_board_is_found_all_are_searched_thoroughly(
     seen = found(tmp_path)
     assert [one.points is not None for one in seen.searched] == [False] * 4 + [True] * 2 + [
         False] * 2 + [True] * 2
-    assert looks == [Look.SAMPLE] * 3 + [Look.FIRST] * 6 + [Look.THOROUGH] * 6
+    assert looks == [Look.SAMPLE] * 3 + [Look.FIRST_SEARCH] * 6 + [Look.THOROUGH] * 6
     for one, image in zip(seen.searched[4:6], hidden, strict=False):
         alone = points.find_points(image, parse_pattern(BOARD), 'saddle')
         assert np.array_equal(one.points.uv, alone.uv)
@@ -76,7 +76,7 @@ def test_inverted_boards_are_found_at_a_first_look(tmp_path: Path, looks: list[L
     inverted = found(tmp_path)
     if inverted.searched[0].points is None:
         pytest.skip('this OpenCV does not find the first inverted board')
-    assert looks == [Look.SAMPLE, Look.INVERTED, Look.INVERTED, Look.INVERTED]
+    assert looks == [Look.SAMPLE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE]
     for one, image in zip(inverted.searched, IMAGES, strict=True):
         alone = points.find_points(255 - image, parse_pattern(BOARD), 'saddle')
         assert np.abs(one.points.uv - alone.uv).max() < 0.1 * alone.sigma.max()
@@ -85,7 +85,7 @@ def test_inverted_boards_are_found_at_a_first_look(tmp_path: Path, looks: list[L
 def test_what_cannot_be_read_again_is_searched_at_once() -> None:
     effort = Effort(True)
     assert effort.look(9, False) is Look.SAMPLE
-    assert effort.look(9, True) is Look.FIRST
+    assert effort.look(9, True) is Look.FIRST_SEARCH
     effort.note(True, False)
     assert effort.look(10, True) is Look.THOROUGH
     assert Effort(False).look(9, True) is Look.THOROUGH

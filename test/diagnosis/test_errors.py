@@ -164,7 +164,7 @@ def test_a_warped_board_leaves_a_calibrated_shift_unsettled():
     shape = CATALOGUE['target_shape'].candidates(model_scene)[0]
     bent = [(shape, np.array([0.006, 0.0, 0.005] * 3))]
     table = observe(lens(), bent, pose, views, SIGMA, rng)
-    shifted = ViewpointShiftEffect(1).curved(lens(), np.array([1e-6]))
+    shifted = ViewpointShiftEffect(1).with_curves(lens(), np.array([1e-6]))
     found = assess_lens(table, shifted, ('fx', 'fy', 'cx', 'cy', 'e0'))
     assert set(found.stderr) == {'fx', 'fy', 'cx', 'cy', 'e0'}
     assert not found.admissible['e0'].settled

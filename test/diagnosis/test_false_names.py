@@ -80,8 +80,8 @@ def test_no_dot_reaches_its_neighbours():
     points = 0.02 * np.stack(np.meshgrid(np.arange(5), np.arange(4), [0]), -1).reshape(-1, 3)
     seen = Scene(views_of(points, np.zeros((1, 20, 2))), lens(), identity(1), np.zeros(0))
     dots = CATALOGUE['dot_centroid']()
-    assert not dots.absurd(np.array([0.019**2]), seen)
-    assert dots.absurd(np.array([0.021**2]), seen)
+    assert not dots.is_implausible(np.array([0.019**2]), seen)
+    assert dots.is_implausible(np.array([0.021**2]), seen)
 
 
 @pytest.mark.parametrize('seed', [3, 8, 10])

@@ -62,7 +62,7 @@ def test_the_error_falls_and_residuals_have_the_rms_that_is_reported(
     base, named, extended = (found[one]['rms_px'] for one in ('base', 'named', 'extended'))
     assert base >= named >= extended
     table = CsvTable(out / 'residuals.csv', ['frame'])
-    kept = ~table.whole('outlier').astype(bool)
+    kept = ~table.integers('outlier').astype(bool)
     for side, rms in (('before', base), ('after', named)):
         squares = (table.numbers(f'du_{side}', f'dv_{side}')[kept] ** 2).sum(axis=1)
         assert np.sqrt(squares.mean()) == pytest.approx(rms, rel=1e-6)

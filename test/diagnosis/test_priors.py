@@ -10,7 +10,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NAMES, NullModel, refit
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
-from fisheye_svp_ros.effects.of_cameras import by_camera, together
+from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import Variances, no_variances
 from fisheye_svp_ros.optics.lens import intrinsic_names
@@ -70,7 +70,7 @@ def test_higher_orders_are_known_by_what_they_do_at_the_edge_of_the_field() -> N
     view = Linearization(data, state, FREE).scene
     sizes = EFFECT.prior_sigma(view) * view.lens.max_incidence ** (2 * np.arange(ORDER))
     assert sizes == pytest.approx(LARGE)
-    each = together([*by_camera(0, 'left', [ViewpointShiftEffect(1)]),
+    each = combine_cameras([*by_camera(0, 'left', [ViewpointShiftEffect(1)]),
                      *by_camera(1, 'right', [ViewpointShiftEffect(2)])])
     rig = replace(view, cameras=((np.arange(1), 0, view), (np.arange(1), 1, view)))
     assert each.prior_sigma(rig) == pytest.approx(

@@ -162,7 +162,7 @@ def test_cameras_that_were_not_photographed_together(late):
     found = diagnose(table, seen.lenses, options=DiagnosisOptions(quick=True))
     (said,) = found.cameras
     assert said.posed_alone and said.verdict == 'agree' and said.maps.correlation > 0.95
-    assert 'each view was posed by itself' in sections(found)[0].sentence
+    assert 'each view has a pose of its own' in sections(found)[0].sentence
     assert 'find out why no rig holds' in verdict_sentences(found)[2].lower()
     assert found.figures.extended.heldout_rms_px < 0.15
 

@@ -204,7 +204,7 @@ def test_a_drift_leaves_the_mean_focal_length_to_the_lens(linearised):
     paused = scene_.views._replace(t=scene_.views.t + 50.0 * late[:, None])
     scene_ = replace(scene_, views=paused)
     for effect in CATALOGUE['focal_drift'].candidates(scene_):
-        growth = effect.plane_columns(scene_) / scene_.normalised()[..., None]
+        growth = effect.plane_columns(scene_) / scene_.normalized_uv()[..., None]
         assert np.abs(growth).max() > 0.5
         np.testing.assert_allclose(np.nanmean(growth, axis=(0, 1, 2)), 0.0, atol=1e-12)
 
@@ -214,7 +214,7 @@ def test_a_drift_stays_as_it_was_where_the_recording_ends(linearised):
     last = np.nanargmax(scene_.times)
     later = replace(scene_, views=scene_.views._replace(t=scene_.views.t + 1000.0))
     for effect in CATALOGUE['focal_drift'].candidates(scene_):
-        known, after = (np.nanmean(effect.plane_columns(one) / one.normalised()[..., None],
+        known, after = (np.nanmean(effect.plane_columns(one) / one.normalized_uv()[..., None],
                                    axis=(1, 2)) for one in (scene_, later))
         np.testing.assert_allclose(after, np.broadcast_to(known[last], after.shape))
 

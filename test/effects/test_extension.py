@@ -157,7 +157,7 @@ def test_what_an_svp_user_is_given_has_the_corrected_curve():
     change = given.fx * given.image_height.value_and_slope(theta)[0] - (
         plain.fx * plain.image_height.value_and_slope(theta)[0])
     effect, values = some('radial_profile')[0]
-    expected = effect.curved(base, values).image_height.value_and_slope(theta)[0]
+    expected = effect.with_curves(base, values).image_height.value_and_slope(theta)[0]
     expected -= base.image_height.value_and_slope(theta)[0]
     assert change == pytest.approx(base.fx * expected, rel=0.02)
     assert kannala_brandt_equivalent(given) == given

@@ -193,7 +193,7 @@ def test_a_timer_and_a_service_that_fail_do_not_end_the_node(
     node = g.start(ModelCritic)
     g.until(lambda: node._failures >= 2)
     response = Trigger.Response()
-    assert node.guarded(fail)(Trigger.Request(), response) is response
+    assert node.guard_callback(fail)(Trigger.Request(), response) is response
 
 
 def sums(counts: dict[str, str]) -> tuple[int, int]:
@@ -304,7 +304,7 @@ def test_files_are_named_below_the_folder_alone(
     (inside.parent / 'link.yaml').symlink_to(outside)
     os.mkfifo(inside.parent / 'fifo.yaml')
     with (inside.parent / 'huge.yaml').open('wb') as file:
-        file.truncate(access.LARGEST + 1)
+        file.truncate(access.MAX_FILE_BYTES + 1)
     node = graph(f'folder:={inside.parent}').start(Localizer)
     assert set_parameter(node, 'lens', str(inside)).successful
     for name, reason in ((outside, 'is not below'), (inside.parent / 'link.yaml', 'is not below'),

@@ -70,7 +70,7 @@ def test_nodes_are_composed_as_rclpy_nodes_are(context: Context) -> None:
 def test_every_node_takes_what_rclpy_nodes_take(
     name: str, context: Context, tmp_path: Any
 ) -> None:
-    kind = executables._kind(name)
+    kind = executables._node_class(name)
     table = tmp_path / 'seen.csv'
     table.write_text('frame,landmark,u,v,x,y,z\n' + ''.join(
         f'0,{i},{10 * i},{5 * i},0,{i},1\n' for i in range(5)))

@@ -27,17 +27,17 @@ def mono(reach: int = 0) -> StampJoin:
 def test_a_set_is_ready_with_its_last_item(order: tuple[str, ...]) -> None:
     sets = StampJoin(('l', 'r'), {'t': 'l'})
     for n, topic in enumerate(order):
-        assert told(sets.ready(0.0, 1.0)) == []
+        assert told(sets.pop_complete(0.0, 1.0)) == []
         sets.add(topic, 5, n, 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [(5, {topic: n for n, topic in enumerate(order)})]
-    assert told(sets.ready(0.0, 1.0)) == []
+    assert told(sets.pop_complete(0.0, 1.0)) == [(5, {topic: n for n, topic in enumerate(order)})]
+    assert told(sets.pop_complete(0.0, 1.0)) == []
 
 
 def test_stamps_never_mix_and_come_in_the_order_of_arrival() -> None:
     sets = StampJoin(('l', 'r'), {})
     for topic, stamp in (('l', 2), ('r', 1), ('l', 1), ('r', 3), ('r', 2)):
         sets.add(topic, stamp, f'{topic}{stamp}', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [
+    assert told(sets.pop_complete(0.0, 1.0)) == [
         (2, {'l': 'l2', 'r': 'r2'}), (1, {'r': 'r1', 'l': 'l1'})
     ], 'a clock that is set back does not make the newest sets the oldest'
 
@@ -45,15 +45,15 @@ def test_stamps_never_mix_and_come_in_the_order_of_arrival() -> None:
 def test_patience_is_lost_once_and_found_again() -> None:
     sets = mono()
     sets.add('l', 1, 'a', 0.0)
-    assert told(sets.ready(1.0, 1.0)) == []
-    assert told(sets.ready(1.1, 1.0)) == [(1, {'l': 'a'})]
+    assert told(sets.pop_complete(1.0, 1.0)) == []
+    assert told(sets.pop_complete(1.1, 1.0)) == [(1, {'l': 'a'})]
     sets.add('l', 2, 'b', 2.0)
-    assert told(sets.ready(2.0, 1.0)) == [(2, {'l': 'b'})], 'nothing has come: do not wait'
+    assert told(sets.pop_complete(2.0, 1.0)) == [(2, {'l': 'b'})], 'nothing has come: do not wait'
     sets.add('t', 2, 'x', 2.5)
     sets.add('l', 4, 'c', 3.0)
-    assert told(sets.ready(3.0, 1.0)) == [], 'it comes, if late: wait'
+    assert told(sets.pop_complete(3.0, 1.0)) == [], 'it comes, if late: wait'
     sets.add('t', 4, 'y', 3.5)
-    assert told(sets.ready(3.5, 1.0)) == [(4, {'l': 'c', 't': 'y'})]
+    assert told(sets.pop_complete(3.5, 1.0)) == [(4, {'l': 'c', 't': 'y'})]
 
 
 @pytest.mark.parametrize('ahead', [1000, -1000])
@@ -63,9 +63,9 @@ def test_what_never_matches_is_not_waited_for(ahead: int) -> None:
     for number in range(10):
         sets.add('t', 10 * number + ahead, 'x', number)
         sets.add('l', 10 * number, 'a', number)
-        at_once = told(sets.ready(number, 0.5))
+        at_once = told(sets.pop_complete(number, 0.5))
         waits.append(not at_once)
-        assert at_once or told(sets.ready(number + 0.6, 0.5)) == [(10 * number, {'l': 'a'})]
+        assert at_once or told(sets.pop_complete(number + 0.6, 0.5)) == [(10 * number, {'l': 'a'})]
     assert waits == [ahead < 0, *[False] * 9]
     assert sets.distance('t', 90 + ahead) == 0 and sets.distance('t', 93 + ahead) == 3
 
@@ -76,9 +76,11 @@ def test_a_set_between_two_items_is_given_both() -> None:
         sets.add('t', stamp, f't{stamp}', 0.0)
     sets.add('l', 14, 'a', 0.0)
     sets.add('l', 23, 'b', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [(14, {'l': 'a', 't': NeighborPair('t10', 't20', 0.4)})]
+    assert told(sets.pop_complete(0.0, 1.0)) == [
+        (14, {'l': 'a', 't': NeighborPair('t10', 't20', 0.4)})]
     sets.add('t', 30, 't30', 0.1)
-    assert told(sets.ready(0.1, 1.0)) == [(23, {'l': 'b', 't': NeighborPair('t20', 't30', 0.3)})]
+    assert told(sets.pop_complete(0.1, 1.0)) == [
+        (23, {'l': 'b', 't': NeighborPair('t20', 't30', 0.3)})]
 
 
 def test_items_too_far_apart_or_of_other_sets_are_not_given() -> None:
@@ -86,13 +88,13 @@ def test_items_too_far_apart_or_of_other_sets_are_not_given() -> None:
     for stamp in (0, 10):
         sets.add('t', stamp, f't{stamp}', 0.0)
     sets.add('l', 5, 'a', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [(5, {'l': 'a'})], 'too far apart'
+    assert told(sets.pop_complete(0.0, 1.0)) == [(5, {'l': 'a'})], 'too far apart'
     sets = mono(reach=100)
     for stamp in (10, 20, 30):
         sets.add('l', stamp, f'l{stamp}', 0.0)
     for stamp in (10, 30):  # that of 20 is lost
         sets.add('t', stamp, f't{stamp}', 0.0)
-    assert [(stamp, items.get('t')) for stamp, items in told(sets.ready(2.0, 1.0))] == [
+    assert [(stamp, items.get('t')) for stamp, items in told(sets.pop_complete(2.0, 1.0))] == [
         (10, 't10'), (20, None), (30, 't30')]
 
 
@@ -101,9 +103,10 @@ def test_items_of_a_recording_that_starts_over_are_not_mixed() -> None:
     for stamp in (0, 10, 20, 5):
         sets.add('t', stamp, f't{stamp}', 0.0)
     sets.add('l', 7, 'a', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == []
+    assert told(sets.pop_complete(0.0, 1.0)) == []
     sets.add('t', 9, 't9', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [(7, {'l': 'a', 't': NeighborPair('t5', 't9', 0.5)})]
+    assert told(sets.pop_complete(0.0, 1.0)) == [
+        (7, {'l': 'a', 't': NeighborPair('t5', 't9', 0.5)})]
 
 
 @pytest.mark.parametrize('order', [('l', 'r'), ('r', 'l')])
@@ -117,10 +120,10 @@ def test_cameras_a_little_apart_are_paired_under_the_first_ones_stamp(
         sets.add('t', 102, 'x', 0.0)
         taken = [sets.add(topic, stamps[topic], topic, 0.0) for topic in order]
         if tolerance == 1:
-            assert told(sets.ready(0.0, 1.0)) == [] and taken == [True, True]
+            assert told(sets.pop_complete(0.0, 1.0)) == [] and taken == [True, True]
             assert sets.distance('r', 100) == 2
             continue
-        assert told(sets.ready(0.0, 1.0)) == [(100, {'l': 'l', 'r': 'r', 't': 'x'})]
+        assert told(sets.pop_complete(0.0, 1.0)) == [(100, {'l': 'l', 'r': 'r', 't': 'x'})]
         assert taken == [True, False]
 
 
@@ -129,16 +132,16 @@ def test_each_is_paired_with_the_nearest() -> None:
     sets.tolerance = 5
     for topic, stamp in (('l', 100), ('l', 104), ('r', 103), ('r', 99)):
         sets.add(topic, stamp, f'{topic}{stamp}', 0.0)
-    assert told(sets.ready(0.0, 1.0)) == [
+    assert told(sets.pop_complete(0.0, 1.0)) == [
         (100, {'l': 'l100', 'r': 'r99'}), (104, {'l': 'l104', 'r': 'r103'})]
 
 
 def test_what_lacks_its_counterpart_is_given_up() -> None:
     sets = StampJoin(('l', 'r'), {})
     sets.add('l', 1, 'a', 0.0)
-    assert told(sets.given_up(1.0, 1.0)) == []
-    assert told(sets.given_up(1.1, 1.0)) == [(1, {'l': 'a'})]
-    assert told(sets.given_up(9.0, 1.0)) == []
+    assert told(sets.pop_expired(1.0, 1.0)) == []
+    assert told(sets.pop_expired(1.1, 1.0)) == [(1, {'l': 'a'})]
+    assert told(sets.pop_expired(9.0, 1.0)) == []
 
 
 def test_what_no_set_takes_is_forgotten_with_patience() -> None:
@@ -146,7 +149,7 @@ def test_what_no_set_takes_is_forgotten_with_patience() -> None:
     sets = mono()
     for second in range(5):
         sets.add('t', second, bytes(1), float(second))
-        assert told(sets.given_up(float(second), 2.0)) == []
+        assert told(sets.pop_expired(float(second), 2.0)) == []
     assert [sets.waiting('t', stamp) for stamp in range(5)] == [None, None, b'\0', b'\0', b'\0']
     assert not any(sets._tracks['t']._latest)
 
@@ -157,5 +160,5 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for stamp in range(5):
         sets.add('l', stamp, stamp, 0.0)
         sets.add('t', stamp, stamp, 0.0)
-    assert [stamp for stamp, _ in told(sets.given_up(0.0, 1.0))] == [0, 1]
+    assert [stamp for stamp, _ in told(sets.pop_expired(0.0, 1.0))] == [0, 1]
     assert [sets.waiting('t', stamp) for stamp in range(5)] == [None, None, 2, 3, 4]

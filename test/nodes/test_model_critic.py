@@ -31,7 +31,7 @@ from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.recording import is_tabulated, tabulate
 from fisheye_svp_ros.nodes import model_critic
-from fisheye_svp_ros.nodes.base import Finished
+from fisheye_svp_ros.nodes.base import NodeExit
 from fisheye_svp_ros.nodes.model_critic import ModelCritic, in_background
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.curves import KannalaBrandt
@@ -156,7 +156,7 @@ def test_other_settings_are_judged_anew_where_they_make_a_difference(
     g = graph('repeat:=false', f'synthetic_camera:lens:={scene}/hidden.yaml')
     critic = g.start(ModelCritic)
     camera = g.start(SyntheticCamera)
-    with pytest.raises(Finished):
+    with pytest.raises(NodeExit):
         g.until(lambda: False)
     g.executor.remove_node(camera)
     g.until(lambda: seen)

@@ -33,7 +33,7 @@ from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import camera, messages
-from fisheye_svp_ros.nodes.base import Finished
+from fisheye_svp_ros.nodes.base import NodeExit
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.recorder import Recorder
@@ -58,7 +58,7 @@ class Endpoint(NamedTuple):
 
 
 def run_to_the_end(graph: Graph) -> None:
-    with pytest.raises(Finished):
+    with pytest.raises(NodeExit):
         graph.idle(60)
 
 
@@ -171,7 +171,7 @@ def test_in_lock_step_every_scenario_is_answered_once_and_in_order(
 def test_a_set_without_an_answer_comes_again(
     graph: Callable[..., Graph], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(camera, '_LONG', 0.3)
+    monkeypatch.setattr(camera, '_REPUBLISH_TIMEOUT', 0.3)
     g = graph('lock_step:=somebody/result', 'rate:=50.0', 'noise_px:=1.0')
     scenarios = g.hear(DiagnosticArray, 'scenario')
     points = g.hear(PointCloud2, 'image_points')

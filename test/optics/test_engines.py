@@ -144,7 +144,8 @@ def test_poses_and_their_covariances(compiled, engine, count):
 def test_exact_images_cost_nothing(compiled):
     views, pose = views_and_poses(5, noise=0.0)
     start = pose.retract(np.full((5, 6), 1e-3))
-    found, remaining, _ = compiled.localize(FISH214, views.seen, views.row, MIN_POINTS, start)
+    found, remaining, _ = compiled.localize(
+        FISH214, views.solver_inputs, views.row, MIN_POINTS, start)
     assert remaining == 0 and found.converged.all() and found.cost.max() < 1e-12
     assert np.abs(found.pose.difference(pose)).max() < 1e-9
 
@@ -180,7 +181,7 @@ def test_both_take_the_same_steps(compiled, monkeypatch):
     """Far starts: steps are refused, damping grows and shrinks, the last step is the same one."""
     views, pose = views_and_poses(60)
     start = pose.retract(0.6 * np.random.default_rng(95).normal(size=(60, 6)))
-    ends, given = set(), (FISH214, views.seen, views.row, MIN_POINTS, start)
+    ends, given = set(), (FISH214, views.solver_inputs, views.row, MIN_POINTS, start)
     # What is given up for the reference takes no steps of the compiled form to the end.
     kept = compiled.localize(*given)[0].converged
     assert kept.sum() > 40
@@ -248,7 +249,7 @@ def test_points_near_the_lens_and_singular_systems_go_to_the_reference(compiled,
     assert expected.converged.tolist() == found.converged.tolist() == [True, False, True]
     changed = views._replace(points=near)
     quick, remaining, flat = compiled.localize(
-        FISH214, changed.seen, changed.row, MIN_POINTS, pose)
+        FISH214, changed.solver_inputs, changed.row, MIN_POINTS, pose)
     assert quick.converged.tolist() == [True, False, False] and remaining == 2 and flat == 1
     both_equal(expected.pose, found.pose)
     assert np.isnan(found.covariance[1]).all()

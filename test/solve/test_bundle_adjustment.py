@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.of_cameras import by_camera, together
+from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
 from fisheye_svp_ros.effects.skew import SkewEffect
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError
@@ -159,7 +159,7 @@ def two_lenses():
 def rig_state(data):
     """Return a state of two lenses that share one effect and have another each for itself."""
     state = initial_state(data, *([two_lenses()[0], two_lenses()[1:]]))
-    own = together([by_camera(i, label, [DecenteringEffect()])[0]
+    own = combine_cameras([by_camera(i, label, [DecenteringEffect()])[0]
                     for i, label in enumerate(('left', 'right'))])
     values = np.array([1e-4, -2e-4, 3e-4, 1e-4])
     return replace(state, terms=((own, values), (SkewEffect(), np.array([1e-3]))))

@@ -281,7 +281,7 @@ def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
     model = ForwardModel(scenes.lens(), [shutter])
     uv = model.predict(pose, views).uv + rng.normal(size=views.uv.shape) * 0.1
     seen = views._replace(uv=uv, weight=np.where(np.isfinite(uv).all(axis=-1), 10.0, 0.0))
-    found, ignored = localize(model, seen), localize(model.still(), seen)
+    found, ignored = localize(model, seen), localize(model.without_motion(), seen)
     assert found.converged.all()
     off, otherwise = (np.linalg.norm(one.pose.position - pose.position, axis=1)
                       for one in (found, ignored))

@@ -212,7 +212,7 @@ def agree_on_target(
 def compare_cameras(selection: Selection) -> list[TwoCameras]:
     """Return what each two cameras of a rig say of each other, if both saw enough."""
     data = selection.null.linear.data
-    known = KnownTarget.of(data.views)
+    known = KnownTarget.from_views(data.views)
     cameras = [_fit_camera(selection, camera, known) for camera in range(data.cameras)
                if (data.camera_of == camera).sum() >= MIN_SHARED_FRAMES]
     alone = is_unpaired(data)

@@ -154,7 +154,7 @@ def _transfer_target(
     one: DatasetModel, other: DatasetModel, source: str, to: str
 ) -> Transfer | None:
     """Try the target's corrections on the other set, if it shows landmarks of the same places."""
-    known, there = (KnownTarget.of(d.null.linear.data.views) for d in (one, other))
+    known, there = (KnownTarget.from_views(d.null.linear.data.views) for d in (one, other))
     if not any(map(displaces_landmarks, one.null.linear.state.terms)) or not (
         np.array_equal(known.landmark, there.landmark)
         and np.abs(known.points - there.points).max() < _PLACE_TOLERANCE
