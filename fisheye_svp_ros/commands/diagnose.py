@@ -58,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--quick', action='store_true',
                         help='a first answer in seconds: one round on 1500 to 3000 of the points, '
                         'without held-out frames in the choice')
+    parser.add_argument('--range', type=float, metavar='M', dest='range_m',
+                        help='distance, m, at which the ray errors of the lenses are stated as '
+                        'well, beside 0.3, 1 and 5 m')
     parser.add_argument('--next', type=int, default=0, metavar='N', dest='count',
                         help='say which N photographs to take next: those that settle what the '
                         'cause may be mistaken for')
@@ -96,7 +99,8 @@ def run(args: argparse.Namespace) -> None:
     with stages('diagnosing') as progress:
         settings: dict[str, Any] = {
             'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
-            'options': DiagnosisOptions(tuple(args.included), tuple(args.left_out), args.quick),
+            'options': DiagnosisOptions(
+                tuple(args.included), tuple(args.left_out), args.quick, args.range_m),
             'progress': progress,
         }
         try:

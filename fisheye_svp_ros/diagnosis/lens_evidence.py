@@ -24,6 +24,7 @@ from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.ray_errors import (
+    RANGES,
     RayError,
     RayModel,
     points_on_rays,
@@ -166,7 +167,8 @@ def find_lens_rays(
 ) -> LensRays:
     """Compare the rays of lenses as given and as extended.
 
-    lenses: as given, by camera; lenses_of: makes extended ones of a state.
+    lenses: as given, by camera; lenses_of: makes extended ones of a state.  The range that the
+    user asks for comes last.
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
@@ -175,7 +177,7 @@ def find_lens_rays(
     covariance = evaluation.covariance[np.ix_(of_lens, of_lens)]
     frames = np.zeros((linear.data.frames, 6))
     before, views = lenses_of(evaluation.simulation.state), linear.data.views
-    errors, offsets = {}, []
+    errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
 
@@ -188,6 +190,11 @@ def find_lens_rays(
         model, there = ray_model(extend_lens, covariance, uv)
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
+        if asked is not None and asked not in RANGES:
+            wider, near = ray_model(extend_lens, covariance, uv, (*RANGES, asked))
+            more = _difference(wider, points_on_rays(given, uv[near], wider.ranges))
+            errors[name]['given'].append(wider.errors(more)[-1])
+            errors[name]['extended'].append(wider.errors()[-1])
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
         offsets.append(_offset(model, (off, off - fitted), given, uv[there]))
     return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))

@@ -59,18 +59,23 @@ def can_be_included(name: str) -> bool:
 class DiagnosisOptions:
     """Effects to include without a test, effects to leave out, whether time matters most.
 
-    Raises ParameterError for a name that is in no catalogue, or that cannot be included.
+    range_m: where ray errors are asked for, m, beside those at 0.3, 1 and 5 m.
+    Raises ParameterError for a name that is in no catalogue, or that cannot be included, and for
+    a range that is none.
     """
 
     included: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     quick: bool = False
+    range_m: float | None = None
 
     def leave_out(self, *names: str) -> DiagnosisOptions:
         """Return the options with more effects left out."""
         return replace(self, left_out=(*self.left_out, *names))
 
     def __post_init__(self) -> None:
+        if self.range_m is not None and not 0 < self.range_m < np.inf:
+            raise ParameterError(f'range {self.range_m:g}: a distance in m, above 0, is needed')
         for name in (*self.included, *self.left_out):
             if name not in CATALOGUE:
                 known = ', '.join(CATALOGUE)

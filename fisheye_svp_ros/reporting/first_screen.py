@@ -102,9 +102,12 @@ def _facts(d: Diagnosis, source: str) -> str:
     figures = d.figures
     base, named, extended = (
         one.heldout_rms_px for one in (figures.base, figures.named, figures.extended))
-    rays = d.conclusion.ray_error_mrad() if d.offers_extended else {}
-    near = (f'; ray error at 1 m {rays["given"][1]["value"]:.2g} → '
-            f'{rays["extended"][1]["value"]:.2g} mrad') if rays else ''
+    rays, near = d.conclusion.ray_error_mrad(), ''
+    if rays and d.offers_extended:
+        asked = d.problem.options.range_m or 1.0
+        before, after = (next(one['value'] for one in rays[side] if one['range_m'] == asked)
+                         for side in ('given', 'extended'))
+        near = f'; ray error at {asked:g} m {before:.2g} → {after:.2g} mrad'
     return (f'{source}: {d.observations} points in {d.frames} {kind}; held-out error '
             f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
             f'noise {d.noise_px:.2g} px{near}')

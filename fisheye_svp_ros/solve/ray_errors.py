@@ -39,12 +39,13 @@ class RayModel(NamedTuple):
 
     points (R, G, 3), m: of G image points at the ranges (R,); columns (R, G, 3, K): what each
     parameter moves them by over the range, rad, without what a motion of the camera frame does;
-    covariance (K, K) of the parameters.
+    covariance (K, K) of the parameters; ranges (R,), m.
     """
 
     points: Array
     columns: Array
     covariance: Array
+    ranges: tuple[float, ...] = RANGES
 
     @property
     def sd(self) -> Array:
@@ -63,7 +64,7 @@ class RayModel(NamedTuple):
         rms = np.sqrt((off**2).sum(axis=2).mean(axis=1))
         return [RayError(range_m, float(np.sqrt((one**2).mean())),
                          *(float(q) for q in np.quantile(one, (0.025, 0.975))))
-                for range_m, one in zip(RANGES, rms, strict=True)]
+                for range_m, one in zip(self.ranges, rms, strict=True)]
 
     def sample(self, seed: int = 0) -> Array:
         """Return errors (R, G, 3, samples), rad, as the covariance of the parameters has them."""
@@ -80,15 +81,16 @@ def typical_points(uv: Array) -> Array:
 
 
 def ray_model(
-    lens_of: Callable[[Array], Lens], covariance: Array, uv: Array
+    lens_of: Callable[[Array], Lens], covariance: Array, uv: Array,
+    ranges: tuple[float, ...] = RANGES,
 ) -> tuple[RayModel, Mask]:
     """Return how parameters move the rays of image points, and which points (G,) have rays.
 
     lens_of: makes a lens of changes (K,) of its parameters; covariance (K, K) of these; uv (G, 2),
-    px.
+    px; ranges: m.
     """
     count = len(covariance)
-    base = points_on_rays(lens_of(np.zeros(count)), uv)
+    base = points_on_rays(lens_of(np.zeros(count)), uv, ranges)
     there = np.isfinite(base).all(axis=(0, 2))
     sides = []
     for k, error in enumerate(np.sqrt(np.maximum(np.diag(covariance), 0.0))):
@@ -97,13 +99,13 @@ def ray_model(
         if not step.any():
             sides.append(np.zeros_like(base))
             continue
-        one, other = (points_on_rays(lens_of(sign * step), uv) for sign in (1, -1))
+        one, other = (points_on_rays(lens_of(sign * step), uv, ranges) for sign in (1, -1))
         there &= np.isfinite(one).all(axis=(0, 2)) & np.isfinite(other).all(axis=(0, 2))
         sides.append((one - other) / (2 * step[k]))
     columns = np.zeros((*base[:, there].shape, count))
     for k, side in enumerate(sides):
         columns[..., k] = without_motion(base[:, there], side[:, there])
-    return RayModel(base[:, there], columns, covariance), np.asarray(there)
+    return RayModel(base[:, there], columns, covariance, ranges), np.asarray(there)
 
 
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:

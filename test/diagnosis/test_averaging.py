@@ -18,7 +18,9 @@ from fisheye_svp_ros.diagnosis.averaging import (
 from fisheye_svp_ros.diagnosis.diagnosis import extended_lenses
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
+from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
+from fisheye_svp_ros.reporting.first_screen import first_screen
 
 
 def diagnosed(e0: float, noise: float, seed: int = 0, **settings: object) -> Diagnosis:
@@ -106,3 +108,15 @@ def test_a_refuted_shift_is_not_written() -> None:
     refuted = replace(selection, refuted=('viewpoint_shift',))
     assert not OpenShifts.of(refuted).effects
     assert not AveragedModel.of(refuted).shifts
+
+
+def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
+    found = diagnosed(0.004, 0.05, options=DiagnosisOptions(range_m=0.5))
+    assert found.offers_extended
+    rays = found.conclusion.ray_error['']
+    assert [one.range_m for one in rays['given']] == [0.3, 1.0, 5.0, 0.5]
+    near, far, _, asked = (one.value for one in rays['extended'])
+    assert min(near, far) * 0.9 < asked < max(near, far) * 1.1
+    assert 'ray error at 0.5 m' in first_screen(found, 'table').facts
+    with pytest.raises(ParameterError, match='a distance in m'):
+        DiagnosisOptions(range_m=0.0)
