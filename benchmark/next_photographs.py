@@ -139,14 +139,14 @@ def simulated(rng: np.random.Generator) -> tuple[Design, Linearization]:
 
 
 def without(design: Design, question: Criterion) -> Criterion:
-    """Return the question with look-alikes left out of it: they are taken as absent."""
+    """Return the question with confounded effects left out of it: they are taken as absent."""
     own = [i for i, name in enumerate(design.names)
            if '.' not in name or name.startswith('viewpoint_shift')]
     return replace(question, nuisance=np.setdiff1d(own, question.interest))
 
 
 def plain(design: Design, question: Criterion) -> Callable[[Index], float]:
-    """Return the standard error of a number from some photographs, look-alikes absent."""
+    """Return the standard error of a number from some photographs, confounded effects absent."""
     own = without(design, question)
     return lambda taken: own.answer(design.known + design.added[taken].sum(axis=0))
 

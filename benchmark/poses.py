@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
     """What became of views.
 
     refused: too few points lie in the field of view; unsolved: no pose; warned, passed: with and
-    without a reason for doubt; wrong: of the passed, beyond FAR_OFF; cleaned: gross errors were
+    without a reason for doubt; wrong: of the passed, beyond FAR_OFF; cleaned: outliers were
     left out; righted: of these, not wrong.
     """
 
@@ -160,7 +160,7 @@ def section(outcomes: dict[tuple[str, str], Outcome], lost: dict[int, tuple[int,
         'cannot tell (below). Clean views that do not pass: '
         f'{sum(o.views - o.passed for o in clean)} of {sum(o.views for o in clean)}.', '',
         '| spoilt by | scene | views | refused | no pose | warned | passed | wrong and passed | '
-        'gross errors left out | of these right |',
+        'outliers rejected | of these right |',
         '| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |',
     ]
     for (case, kind), o in outcomes.items():

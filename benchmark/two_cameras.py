@@ -5,7 +5,7 @@ offsets of single corners, an image field of each lens and of each frame, outlie
 only one camera sees or that the detector numbered from the other end.  Each is calibrated and
 diagnosed as a user would, and asked what the two cameras say of each other.  Some pairs are
 rendered: photographs alone go to `detect`.  Pairs that the output holds already are not run again;
-writes docs/results/two_cameras.json and the table in docs/how_to/whats_wrong.md.
+writes docs/results/two_cameras.json and the table in docs/results/two_cameras.md.
 """
 
 from __future__ import annotations
@@ -295,7 +295,7 @@ def tried(kind: str, seed: int) -> dict[str, Any]:
 
 
 def section(found: Sequence[dict[str, Any]]) -> str:
-    """Return the table of docs/how_to/whats_wrong.md."""
+    """Return the table of docs/results/two_cameras.md."""
     lines = [
         '| pairs | agree, undecided, contradict | correlation of the maps | rms of the one that '
         'did not find it, px | less scatter of the rig: translation | rotation | by the truth | '
@@ -364,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.stdout.write(lines[-1] + '\n')
             sys.stdout.flush()
             write_text(asked.output, '[\n' + ',\n'.join(lines) + '\n]\n')
-    page = DOCS / 'how_to' / 'whats_wrong.md'
+    page = DOCS / 'results' / 'two_cameras.md'
     between = f'{BEGIN}\n{section(found)}\n{END}'
     write_text(page, re.sub(f'{BEGIN}.*{END}', lambda _: between, page.read_text(), flags=re.S))
 

@@ -60,7 +60,7 @@ class Localized(Result):
     minus predicted, in the order of the observations, NaN where not used; sigma_px: noise of u and
     v, estimated, None where the observations bring their own; left_out: frames whose points do
     not fix a pose; reasons (F,): why a pose should not be relied on, '' where nothing speaks
-    against it: its misfit, or gross errors, which are not used.
+    against it: its misfit, or outliers, which are not used.
     """
 
     frame: Index
@@ -282,7 +282,7 @@ def calibrate(
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
-    Gross errors are set aside, and standard errors are honest, as those of the command.
+    Outliers are rejected, and standard errors are honest, as those of the command.
     progress: called with each stage and the share that is done.
     """
     from fisheye_svp_ros.study.lens_trust import (

@@ -64,7 +64,7 @@ SETS: dict[str, Callable[[Path], Set]] = {
 class Row(NamedTuple):
     """A model on one set: held-out rms, px, of so many points; seconds of a core to fit.
 
-    whole_px: the rms with gross errors.  NaN: not known, or the row above has it.
+    whole_px: the rms with outliers.  NaN: not known, or the row above has it.
     """
 
     model: str
@@ -125,7 +125,7 @@ def _nominal(lens: fsvp.Lens, test: Observations, start: Localized) -> float:
 
 
 def _whole(found: Diagnosis, test: Observations, local: PredictedOffsets | None = None) -> float:
-    """Return the rms of all held-out points, gross errors among them."""
+    """Return the rms of all held-out points, outliers among them."""
     data, known = group_by_frame(test), found.model.data.observations.t
     terms = tuple(e for e in found.model.state.terms if e[0].holds_for(test.t, known))
     solved = localize_frames(data, replace(found.model.state, terms=terms))
@@ -175,7 +175,7 @@ def section(data: Set, rows: list[Row]) -> list[str]:
         f'{len(data.train)} points in {len(data.train.frames)} frames of '
         f'{boards} board{"s" * (boards > 1)} to fit; {len(data.test)} in {held_out} frames held '
         'out.', '',
-        '| model | held-out rms, px | beside the best of the others | points | with gross errors, '
+        '| model | held-out rms, px | beside the best of the others | points | with outliers, '
         'px | s | causes, notes |', '|---|---:|---:|---:|---:|---:|---|',
     ]
     for row in rows:

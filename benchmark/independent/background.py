@@ -16,7 +16,7 @@ Rng = np.random.Generator
 
 
 class Background(NamedTuple):
-    """Departures, gross errors as a share of the points, and rms of the parts over the noise."""
+    """Departures, outliers as a share of the points, and rms of the parts over the noise."""
 
     departures: tuple[Departure, ...]
     outliers: float
@@ -85,7 +85,7 @@ def draw_background(rng: Rng, scene: Scene, size: float, free: Free) -> Backgrou
     """Return a background that leaves an rms of `size` times the noise in each coordinate.
 
     What free poses and intrinsics take away does not count.  Its variance is shared at random
-    among boards, frames and lens; up to size·2 % of the points are gross errors besides.
+    among boards, frames and lens; up to size·2 % of the points are outliers besides.
     """
     if not size:
         return Background((), 0.0, {})

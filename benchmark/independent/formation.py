@@ -121,7 +121,7 @@ def observed(
 ) -> tuple[Array, Scene]:
     """Return observed image points (M, 2), and the scene with the landmarks as they are named.
 
-    Noise, gross errors (a share `outliers` of the points), rounding and swapped names come last.
+    Noise, outliers (a share `outliers` of the points), rounding and swapped names come last.
     """
     uv = form(scene, departures)
     count = len(uv)

@@ -18,8 +18,8 @@ one camera or two; stills or video; 12 to 40 frames) and noise of 0.05 to 0.5 px
 gets observations, held-out frames and the lens. Size 1: what free poses, rig and fitted intrinsics
 leave of the effect is, in rms of a coordinate, the noise (`noise_vs_angle`: rms relative growth of
 the noise; `quantisation`: step/√12; `wrong_ids`: five pairs). Background, in the same measure,
-before gross errors: errors of single landmarks and of their neighbourhoods, an affine and
-quadratic field in each view, a static field in each camera; and up to 2 % gross errors.
+before outliers: errors of single landmarks and of their neighbourhoods, an affine and
+quadratic field in each view, a static field in each camera; and up to 2 % outliers.
 
 An effect is named if a cause or its class (`indistinguishable_from`) has it. A name is false if
 nothing of its class is hidden. The stage is right if the strongest significant component (1 %)

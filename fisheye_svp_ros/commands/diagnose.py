@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='fit the intrinsics too; always so for a lens from `calibrate`')
     parser.add_argument('--held-out', metavar='TEST',
                         help='other observations of the same camera and target to measure the '
-                        'gain on; by default frames of OBS in turn')
+                        'gain on; by default cross-validation on OBS')
     parser.add_argument('--against', metavar='OTHER',
                         help='other observations of the same camera, of another target or another '
                         'day: what moves with the lens must hold there too')

@@ -112,7 +112,7 @@ def _parts_text(uncertainty: _Parts) -> str:
     by = uncertainty['position_m']
     shares = ', '.join(f'{words} {1000 * by[name]:.3g} mm' for name, words in (
         ('noise', 'noise'), ('parameters', 'parameters of the lens'),
-        ('misfit', 'what remains without a name')))
+        ('misfit', 'unexplained model error')))
     return f'standard errors with those of the lens (rms of positions: {shares})'
 
 

@@ -27,7 +27,7 @@ _MAX_LISTED = 8
 
 @dataclass(frozen=True)
 class Advice:
-    """One thing to do: what, to which frames, landmarks and boards; gain: of held-out misfit.
+    """One thing to do: what, to which frames, landmarks and boards; gain: of held-out variance.
 
     photographs: the files of the frames, as far as they are known; kind: RETAKE, or UNLIKE where
     the other frames do not predict these.
@@ -67,7 +67,7 @@ def advise(
 
 
 def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]:
-    """Return what to do about causes of lens and target that held-out data bear out."""
+    """Return what to do about causes of lens and target that held-out data confirm."""
     gains, advice = evaluation.gains, []
     stages = {cause.effect_class.budget_stage() for cause in causes}
     if 'lens' in stages and gains['lens'].value > 0:
@@ -77,7 +77,7 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
         boards = sorted({board for cause in causes if cause.effect_class.budget_stage() == 'target'
                          for board in _boards(cause)})
         advice.append(Advice(
-            'measure the target again',
+            'measure the board, or flatten or replace it',
             boards=boards,
             landmarks=[n for c in causes if c.effect_class.target_map == 'single'
                        for n in _landmarks(c)],
@@ -93,9 +93,9 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
         alone = _frame_numbers(evaluation)[~evaluation.counted_frames]
         return [_about_frames(
             evaluation.null.linear.data.observations,
-            'take more photographs like these: the others do not predict them, since they '
-            'alone show some of the image, or since something is wrong with them; the '
-            'held-out rms is that of the others', alone.tolist(), UNLIKE)] if len(alone) else []
+            'take more photographs like these: the others do not predict them; they alone '
+            'show a part of the image, or they are wrong; the held-out rms excludes them',
+            alone.tolist(), UNLIKE)] if len(alone) else []
     table = test.data.observations
     advice = _check_photographs(table, test.outliers, 'held-out ')
     if test.another_target:
@@ -106,7 +106,7 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
     if test.rig_differs:
         advice.append(_about_frames(
             table, 'look at these held-out photographs: their cameras do not stand as in the '
-            'others, so that each view was posed by itself; was the rig touched, are the '
+            'others, so each view has a pose of its own; was the rig touched, are the '
             'cameras exchanged, are photographs of one moment numbered alike, and the points '
             'from the same end?', _shared_frames(table)))
     return advice
@@ -152,9 +152,9 @@ def _vary_views(views: RepeatedErrors) -> Advice:
     """Return what to do where landmarks err alike in similar views."""
     soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
     return Advice(
-        f'take photographs that differ from each other: landmarks err alike in those that are '
-        f'alike{soon}, so that more of the same average nothing out; does the paper lie anew each '
-        'time, does light reflect, is something printed near the corners?')
+        f'take photographs that differ from each other: errors of landmarks repeat in similar '
+        f'ones{soon} and do not average out; is the paper flat, does light reflect, is something '
+        'printed near the corners?')
 
 
 def _retake_frames(evaluation: Evaluation) -> list[Advice]:

@@ -90,7 +90,7 @@ def rms_reduction(before: HeldOut, after: HeldOut) -> Comparison:
 
 
 def held_out_gain(before: HeldOut, after: HeldOut, noise: float) -> Comparison:
-    """Return 1 - (held-out misfit above noise after) / (before), with a bootstrap interval."""
+    """Return 1 - (held-out variance above noise after) / (before), with a bootstrap interval."""
     return gain_and_confidence(before, after, noise)[0]
 
 
@@ -194,7 +194,7 @@ def cross_validate(
     null: NullModel, without: Collection[str] = (), offsets: PredictedOffsets | None = None,
     held: Collection[str] = (),
 ) -> HeldOut:
-    """Predict frames left out in turn by a fit to the others (linear in all parameters).
+    """Predict frames left out one by one by a fit to the others (linear in all parameters).
 
     without: causes that are left out; offsets: random effects to predict, each frame's from the
     others; held: causes that are not fitted anew.

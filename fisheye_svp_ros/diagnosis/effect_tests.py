@@ -56,7 +56,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class HeldOutGain:
-    """Gain in log predictive density of frames left out in turn, and its standard error."""
+    """Gain in log predictive density of frames left out one by one, and its standard error."""
 
     value: float
     stderr: float
@@ -176,7 +176,7 @@ class EffectTests:
         return score._replace(p_value=p, freedom=freedom)
 
     def held_out_gain(self, included: Index, columns: Index, effect: Effect) -> HeldOutGain:
-        """Return what columns add to the log predictive density of frames left out in turn.
+        """Return what columns add to the log predictive density of frames left out one by one.
 
         Of log p(all) - log p(all but one); a wide normal prior keeps what the others do not tell.
         """

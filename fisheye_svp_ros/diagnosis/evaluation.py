@@ -137,7 +137,7 @@ class Evaluation:
     """Figures of a selection.
 
     offsets: predicted, with what repeats in similar views; noise_px: of a coordinate; held_out:
-    other frames, None for frames left out in turn; medium: the cause that was found before the
+    other frames, None for frames left out one by one; medium: the cause that was found before the
     selection, if there is one.
     """
 
@@ -227,7 +227,7 @@ class Evaluation:
 
     @cached_property
     def counted_frames(self) -> Mask:
-        """Which frames (F,) count where each is left out in turn: what any model predicts."""
+        """Which frames (F,) count where each is left out one by one: what any model predicts."""
         with_causes, without = (
             cross_validate(self.null, gone) for gone in ((), self.names))
         return with_causes.is_predictable | without.is_predictable

@@ -52,7 +52,7 @@ def lens_columns(linear: Linearization) -> Mask:
 
 
 def compare_lens_files(evaluation: Evaluation) -> FileFigure:
-    """Predict frames left out in turn with the lens as given and the extended one.
+    """Predict frames left out one by one with the lens as given and the extended one.
 
     The target and the offsets of its landmarks are those that the other frames predict with the
     extended lens, for both lenses; that favours the extended one.

@@ -115,7 +115,7 @@ def _next_candidate(remaining: Iterator[Candidate]) -> Candidate | None:
 
 
 def _commoner_candidate(best: Candidate, others: Iterator[Candidate]) -> Candidate:
-    """Return what stands for the best candidate: a part of it, or a look-alike, more common."""
+    """Return what stands for the best candidate: a part of it, or a more common confounded one."""
     if best.effect.asked_after:
         return next((c for c in others if c.effect.name in best.effect.asked_after), best)
     near = takewhile(lambda c: c.criterion > best.criterion - _RARITY_ODDS, others)

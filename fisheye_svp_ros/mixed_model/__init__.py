@@ -6,7 +6,7 @@ covariance, leave-one-group-out predictions.  It knows no camera, board, lens or
 
     model_columns  X and Z, and their products
     equations      Henderson's mixed-model equations, factored block by block
-    solution       estimates and predictions, their covariance, groups left out in turn
+    solution       estimates and predictions, their covariance, groups left out one by one
     reml           variances by restricted maximum likelihood (average information)
     components     which variances the data call for, and their p-values
     score_tests    Rao's score test of added fixed columns, on one information matrix

@@ -1,7 +1,7 @@
 """Solutions of the mixed-model equations: BLUE, BLUP, their covariance, and groups left out.
 
 Best linear unbiased estimates of fixed and predictions of random coefficients (Henderson 1975).
-Every group left out in turn follows, exactly, from the one factorization of all groups: with
+Every group left out one by one follows, exactly, from the one factorization of all groups: with
 P = V^-1 - V^-1 X (X' V^-1 X)^-1 X' V^-1 of fixed columns X of groups and covariance V, what the
 others leave of columns c in group g is inv(P_gg) (P c)_g, and the information that goes with the
 group is (P c)_g' inv(P_gg) (P c)_g.
@@ -221,7 +221,7 @@ class LeaveOneOut(NamedTuple):
 def leave_groups_out(
     f: FactoredEquations, random: RandomColumns, group_fixed: Array, border: Array
 ) -> LeaveOneOut:
-    """Leave out every group in turn.
+    """Leave out every group, one at a time.
 
     random: columns of the components in the factored equations; group_fixed (G, M, P) and border
     (G, M, X): the columns that these were made of.

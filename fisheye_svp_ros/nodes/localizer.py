@@ -52,7 +52,7 @@ class Localizer(SolverNode):
         self._markers = self.announce(MarkerArray, '~/markers', LATCHED)
         self._transforms = Transforms(self, self.settings.publish_tf)
         self._before: tuple[Pose | None, float] = None, 0.0
-        self._misfits = 0  # sets up to the one before that fit badly, without gross errors found
+        self._misfits = 0  # sets up to the one before that fit badly, without outliers found
         self._errors: LensErrors | None = None  # of the latest lens
         self.start()
 
@@ -105,7 +105,7 @@ class Localizer(SolverNode):
     ) -> SetSolutions[Localization]:
         """Solve from where the camera was, which is faster; from anywhere if that is not near.
 
-        A wrong lens is wrong in every set; to search each for gross errors would take 20 ms more.
+        A wrong lens is wrong in every set; to search each for outliers would take 20 ms more.
         """
         start, before = self._before
         searched = self._misfits % OUTLIER_SEARCH_INTERVAL == 0

@@ -1,11 +1,11 @@
 """Which photographs to take next: views of a board that tell most of what is in doubt.
 
 Every view that a person can arrange adds information about all that is shared (lens, causes and
-their look-alikes), its own pose taken out.  Views are added greedily and then exchanged, so that
-the doubt shrinks most: the error of some numbers with all others unknown (D_s-optimal design), or
-how far a named cause is from whatever it may be mistaken for.
-Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs, 2007, sections 10.3 and 12;
-Federov's exchange.  Landmarks' own random errors are left out of it.
+their confounded effects), its own pose eliminated. Views are added greedily and then exchanged,
+so that the doubt shrinks most: the error of some numbers with all others unknown (D_s-optimal
+design), or how far a named cause is from whatever it may be mistaken for. Sources: Atkinson,
+Donev and Tobias, Optimum Experimental Designs, 2007, sections 10.3 and 12; Federov's exchange.
+Landmarks' own random errors are left out of it.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ class Criterion:
     def answer(self, information: Array) -> float:
         """Return the standard error (the geometric mean of several), or how sure a name is.
 
-        The latter: with which probability it proves needed beside each of its look-alikes.
+        The latter: with which probability it proves needed beside each of its confounded effects.
         """
         merit = float(self.merit(information[None])[0])
         if self.value is None:

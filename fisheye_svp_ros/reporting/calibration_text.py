@@ -58,7 +58,7 @@ class CalibratedCamera:
 
     def _shift_warnings(self) -> list[str]:
         return [
-            f'{name} is not settled: from {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm '
+            f'{name} is undecided: from {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm '
             'over all targets that these data admit, whose shape can explain it; ask '
             '`fisheye-svp diagnose`'
             for name, range_ in self.trust.doubtful_shift.items()]

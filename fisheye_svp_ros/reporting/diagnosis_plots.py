@@ -34,7 +34,7 @@ Picture = tuple[str, Callable[..., None], tuple[Any, ...]]
 
 
 class PlotData(NamedTuple):
-    """What the pictures are of: observations without gross errors, lenses by camera, noise (px).
+    """What the pictures are of: observations without outliers, lenses by camera, noise (px).
 
     lenses: '' is that of all cameras; table: the observations, which name photographs.
     """
@@ -46,7 +46,7 @@ class PlotData(NamedTuple):
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, points: PointResiduals) -> PlotData:
-        """Leave out gross errors: they have a table of their own."""
+        """Leave out outliers: they have a table of their own."""
         both = np.concatenate([points.before, points.after], axis=1)
         kept = ~points.outlier & np.isfinite(both).all(axis=1)
         shown = PointResiduals._make(array[kept] for array in points)

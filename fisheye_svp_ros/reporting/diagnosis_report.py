@@ -36,7 +36,7 @@ _CAPTIONS = {
     'frame': 'Residuals of each frame. A step or a drift is a change of the camera.',
     'phase': 'Residuals against the place within a pixel. Waves come from the detector of image '
              'points.',
-    'histogram': 'Residuals over the noise; beyond 6 at the ends. Wide flanks are gross errors or '
+    'histogram': 'Residuals over the noise; beyond 6 at the ends. Wide flanks are outliers or '
                  'noise that differs from place to place.',
 }
 _PICTURE_OF = {

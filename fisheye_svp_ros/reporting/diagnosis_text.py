@@ -39,7 +39,7 @@ VARIABLES = {
     'pixel_phase': 'the place within a pixel',
 }
 _STRUCTURE_TEXTS = {
-    'outliers': 'a few points lie far off',
+    'outliers': 'a few points are outliers',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
     'size': 'the residuals are not of the size that sigma says',
@@ -181,8 +181,8 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         worst, count = diagnosis.gross[0], len(diagnosis.gross)
         where = worst.get('photograph') or f'frame {worst["frame"]}'
         which = f'{where} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
-        return (f'{count} points lie far off, furthest {which}' if count > 1 else
-                f'a point lies far off, {which}')
+        return (f'{count} points are outliers, furthest {which}' if count > 1 else
+                f'one point is an outlier, {which}')
     if variable == 'size':
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
         return f'the residuals are {ratio:.2g} times as large as sigma says'
@@ -206,11 +206,11 @@ def _wrong(d: Diagnosis) -> str:
         but = [what for what, told in (('the intrinsics as given', _is_off(d)),
                                        ('where the cameras stand', _rig_advice(d))) if told]
         nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
-        return (f'{nothing} is wrong that these data can show: in {d.observations} points of '
+        return (f'{nothing} is wrong in these data: in {d.observations} points of '
                 f'{d.frames} frames the simulation leaves {noise} and no pattern.')
     if not d.causes:
         return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
-                'effect of the catalogue accounts for what is odd about them: '
+                'effect of the catalogue explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; because '.join(
         f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
@@ -227,13 +227,13 @@ def _almost(d: Diagnosis) -> str:
         if not step.accepted and step.why.endswith('does not predict better'):
             name = step.effect.partition('(')[0]
             return (f'; {name} would ({probability(step.corrected)}), but with it frames left out '
-                    'in turn are predicted no better beyond chance: more photographs would tell')
+                    'one by one are not predicted significantly better: take more photographs')
     return ''
 
 
 def _name(cause: Cause) -> str:
     others = join_names(cause.indistinguishable_from, 'or')
-    return f'{cause.effect}, or as well {others}' if others else cause.effect
+    return f'{cause.effect}, confounded with {others}' if others else cause.effect
 
 
 def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
@@ -242,23 +242,22 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     moving = [c for c in d.causes if c.effect_class.stage != 'noise']
     local = ''
     if best < 0.99 * named:
-        local = (f'; with the local offsets of single landmarks and of the image, which have no '
-                 f'name, to {best:.3g} px')
+        local = f'; with the random effects of single landmarks and of the image to {best:.3g} px'
     elif best > 1.01 * named:
-        local = (f'; the local offsets of single landmarks and of the image do not hold there: '
+        local = (f'; the random effects of single landmarks and of the image do not hold there: '
                  f'with them {best:.3g} px')
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
         if d.verdict == 'adequate':
             why = 'that is the noise' if times < _NOISE_RATIO else (
-                f'that is {times:.1f} times the noise: these frames hold the lens too loosely to '
-                'predict others; --next N says which are wanted')
+                f'{times:.1f} times the noise: these frames constrain the lens poorly; --next N '
+                'lists the photographs to take')
         if d.causes:
             why = 'the cause is in the table of image points, not in the lens'
         which = 'The lens, fitted to these data,' if _is_off(d) else 'The lens as it is'
         return f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}.'
     if named >= before:
-        return (f'Held-out data do not bear it out: {named:.3g} px rms instead of {before:.3g}; '
+        return (f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; '
                 f'the causes are no correction{local}.')
     text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
             f'{before:.3g}{local}')

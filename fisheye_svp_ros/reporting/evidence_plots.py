@@ -19,7 +19,7 @@ from fisheye_svp_ros.reporting.plots import picture, round_number
 _REJECTED_COLOR = '#cbd5e1'
 _CELLS = 24  # over the longer side of the image
 _TITLES = {'noise': 'noise of a point', 'parameters': 'parameters of the lens',
-           'misfit': 'what remains without a name'}
+           'misfit': 'unexplained model error'}
 
 
 def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:

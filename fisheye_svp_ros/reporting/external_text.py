@@ -23,7 +23,7 @@ _NO_RIG_NOTE = (
     'has a pose of its own and no result depends on their rig')
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
-CAMERAS_TITLE = 'The two cameras as each other\'s truth'
+CAMERAS_TITLE = 'Cross-camera validation'
 
 
 class Section(NamedTuple):
@@ -87,16 +87,16 @@ def _agreement(pair: TwoCameras) -> str:
     carried = f'the shape of the target found by one alone takes held-out frames of {tried}'
     alike = '' if pair.maps is None else f'; their maps correlate by {pair.maps.correlation:.2f}'
     if pair.verdict == 'agree':
-        return f'{both} bear each other out: {carried}{alike}'
+        return f'{both} agree: {carried}{alike}'
     if pair.verdict == 'undecided':
-        return f'{both} do not settle it: {carried}, which is not beyond chance in both{alike}'
+        return f'{both} are undecided: {carried}, not significant in both{alike}'
     gone = f', so that {join_names(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
     return f'{both} contradict each other about the target: {carried}{alike}{gone}'
 
 
 def _rig(pair: TwoCameras) -> str:
     if not pair.rig:
-        return '; too few frames were seen by both to say how their rig scatters'
+        return '; too few frames were seen by both to estimate the scatter of their rig'
     if pair.posed_alone:
         return _NO_RIG_NOTE
     if pair.verdict in ('nothing', 'contradict'):
@@ -104,7 +104,7 @@ def _rig(pair: TwoCameras) -> str:
     said = []
     for label, before, after, less in _rig_rows(pair.rig):
         said.append(f'{label} {before} before and {after} after ({less} less)')
-    return '; found view by view, the rig scatters: ' + join_names(said)
+    return '; estimated view by view, the rig scatters: ' + join_names(said)
 
 
 def _rig_rows(rig: dict[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
@@ -140,7 +140,7 @@ def _lens_holds(against: TwoDatasets) -> str:
     ])
     said = {
         'agree': 'What moves with the lens holds in both sets',
-        'undecided': 'Whether what moves with the lens holds in both sets is not settled',
+        'undecided': 'Whether what moves with the lens holds in both sets is undecided',
         'contradict': 'The two sets contradict each other about the lens',
     }[against.verdict]
     gone = f'; {join_names(against.withdrawn)} is withdrawn' if against.withdrawn else ''
@@ -153,9 +153,9 @@ def _difference_text(against: TwoDatasets) -> str:
     said = ''
     for of_causes, meaning in (
         (False, 'the intrinsics are not those of the other set ({}): focus or mount changed in '
-                'between, or they take up what no cause holds'),
-        (True, 'sizes of causes do not agree within their errors ({}): they are less certain than '
-               'one set says'),
+                'between, or they absorb an unexplained error'),
+        (True, 'sizes of causes do not agree within their errors ({}): the errors that '
+               'one set states are too small'),
     ):
         sizes = [(abs(one.standardized_difference), name)
                  for name, one in against.parameters.items() if ('.' in name) == of_causes]
@@ -172,4 +172,4 @@ def _follows(against: TwoDatasets) -> str:
     if any(one.improves for one in there):
         return ('; the correction of the target holds in the other set too: it is the same one, '
                 'or an error of the lens')
-    return '; the correction of the target does not follow to the other one, as it should'
+    return '; the correction of the target does not transfer to the other one, as expected'

@@ -15,7 +15,7 @@ class PointResiduals(NamedTuple):
 
     frame, camera, landmark (K,); t (K,), s, NaN where unknown; uv (K, 2), px; before and after
     (K, 2), px: measured minus predicted by the fitted base and the fitted extended model; theta
-    (K,), rad, and range (K,), m, under the latter; outlier (K,): a gross error, left out of fits.
+    (K,), rad, and range (K,), m, under the latter; outlier (K,): an outlier, left out of fits.
     """
 
     frame: Index

@@ -25,8 +25,8 @@ class MeasuredPoses(NamedTuple):
 
     result: covariances for the noise of the data; sigma: noise of u and of v, px, estimated from
     the residuals, None where the observations bring their own; left_out: frames whose points do
-    not fix a pose; gross (V, N): observations left out as gross errors; reasons (V,): why a pose
-    should not be relied on, '' where nothing speaks against it.
+    not fix a pose; gross (V, N): observations left out as outliers; reasons (V,): why a pose
+    should not be relied on, '' for a reliable one.
     """
 
     views: Views
@@ -38,7 +38,7 @@ class MeasuredPoses(NamedTuple):
 
     @property
     def inlier_residual(self) -> Array:
-        """Residuals (V, N, 2), px, without those of gross errors."""
+        """Residuals (V, N, 2), px, without those of outliers."""
         return np.where(self.gross[..., None], np.nan, self.result.residual)
 
 

@@ -1,8 +1,8 @@
-"""Which solved poses can be believed: a test of every misfit, and gross errors found and named.
+"""Which solved poses can be believed: a test of every misfit, and outliers found and named.
 
 A view passes when its misfit is what its sigma allows (chi-square) and no residual stands out of
 the others.  One that does not is searched for a pose that most of its points agree on: the points
-that do not are gross errors (Fischler and Bolles, CACM 1981; locally optimised after Chum, Matas,
+that do not are outliers (Fischler and Bolles, CACM 1981; locally optimised after Chum, Matas,
 Kittler, DAGM 2003).  Views that pass pay for no search.
 """
 
@@ -41,8 +41,8 @@ class Examination(NamedTuple):
     """Solved poses of S views, examined.
 
     result: covariances for what the residuals show where that is more than sigma; gross (S, N):
-    observations left out as gross errors; reasons (S,): why a pose should not be relied on as it
-    is, '' where nothing speaks against it; sigma: noise of u and of v, px, estimated from the
+    observations left out as outliers; reasons (S,): why a pose should not be relied on as it
+    is, '' for a reliable one; sigma: noise of u and of v, px, estimated from the
     views that pass, None where weights are known.
     """
 
@@ -56,11 +56,11 @@ def examine(
     model: ForwardModel, views: Views, found: Localization, sigma_known: bool = True,
     searched: bool = True,
 ) -> Examination:
-    """Test the poses that `localize` found, and look for gross errors where they fail.
+    """Test the poses that `localize` found, and look for outliers where they fail.
 
     sigma_known: whether weights are 1 / sigma; if not, views are held against each other, a
     single one against its own median residual, and covariances are scaled by the estimate.
-    searched: look for gross errors; without, a view that fails is only said to.
+    searched: look for outliers; without, a view that fails is only said to.
     """
     model = model.seeing(views)
     if sigma_known:
@@ -119,7 +119,7 @@ def doubt_of_pairs(
     models: tuple[ForwardModel, ForwardModel], rig: Pose, uv: tuple[Array, Array], landmark: Index,
     sigma: float,
 ) -> str:
-    """Say why stereo depth should not be relied on; '' where nothing speaks against it.
+    """Say why stereo depth should not be relied on; '' for a reliable one.
 
     models, uv (N, 2), px: left, right; rig: left camera in the right one; landmark (N,); sigma:
     noise of u and of v, px.  The least reprojection error of a pair has one degree of freedom.
@@ -153,7 +153,7 @@ def misfit_fails(cost: Array, freedom: Array) -> Mask:
 def misfit_reason(excess: float, freedom: int) -> str:
     """Say in words that the misfit is too large: excess over its expectation, as a variance."""
     return (
-        f'the misfit is {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
+        f'the residuals are {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
         'freedom) and no few points are to blame: lens, image size, landmarks or their unit may '
         'be wrong'
     )
@@ -263,7 +263,7 @@ def _gross_reason(view: Views, gross: Mask, residual: Array) -> str:
     worst = np.argsort(-size, kind='stable')[:gross.sum()]
     if not len(worst):
         return ''
-    return f'gross errors left out: {_landmark_names(view.landmark[0, worst], size[worst])}'
+    return f'outliers rejected: {_landmark_names(view.landmark[0, worst], size[worst])}'
 
 
 def _landmark_names(landmark: Index, size: Array) -> str:

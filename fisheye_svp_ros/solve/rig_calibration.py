@@ -32,7 +32,7 @@ class RigCalibration(NamedTuple):
     camera in the target; rms_px (C,), and over all: total_rms_px; sigma_px: noise of u and v,
     estimated, None where the observations bring their own; shared (C,): frames that a camera
     shares with others; left_out: frames that no rig explains; reason: why it should not be relied
-    on, '' where nothing speaks against it.
+    on, '' for a reliable one.
     """
 
     cameras: tuple[str, ...]

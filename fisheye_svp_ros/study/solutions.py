@@ -51,7 +51,7 @@ class SetSolutions(NamedTuple, Generic[T]):
     """The solution of S sets and its metrics, arrays (S,) by name.
 
     solved (S,); unsolved: why the others have no solution; reasons (S,): why a solution should
-    not be relied on, '' where nothing speaks against it, all of them where that was not examined.
+    not be relied on, '' for a reliable one, all of them where that was not examined.
     """
 
     solution: T
@@ -73,7 +73,7 @@ def localize_sets(
 ) -> SetSolutions[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
-    examined: test the misfit against sigma and leave gross errors out, which simulated sets do
+    examined: test the misfit against sigma and leave outliers out, which simulated sets do
     not have: for them it changes nothing.  searched: as `examine` has it.
     Raises GeometryError as `localize` does.
     """

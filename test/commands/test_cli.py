@@ -162,7 +162,7 @@ class TestLocalize:
         arguments = [tmp_path / 'swapped.csv', '--lens', folder / 'lens.yaml', '-o', tmp_path]
         assert cli.main(['localize', *map(str, arguments)]) == 0
         err = capsys.readouterr().err
-        assert 'note: frame 4: gross errors left out: landmarks' in err and err.count('note') == 1
+        assert 'note: frame 4: outliers rejected: landmarks' in err and err.count('note') == 1
         figures = json.loads((tmp_path / 'localize.json').read_text())
         assert {(g['frame'], g['landmark']) for g in figures['gross']} == {(4, 7), (4, 40)}
         assert [frame['frame'] for frame in figures['doubtful']] == [4]

@@ -400,7 +400,7 @@ def test_a_pose_that_is_not_to_be_relied_on_is_a_warning(graph: Callable[..., Gr
     assert [one.level for one in status] == [ok, warn, warn]
     assert status[0].message == ''
     named = {int(seen.landmark[i]) for i in (4, 20)}
-    assert 'gross errors left out: landmarks' in status[1].message
+    assert 'outliers rejected: landmarks' in status[1].message
     assert all(f' {landmark} (' in status[1].message for landmark in named)
     assert 'times what sigma allows' in status[2].message
     sets.graph.until(lambda: len(sets.poses) == 3)

@@ -1,4 +1,4 @@
-"""Poses that should not be relied on are said to be so, and gross errors are named."""
+"""Poses that should not be relied on are said to be so, and outliers are named."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_gross_errors_are_named_and_change_no_metrics_but_their_own():
     kept = views._replace(weight=np.where(np.isin(views.landmark, [3, 11]), 0.0, views.weight))
     found, want = localize_sets(model, views, true, examined=True), localize(model, kept)
     reason, = found.reasons
-    assert reason.startswith('gross errors left out: landmarks 3 (4') and ', 11 (3' in reason
+    assert reason.startswith('outliers rejected: landmarks 3 (4') and ', 11 (3' in reason
     np.testing.assert_allclose(found.solution.pose.position, want.pose.position, atol=1e-8)
     np.testing.assert_allclose(found.solution.covariance, want.covariance, rtol=1e-4)
     assert found.metrics['points'] == 18 and found.metrics['rms_px'] < 3 * SIGMA
@@ -89,7 +89,7 @@ def test_a_misfit_that_no_point_is_to_blame_for_scales_the_covariance():
     checked = examine(model, views, found)
     excess = found.cost[0] / (2 * 20 - 6)
     np.testing.assert_allclose(checked.result.covariance, excess * found.covariance)
-    assert f'the misfit is {np.sqrt(excess):.3g} times what sigma allows' in checked.reasons[0]
+    assert f'the residuals are {np.sqrt(excess):.3g} times what sigma allows' in checked.reasons[0]
     assert 'the covariance is scaled' in checked.reasons[0]
 
 
@@ -212,7 +212,7 @@ class TestStereoDepth:
     def test_pairs_that_all_misfit_a_little_are_no_gross_errors(self):
         models, left, uv = self.pairs(4, 0.5 * SIGMA)
         uv[0][:, 1] += 2.5 * SIGMA  # of 5 that one pair may be off
-        assert self.doubt(models, left, uv).startswith('the misfit is ')
+        assert self.doubt(models, left, uv).startswith('the residuals are ')
 
     @pytest.mark.parametrize('spoil', ['swap', 'turn', 'half', 'noise', 'ids'])
     def test_what_is_wrong_with_all_of_them_is_said(self, spoil):

@@ -1,4 +1,4 @@
-"""Two cameras as each other's truth: one board has one shape, and a rig stands still.
+"""Cross-camera validation: one board has one shape, and a rig stands still.
 
 What each camera alone says of the target is carried over to the other, which took no part in
 finding it; and the rig is found view by view, from poses of each camera by itself.
@@ -41,7 +41,7 @@ _MIN_COMMON_LANDMARKS = 6  # landmarks, the fewest that two maps are compared by
 
 @dataclass(frozen=True)
 class Transfer:
-    """Frames of `to`, each left out in turn, without and with what was found in `source`.
+    """Frames of `to`, each left out one by one, without and with what was found in `source`.
 
     without_px, with_px: rms of the 2-D residual; less_px: by how much it is less, and its 95 %
     interval over frames.
@@ -94,7 +94,7 @@ def effect_names(terms: Sequence[Term]) -> list[str]:
 def fit_and_predict(
     data: RigViews, state: RigState, free: Sequence[str], held: Collection[str] = ()
 ) -> tuple[RigState, HeldOut]:
-    """Fit by least squares, and predict frames left out in turn; held: effects left as they are.
+    """Fit by least squares, and predict frames left out one by one; held: effects kept fixed.
 
     Nothing random: what was carried over is tried as whoever uses it would.
     """
