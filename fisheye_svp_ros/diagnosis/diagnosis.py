@@ -189,6 +189,11 @@ class Diagnosis:
         return self.evaluation.fixed_model
 
     @property
+    def named_fit(self) -> Linearization:
+        """The named causes fitted as the simulation was, for residuals after and before them."""
+        return self.evaluation.named_fit
+
+    @property
     def written_model(self) -> Linearization:
         """The model whose lenses are written: with the viewpoint shifts that may be there."""
         return self.evaluation.written_model

@@ -57,10 +57,11 @@ from fisheye_svp_ros.solve.rig_state import (
     RigState,
     RigViews,
     group_by_frame,
+    is_shared,
     rms_px,
 )
 
-_SAME_RMS = 1 - 1e-9  # rounding
+_SAME_RMS = 0.995  # a rise by less is none: noise that grows with the angle has weights
 
 
 @dataclass(frozen=True)
@@ -280,6 +281,18 @@ class Evaluation:
         """The causes without random effects: poses, which these had moved, are fitted anew."""
         return _with_poses_anew(self.null.linear)
 
+    @cached_property
+    def named_fit(self) -> Linearization:
+        """The named causes fitted as the simulation was, by least squares without random effects.
+
+        All points count alike in both: the rms on the fitted frames says what the causes bring.
+        """
+        if self.medium is not None:
+            return self.fixed_model  # the lens as it is in air was no free fit either
+        data, start = self.null.linear.data, self.null.linear.state
+        start = replace(start, terms=tuple(t for t in start.terms if is_shared(t[0])))
+        return Linearization(data, adjust(data, start, self.free), self.free)
+
     @property
     def falling(self) -> bool:
         """Whether the rms of the fitted frames falls from base to named to extended."""
@@ -310,7 +323,7 @@ class Evaluation:
         freedom = full.rows - full.group_rank - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
         # Of the points that the causes were fitted to: figures before and after are comparable.
-        views = self.fixed_model.data.views
+        views = self.named_fit.data.views
         squares = ((views.uv - linear.linear.uv) ** 2).sum(axis=-1)[views.used]
         return FitQuality(
             float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
@@ -318,7 +331,7 @@ class Evaluation:
     @cached_property
     def named_quality(self) -> FitQuality:
         """All causes, without random effects."""
-        return FitQuality(rms_px(self.fixed_model), self._cause_predictions[-1].rms)
+        return FitQuality(rms_px(self.named_fit), self._cause_predictions[-1].rms)
 
     @cached_property
     def lens_quality(self) -> FitQuality:

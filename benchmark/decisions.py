@@ -1,0 +1,186 @@
+"""What the diagnosis decides about lenses whose truth is known: `python -m benchmark.decisions`.
+
+A camera of the independent simulator is calibrated on one set and diagnosed on another, with a
+board whose landmarks are a little off.  Its lens is sound, or off by three of its stated errors in
+one intrinsic, or has a viewpoint shift that the calibration did not know of.
+Writes docs/results/decisions.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.stats import binomtest, spearmanr
+
+import fisheye_svp_ros as fsvp
+from benchmark.independent.camera import Array, draw_lens, image_points
+from benchmark.independent.camera import Lens as TrueLens
+from benchmark.independent.formation import Departure, observed
+from benchmark.independent.scene import Scene, draw_scene
+from benchmark.workers import in_processes
+from fisheye_svp_ros.io.files import write_text
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations, make_observations
+
+KINDS = ('sound', 'off', 'shift')
+OFF = 3.0  # standard errors
+OFFSET = 3e-5  # m: of the landmarks of a printed board
+SHIFT = 4e-3  # m
+RANGES = (0.3, 1.0, 5.0)
+RESULT = Path('docs/results/decisions.md')
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was decided about a lens, and what is true of it.
+
+    decision, target: the answers; bound: of the viewpoint shift, m, NaN where none is stated;
+    shift: the true one; gain: the `file` figure; true_gain: 1 - ray error of the extended lens
+    over that of the given one, by the truth; stated: of `ray_error_mrad`, given and extended at
+    1 m, with the true ones.
+    """
+
+    kind: str
+    decision: str
+    target: str
+    causes: tuple[str, ...]
+    bound: float
+    shift: float
+    gain: float
+    true_gain: float
+
+
+def run(task: tuple[str, int]) -> Outcome:
+    """Run one trial: kind and number; the same gives the same data."""
+    kind, number = task
+    rng = np.random.default_rng([KINDS.index(kind), number])
+    shift = rng.choice([-1, 1]) * abs(rng.normal(0, SHIFT)) if kind == 'shift' else 0.0
+    lens, noise = draw_lens(rng, 'kannala_brandt', 1.6), float(np.exp(rng.uniform(-3.0, -1.2)))
+    tables = [_photograph(rng, lens, shift, noise) for _ in range(2)]
+    given = fsvp.calibrate(
+        tables[0], 'kannala_brandt', (lens.width, lens.height)).lens
+    if kind == 'off':
+        given = _move(given, rng)
+    found = fsvp.diagnose(tables[1], given)
+    document = found.document
+    answer = document['decision']['lens']
+    bounds = {one['effect']: one['value'] for one in answer.get('bound', [])}
+    errors = [_ray_error(one, lens, shift, tables[1]) for one in (given, found.lens)]
+    return Outcome(
+        kind, answer['say'], document['decision']['target']['say'],
+        tuple(cause['effect'] for cause in document['causes']),
+        bounds.get('viewpoint_shift', np.nan), shift, document['file']['gain'],
+        1 - errors[1] / errors[0])
+
+
+def _photograph(rng: np.random.Generator, lens: TrueLens, shift: float, noise: float
+                ) -> Observations:
+    """Return what the camera sees of a printed board."""
+    scene: Scene | None = None
+    while scene is None:
+        scene = draw_scene(rng, lens, 'board', fitted=True, stereo=False, moving=False,
+                           noise=noise)
+    offsets = Departure(landmarks=OFFSET * rng.normal(size=scene.target.points.shape))
+    pupil = Departure(pupil=lambda theta, _: shift * _gennery(theta)[:, None] * [0.0, 0.0, 1.0])
+    uv, named = observed(rng, scene, [offsets, pupil], 0.0)
+    return make_observations(named.frame, named.landmark, uv, scene.target.points[named.landmark])
+
+
+def _gennery(theta: Array) -> Array:
+    safe = np.maximum(theta, 1e-6)
+    return np.asarray(safe / np.sin(safe) - 1)
+
+
+def _move(lens: Lens, rng: np.random.Generator) -> Lens:
+    """Return a lens with one intrinsic off by some of its stated standard errors."""
+    stated = (lens.calibration or {})['stderr']
+    names: Sequence[str] = [('fx', 'fy'), ('cx',), ('cy',)][rng.integers(3)]
+    sign = rng.choice([-1, 1])
+    return replace(lens.with_parameters(
+        names, [lens.parameters[name] + sign * OFF * stated[name] for name in names]),
+        calibration=lens.calibration)
+
+
+def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) -> float:
+    """Return the rms angle, rad, over ranges between true rays and those of a lens.
+
+    Over the field that was seen; a motion of the whole camera is taken out.
+    """
+    center = np.array([true.cx, true.cy])
+    seen = np.quantile(np.linalg.norm(table.uv - center, axis=1), 0.98)
+    theta, azimuth = (one.ravel() for one in np.meshgrid(
+        np.linspace(0.02, true.theta_max, 25), np.linspace(0, 2 * np.pi, 16, endpoint=False)))
+    uv = image_points(true, theta, azimuth)
+    inside = (np.linalg.norm(uv - center, axis=1) < seen) & (uv > 0).all(axis=1)
+    inside &= (uv < [true.width, true.height]).all(axis=1)
+    theta, azimuth, uv = theta[inside], azimuth[inside], uv[inside]
+    direction = np.stack([np.sin(theta) * np.cos(azimuth), np.sin(theta) * np.sin(azimuth),
+                          np.cos(theta)], axis=1)
+    origin = shift * _gennery(theta)[:, None] * [0.0, 0.0, 1.0]
+    points = np.concatenate([origin + far * direction for far in RANGES])
+
+    def off(motion: Array) -> Array:
+        moved = Rotation.from_rotvec(motion[:3]).apply(points) + motion[3:]
+        image = fsvp.project(lens, moved).uv
+        return np.nan_to_num((image - np.tile(uv, (len(RANGES), 1))) / true.fx).ravel()
+
+    left = least_squares(off, np.zeros(6)).fun
+    return float(np.sqrt(2 * np.mean(left**2)))
+
+
+def _share(hits: Sequence[bool]) -> str:
+    """Return a share with its 95 % interval, in percent."""
+    found = binomtest(int(np.sum(hits)), len(hits)).proportion_ci(method='wilson')
+    return (f'{100 * np.mean(hits):.0f} % ({100 * found.low:.0f} to {100 * found.high:.0f}, '
+            f'n = {len(hits)})')
+
+
+def report(outcomes: Sequence[Outcome], command: str) -> str:
+    """Return the page of results."""
+    of = {kind: [one for one in outcomes if one.kind == kind] for kind in KINDS}
+    wanted = {'sound': {'keep'}, 'off': {'recalibrate'},
+              'shift': {'use_extended', 'recalibrate', 'undecided'}}
+    lines = ['# Decisions about lenses whose truth is known', '', __doc__.partition('\n\n')[2]
+             .rpartition('\n')[0].rpartition('\n')[0], '', f'`{command}`', '',
+             '| lens | expected | as expected | '
+             + ' | '.join(('keep', 'use_extended', 'recalibrate', 'undecided')) + ' |',
+             '|---|---|---|---|---|---|---|']
+    for kind, found in of.items():
+        counts = [str(sum(one.decision == say for one in found))
+                  for say in ('keep', 'use_extended', 'recalibrate', 'undecided')]
+        lines.append(f'| {kind} | {", ".join(sorted(wanted[kind]))} | '
+                     f'{_share([one.decision in wanted[kind] for one in found])} | '
+                     + ' | '.join(counts) + ' |')
+    bounded = [one for one in outcomes if np.isfinite(one.bound)]
+    covered = [one.bound >= abs(one.shift) for one in bounded]
+    finite = [one for one in outcomes if np.isfinite(one.true_gain)]
+    rank = spearmanr([one.gain for one in finite], [one.true_gain for one in finite])
+    lines += ['', f'- The bound of the viewpoint shift covers the truth in {_share(covered)}.',
+              f'- Rank correlation of `file` with the true gain of rays: {rank.statistic:.2f}.',
+              f'- Extended lenses more than 10 % worse than those given: '
+              f'{_share([one.true_gain < -0.1 for one in finite])}.', '']
+    return '\n'.join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the trials and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument('--trials', type=int, default=60, help='of each kind')
+    parser.add_argument('--workers', type=int, default=2, help='processes')
+    parser.add_argument('-o', '--output', type=Path, default=RESULT)
+    chosen = parser.parse_args(arguments)
+    tasks: list[Any] = [(kind, i) for i in range(chosen.trials) for kind in KINDS]
+    outcomes = in_processes('decisions', run, tasks, chosen.workers)
+    write_text(chosen.output, report(
+        outcomes, f'python -m benchmark.decisions --trials {chosen.trials}'))
+
+
+if __name__ == '__main__':
+    main()
