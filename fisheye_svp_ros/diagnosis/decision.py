@@ -11,7 +11,7 @@ LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
 TargetAnswer = Literal['keep', 'correct', 'measure_again']
 PhotographsAnswer = Literal['enough', 'more', 'retake']
 
-_OFF_P = 0.02  # of the ray error by what is stated: below, the lens is another one
+_OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
 _MIN_FRAMES = 8  # frames
@@ -64,20 +64,16 @@ class LensOffset(NamedTuple):
     """How far the lens as given is off what the data say.
 
     mrad: rms of the rays at 1 m, of the fit with causes or of that without, whichever is nearer;
-    expected: what the stated errors and those of the fit let expect, p_value: of so much by them;
-    px: mrad in the image; stated: whether the lens file states errors.
+    ratio: of the distance over what the stated errors and those of the fit let expect, by their
+    covariance; p_value: of so much by chance; px: mrad in the image; stated: whether the lens
+    file states errors.
     """
 
     mrad: float
-    expected: float
+    ratio: float
     p_value: float
     px: float
     stated: bool = True
-
-    @property
-    def ratio(self) -> float:
-        """Times the expected one."""
-        return self.mrad / max(self.expected, 1e-9)
 
     def matters(self, noise_px: float) -> bool:
         """Say whether the lens is another one; of a lens without errors only what costs counts."""
@@ -132,7 +128,7 @@ def decide_lens(facts: LensFacts) -> Decision:
     if (off := facts.offset) is not None and off.matters(facts.noise_px):
         return Decision(
             'recalibrate', f'the lens as given is off by {off.mrad:.2g} mrad ({off.px:.2g} px), '
-            f'{off.ratio:.1f} times its expected error',
+            f'{off.ratio:.1f} times what the errors of both fits allow',
             Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
     if facts.refitted:
         names = ', '.join(facts.refitted)

@@ -37,6 +37,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, is_shared
 _BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
 _EDGE = 0.9  # of the points by incidence angle: beyond is the edge
+_FLOOR = 0.1  # of the noise: what an angle may differ by without a reason
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 LensesOf = Callable[[RigState], Mapping[str, Lens]]
@@ -196,7 +197,8 @@ def find_lens_rays(
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
-        offsets.append(_offset(model, (off, off - fitted), given, uv[there]))
+        offsets.append(
+                _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px))
     return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))
 
 
@@ -209,17 +211,42 @@ def _difference(model: RayModel, points: Array) -> Array:
     return found
 
 
-def _offset(model: RayModel, off: Sequence[Array], given: Lens, uv: Array) -> LensOffset:
-    """Return how far a lens is off the nearer of two fits, and how often chance does as much."""
-    nearer = min(_rms(one[_NEAR_RANGE]) for one in off)
+def _offset(
+    model: RayModel, off: Sequence[Array], given: Lens, uv: Array, noise: float
+) -> LensOffset:
+    """Return how far a lens is off the nearer of two fits, and how often chance does as much.
+
+    By the covariance of what both may be off: a small change counts where it is known well.
+    noise: px; angles far below it do not count (`_FLOOR`).
+    """
+    nearer = min((one[_NEAR_RANGE] for one in off), key=_rms)
     expected = model.sample()[_NEAR_RANGE]
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
-    drawn = np.sqrt((expected**2).sum(axis=1).mean(axis=0))
-    p_value = float((1 + (drawn >= nearer).sum()) / (1 + len(drawn)))
-    return LensOffset(1e3 * nearer, 1e3 * float(np.sqrt((drawn**2).mean())), p_value,
-                      nearer * float(np.sqrt(given.fx * given.fy)), stated is not None)
+    focal = float(np.sqrt(given.fx * given.fy))
+    distance, drawn = _distances(nearer, expected, _FLOOR * noise / focal)
+    p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
+    return LensOffset(1e3 * _rms(nearer), float(distance / np.sqrt((drawn**2).mean())), p_value,
+                      _rms(nearer) * focal, stated is not None)
+
+
+def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
+    """Return the Mahalanobis distance of angles (G, 3) and of samples (G, 3, S) of their errors.
+
+    floor: standard deviation, rad, of each angle beside their covariance.
+    Source: Mahalanobis, On the generalized distance in statistics (1936).
+    """
+    flat = samples.reshape(-1, samples.shape[-1])
+    axes, size, _ = np.linalg.svd(flat / np.sqrt(flat.shape[1]), full_matrices=False)
+
+    def distance(angles: Array) -> Array:
+        within = axes.T @ angles
+        rest = (angles**2).sum(axis=0) - (within**2).sum(axis=0)
+        whole = (within**2 / (size**2 + floor**2)[:, None]).sum(axis=0) + rest / floor**2
+        return np.asarray(np.sqrt(np.maximum(whole, 0.0)))
+
+    return float(distance(off.reshape(-1, 1))[0]), distance(flat)
 
 
 def _rms(angles: Array) -> float:
