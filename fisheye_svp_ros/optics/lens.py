@@ -41,9 +41,9 @@ class Lens:
     viewpoint_shift: ViewpointShift | None = None
     port: Port | None = None
     corrections: Mapping[str, Any] = field(default_factory=dict)
-    target: Mapping[str, Any] = field(default_factory=dict)
-    calibration: Mapping[str, Any] | None = None
-    uncertainty: Mapping[str, Any] | None = None
+    target: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    calibration: Mapping[str, Any] | None = field(default=None, repr=False)
+    uncertainty: Mapping[str, Any] | None = field(default=None, repr=False)
 
     @property
     def parameters(self) -> dict[str, float]:

@@ -256,3 +256,9 @@ def test_kannala_brandt_ends_where_its_height_stops_growing():
 def test_a_coefficient_next_to_nothing_changes_no_limit():
     assert KannalaBrandt(-0.1, 0.0, 0.0, 1e-320).limit == KannalaBrandt(-0.1).limit
     assert KannalaBrandt(-0.1, 0.0, 0.0, 5e-324).limit == KannalaBrandt(-0.1).limit
+
+
+def test_a_lens_prints_on_one_line_whatever_its_file_holds():
+    calibration = {'stderr': {'fx': 0.1}, 'covariance': np.eye(40).tolist()}
+    lens = lens_from_dict({**copy.deepcopy(DOCUMENT), 'calibration': calibration})
+    assert len(repr(lens)) < 500 and 'covariance' not in repr(lens)
