@@ -38,6 +38,7 @@ _BOUNDED_EFFECTS = ('viewpoint_shift', 'sensor_tilt', 'decentering')
 _NORMAL_95 = 1.96
 _EDGE = 0.9  # of the points by incidence angle: beyond is the edge
 _FLOOR = 0.1  # of the noise: what an angle may differ by without a reason
+_LINEARITY = 0.05  # of a change: beyond it, its columns are no measure
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 LensesOf = Callable[[RigState], Mapping[str, Lens]]
@@ -217,7 +218,7 @@ def _offset(
     """Return how far a lens is off the nearer of two fits, and how often chance does as much.
 
     By the covariance of what both may be off: a small change counts where it is known well.
-    noise: px; angles far below it do not count (`_FLOOR`).
+    noise: px; angles far below it, and what a large change is by more than linear, do not count.
     """
     nearer = min((one[_NEAR_RANGE] for one in off), key=_rms)
     expected = model.sample()[_NEAR_RANGE]
@@ -225,7 +226,8 @@ def _offset(
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
     focal = float(np.sqrt(given.fx * given.fy))
-    distance, drawn = _distances(nearer, expected, _FLOOR * noise / focal)
+    floor = float(np.hypot(_FLOOR * noise / focal, _LINEARITY * _rms(nearer)))
+    distance, drawn = _distances(nearer, expected, floor)
     p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
     return LensOffset(1e3 * _rms(nearer), float(distance / np.sqrt((drawn**2).mean())), p_value,
                       _rms(nearer) * focal, stated is not None)
@@ -234,10 +236,11 @@ def _offset(
 def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     """Return the Mahalanobis distance of angles (G, 3) and of samples (G, 3, S) of their errors.
 
-    floor: standard deviation, rad, of each angle beside their covariance.
+    floor: rms of angles, rad, that counts as one standard deviation beside their covariance.
     Source: Mahalanobis, On the generalized distance in statistics (1936).
     """
     flat = samples.reshape(-1, samples.shape[-1])
+    floor = floor * np.sqrt(len(flat) / 3)
     axes, size, _ = np.linalg.svd(flat / np.sqrt(flat.shape[1]), full_matrices=False)
 
     def distance(angles: Array) -> Array:
