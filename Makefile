@@ -18,7 +18,7 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare rectification hand-eye kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare decisions rectification hand-eye kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -63,6 +63,10 @@ blind: $(VENV)/ready
 # The same through rendered photographs: only the pictures are handed over; takes long, too.
 blind-images: $(VENV)/ready
 	$(BIN)/python -m benchmark.blind_images --trials 100
+
+# What is decided about lenses whose truth is known, into docs/results/decisions.md.
+decisions: $(VENV)/ready
+	$(BIN)/python -m benchmark.decisions --trials 60
 
 # How accurate detected corners are, into docs/results/detectors.md.
 detectors: $(VENV)/ready
