@@ -229,7 +229,8 @@ def _offset(
     floor = float(np.hypot(_FLOOR * noise / focal, _LINEARITY * _rms(nearer)))
     distance, drawn = _distances(nearer, expected, floor)
     p_value = float((1 + (drawn >= distance).sum()) / (1 + len(drawn)))
-    return LensOffset(1e3 * _rms(nearer), float(distance / np.sqrt((drawn**2).mean())), p_value,
+    ratio = distance / max(float(np.sqrt((drawn**2).mean())), 1.0)
+    return LensOffset(1e3 * _rms(nearer), ratio, p_value,
                       _rms(nearer) * focal, stated is not None)
 
 

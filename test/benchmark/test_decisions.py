@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from benchmark.decisions import KINDS, Outcome, report, run
 
 
