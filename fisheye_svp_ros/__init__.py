@@ -31,6 +31,8 @@ _HOMES = {
     'localize': 'library',
     'calibrate': 'library',
     'calibrate_stereo': 'library',
+    'calibrate_rig': 'library_rigs',
+    'localize_rig': 'library_rigs',
     'stereo_depth': 'library',
     'simulate_scenario': 'library',
     'sweep': 'library',

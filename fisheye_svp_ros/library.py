@@ -19,8 +19,8 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
-from fisheye_svp_ros.io.poses_csv import pose_columns
-from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.io.poses_csv import FramePoses, pose_columns
+from fisheye_svp_ros.io.readers import read_observations, read_poses
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 
 AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
+AnyPoses = FramePoses | str | Path
 # Called with a stage of long work and the share (0 to 1) that is done.
 Progress = Callable[[str, float], None]
 
@@ -241,6 +242,10 @@ def back_project(lens: AnyLens, uv: Array) -> Rays:
     return forward.back_project(load_lens(lens), _check_last_axis(2, uv, 'uv'))
 
 
+def _by_frame(poses: AnyPoses) -> dict[int, Pose]:
+    return (poses if isinstance(poses, FramePoses) else read_poses(poses)).by_frame()
+
+
 def _check_last_axis(size: int, values: Array, name: str) -> Array:
     numbers = np.asarray(values, dtype=float)
     if numbers.shape[-1:] != (size,):
@@ -278,11 +283,14 @@ def localize(
 @single_threaded
 def calibrate(
     observations: AnyObservations, model: str, image_size: tuple[int, int],
-    free: Sequence[str] | None = None, name: str = 'lens', *, progress: Progress = _silent,
+    free: Sequence[str] | None = None, name: str = 'lens', *,
+    poses: AnyPoses | None = None, progress: Progress = _silent,
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
     Outliers are rejected, and standard errors are honest, as those of the command.
+    poses: of the flange of a robot that carried the camera; `calibration` of the lens has
+    `hand_eye` then, where the camera sits in it.
     progress: called with each stage and the share that is done.
     """
     from fisheye_svp_ros.study.lens_trust import (
@@ -295,6 +303,8 @@ def calibrate(
     found, kept, _ = calibrate_without_outliers(
         _table(observations),
         lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
+    if poses is not None:
+        found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
     adjusted = found.adjusted
     progress('estimating standard errors', 0.3)
     trusted = assess_lens(kept, adjusted.lens, adjusted.names)
@@ -384,23 +394,26 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
 @single_threaded
 def diagnose(
     observations: AnyObservations, lens: AnyLens, *, free_intrinsics: bool | None = None,
-    held_out: AnyObservations | None = None, progress: Progress = _silent,
+    held_out: AnyObservations | None = None, poses: AnyPoses | None = None,
+    progress: Progress = _silent,
 ) -> Diagnosed:
     """Find what a lens's simulation gets wrong about observations, and extend it.
 
     free_intrinsics: whether they are to be fitted, by default where a fit made the lens;
-    held_out: other frames of the same camera and target to measure the gain on;
+    held_out: other frames of the same camera and target to measure the gain on; poses: of the
+    camera, or of the flange of a robot that carries it, which the data tell apart;
     progress: called with each stage and the share that is done.
     Raises GeometryError or ObservationError where the data cannot be solved at all.
     """
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
-    from fisheye_svp_ros.solve.measured_poses import posable_observations
+    from fisheye_svp_ros.solve.measured_poses import posable_observations, poses_by_frame
 
     known = load_lens(lens)
     table, _ = posable_observations(_table(observations), known)
     test = None if held_out is None else posable_observations(_table(held_out), known)[0]
+    given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
     found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
-                        progress=progress)
+                        poses=given, progress=progress)
     return Diagnosed(found.verdict, found.to_dict(), found.lens)
 
 

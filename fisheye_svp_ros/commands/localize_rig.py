@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.reporting.tables import noise_text, print_table
 from fisheye_svp_ros.scene.observations import Observations
-from fisheye_svp_ros.scene.photograph_names import frame_name, photograph_entry
+from fisheye_svp_ros.scene.photograph_names import photograph_entry
 from fisheye_svp_ros.solve.measured_poses import rms_px
 from fisheye_svp_ros.solve.rig_localization import RigLocalization, localize_rig
 
@@ -52,7 +52,7 @@ def _print(table: Observations, cameras: tuple[str, ...], found: RigLocalization
         worst = [np.sqrt(np.linalg.eigvalsh(found.covariance[i][part, part])[-1])
                  for part in (slice(0, 3), slice(3, 6))]
         rows.append((
-            frame_name(table, frame).removeprefix('frame '), ' '.join(names),
+            str(frame), ' '.join(names),
             str(int(data.views.used[mine].sum())), f'{rms_px(found.residual[mine]):.4f}',
             *(f'{1000 * value:.3f}' for value in found.pose.position[i]),
             f'{1000 * worst[0]:.3f}', f'{np.degrees(worst[1]):.4f}'))
