@@ -31,7 +31,7 @@ from fisheye_svp_ros.scene.photograph_names import photograph_names
 if TYPE_CHECKING:
     from fisheye_svp_ros.diagnosis import Comparison, Diagnosis
     from fisheye_svp_ros.planning.plan import NextViews
-    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs
+    from fisheye_svp_ros.reporting.next_steps import ReportInputs
     from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 
@@ -170,10 +170,10 @@ def _print(
     wanted: NextViews | None,
 ) -> None:
     """Print what the first screen of the report says, and the photographs to take next."""
-    from fisheye_svp_ros.reporting import external_text, shot_list
-    from fisheye_svp_ros.reporting.diagnosis_report import command_to_go_on
+    from fisheye_svp_ros.reporting import external_text
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
     from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
+    from fisheye_svp_ros.reporting.next_steps import command_to_go_on
     from fisheye_svp_ros.reporting.tables import print_lines, print_table
 
     command = command_to_go_on(diagnosis, _inputs(args, bool(diagnosis.intrinsics)))
@@ -182,6 +182,8 @@ def _print(
                         command if args.output else ''),
         *(f'{one.title}: {one.sentence}' for one in external_text.sections(diagnosis))])
     if wanted:
+        from fisheye_svp_ros.reporting import shot_list
+
         print_table(f'photographs to take next, {shot_list.purpose(wanted)}', shot_list.HEADER,
                     shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
     if args.output:
@@ -193,7 +195,7 @@ def _print(
 
 
 def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
-    from fisheye_svp_ros.reporting.diagnosis_report import ReportInputs
+    from fisheye_svp_ros.reporting.next_steps import ReportInputs
 
     return ReportInputs(
         args.observations, tuple(args.lens), args.poses, args.held_out, args.output or Path(),

@@ -7,7 +7,7 @@ what the effect may be mistaken for, and the scatter of the score from landmark 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -27,6 +27,7 @@ from fisheye_svp_ros.mixed_model import (
     pseudo_inverse,
     satterthwaite_freedom,
     score_columns,
+    score_each,
 )
 
 # False alarms: this much for all effects together, the same again for the random components.
@@ -84,9 +85,8 @@ class EffectTests:
         forms = self.null.fixed.forms
         remaining = eliminate(self.null.information, self.null.included_columns)
         ranks: dict[str, int] = {}
-        for form, effect in enumerate(forms.effects):
-            rank = self.score(remaining, self.null.form_columns(form)).rank
-            ranks[effect.name] = max(rank, ranks.get(effect.name, 0))
+        for effect, score in zip(forms.effects, self._score_forms(remaining), strict=True):
+            ranks[effect.name] = max(score.rank, ranks.get(effect.name, 0))
         taken = 'what it would do is taken up by what is free already'
         return forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
 
@@ -99,6 +99,12 @@ class EffectTests:
         """Test columns by the information that remains once what is in the model is eliminated."""
         return score_columns(remaining, columns, self.null.scale, self.null.variances.sigma**2)
 
+    def _score_forms(self, remaining: Array) -> list[Score]:
+        """Test all forms of the catalogue by the information that remains."""
+        forms = range(len(self.null.fixed.forms.effects))
+        return score_each(remaining, [self.null.form_columns(form) for form in forms],
+                          self.null.scale, self.null.variances.sigma**2)
+
     def score_beside(self, included: Index, columns: Index) -> Score:
         """Test columns beside what is included, and no other effects."""
         remaining = self.null.remaining_information(self.null.information, included)
@@ -109,21 +115,28 @@ class EffectTests:
         rest = np.setdiff1d(included, columns)
         return self.adjust_p_value(self.score_beside(rest, columns), rest, columns, effect)
 
-    def candidates(self, included: Index, per_frame: bool = True) -> list[Candidate]:
-        """Return all forms, best criterion first; per_frame: also those that differ by frame."""
+    def candidates(
+        self, included: Index, per_frame: bool = True,
+        worth: Callable[[Score], bool] = lambda _: True,
+    ) -> list[Candidate]:
+        """Return all forms, best criterion first.
+
+        per_frame: also those that differ by frame; worth: whether a score is worth a look.
+        """
         null = self.null
         remaining = null.remaining_information(null.information, included)
         candidates = []
-        for form, effect in enumerate(null.fixed.forms.effects):
-            columns = null.form_columns(form)
-            score = self.score(remaining, columns)
-            if not score.rank or _is_negative(effect, score) or effect.per_frame > per_frame:
+        for form, score in enumerate(self._score_forms(remaining)):
+            effect = null.fixed.forms.effects[form]
+            if not score.rank or effect.per_frame > per_frame or not worth(score):
+                continue
+            if _is_negative(effect, score):
                 continue
             if effect.is_implausible(score.estimate, null.linear.scene):
                 continue
             gain, count = score.statistic, score.rank
             if effect.per_frame:  # what it is in single frames is one variance
-                gain, count = random_gain(null, included, columns), 1
+                gain, count = random_gain(null, included, null.form_columns(form)), 1
                 score = score._replace(p_value=float(special.chdtrc(1, max(gain, 0.0))) / 2)
             criterion = float(gain - count * np.log(null.full.rows))
             candidates.append(

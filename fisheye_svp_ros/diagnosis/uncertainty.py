@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -160,6 +161,10 @@ def _log_odds(null: NullModel, score: Score) -> float:
     return float(score.statistic - score.rank * np.log(frames))
 
 
+def _is_likely(null: NullModel, least: float, score: Score) -> bool:
+    return _log_odds(null, score) > least
+
+
 class _Model(NamedTuple):
     """A model: its criterion beside the chosen one, its columns, kinds of what differs."""
 
@@ -179,9 +184,10 @@ def _likely_models(null: NullModel, averaged: Collection[str]) -> list[_Model]:
     while waiting and len(found) < _MAX_MODELS:
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
-        for one in tests.candidates(model.included, per_frame=False):
+        for one in tests.candidates(
+                model.included, per_frame=False, worth=partial(_is_likely, null, 0.0)):
             kinds, gain = _effect_family(one.effect), _log_odds(null, one.score)
-            if gain <= 0 or model.kinds & kinds or {*one.effect.kinds} & {*averaged}:
+            if model.kinds & kinds or {*one.effect.kinds} & {*averaged}:
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, null.form_columns(one.form)])
@@ -201,10 +207,12 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], _Model]
         rest = np.setdiff1d(null.included_columns, columns)
         score = tests.score_beside(rest, columns)
         lost = _log_odds(null, score)
-        for one in tests.candidates(rest, per_frame=False):
+        least = lost - _ODDS_WINDOW
+        for one in tests.candidates(
+                rest, per_frame=False, worth=partial(_is_likely, null, least)):
             kinds = frozenset(one.effect.kinds)
             gain = _log_odds(null, one.score) - lost
-            if gain > -_ODDS_WINDOW and _is_lasting(one.effect) and not null.effect_kinds & kinds:
+            if _is_lasting(one.effect) and not null.effect_kinds & kinds:
                 included = np.concatenate([rest, null.form_columns(one.form)])
                 yield frozenset({~i, one.form}), _Model(
                     gain, included, kinds | set(effect.kinds))

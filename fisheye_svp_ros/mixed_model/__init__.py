@@ -50,6 +50,7 @@ from fisheye_svp_ros.mixed_model.score_tests import (
     pseudo_inverse,
     satterthwaite_freedom,
     score_columns,
+    score_each,
 )
 from fisheye_svp_ros.mixed_model.solution import (
     LeaveOneOut,
@@ -69,5 +70,6 @@ __all__ = [
     'initial_variances', 'integrate_columns', 'is_called_for', 'leave_groups_out',
     'make_equations', 'multiply_rows', 'no_variances', 'posterior_covariance', 'predict_rows',
     'pseudo_inverse', 'satterthwaite_freedom', 'score_columns', 'score_components',
+    'score_each',
     'solve_equations', 'solve_lower', 'unit_covariances', 'unit_labels',
 ]

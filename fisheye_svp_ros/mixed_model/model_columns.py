@@ -19,6 +19,8 @@ from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 
+_DENSE_SIZE = 4_000_000  # numbers of shared columns that are made dense at a time
+
 
 @dataclass(frozen=True)
 class Components:
@@ -155,17 +157,22 @@ def _multiply_shared(
     """Return the products of shared columns with themselves, groups' own and the border.
 
     Over one of the `step` rows of every point: a shared column fills one of them, a group a part.
+    Several groups at a time are made dense, as many as `_DENSE_SIZE` has room for.
     """
     (groups, height, _), count = own.shape, shared.shape[1]
     ss, sg, sx = (np.zeros((count, *shape)) for shape in (
         (count,), (groups, own.shape[-1]), (border.shape[-1],)))
-    for g in range(groups):
-        part = shared[g * height + row : (g + 1) * height : step]
-        touched = np.unique(part.indices)
-        dense = part[:, touched].toarray().T
-        sg[touched, g] = dense @ own[g, row::step]
-        sx[touched] += dense @ border[g, row::step]
-        ss[np.ix_(touched, touched)] += dense @ dense.T
+    rows, points = shared[row::step], height // step
+    parts = 1 + groups * points * count // _DENSE_SIZE
+    for some in np.array_split(np.arange(groups), min(parts, groups)):
+        part = rows[some[0] * points : (some[-1] + 1) * points]
+        touched = np.flatnonzero(np.bincount(part.indices, minlength=count))
+        dense = part[:, touched].toarray()
+        by_group = dense.reshape(len(some), points, len(touched))
+        products = np.swapaxes(by_group, -1, -2) @ own[some, row::step]
+        sg[np.ix_(touched, some)] = np.moveaxis(products, 0, 1)
+        sx[touched] += dense.T @ border[some, row::step].reshape(len(dense), -1)
+        ss[np.ix_(touched, touched)] += dense.T @ dense
     return ss, sg, sx
 
 

@@ -8,6 +8,7 @@ Proceedings of the Cambridge Philosophical Society 44 (1948).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +36,31 @@ def score_columns(information: Array, columns: Index, scale: Array, variance: fl
     information (X, X): its last row and column the score; scale (X,): norms that the columns were
     divided by; variance: of the noise, that a normalized column alone has 1 / variance of.
     """
-    block, gradient = information[np.ix_(columns, columns)], information[columns, -1]
-    inverse, rank = pseudo_inverse(block, least=IDENTIFIABLE / variance)
-    estimate = inverse @ gradient
-    statistic = float(estimate @ gradient)
-    p = float(special.chdtrc(rank, max(statistic, 0.0))) if rank else 1.0
-    return Score(statistic, rank, p, estimate / scale[columns], np.inf)
+    return score_each(information, [columns], scale, variance)[0]
+
+
+def score_each(
+    information: Array, choices: Sequence[Index], scale: Array, variance: float
+) -> list[Score]:
+    """Test each of some choices of columns as `score_columns` does, those of a size together."""
+    scores: dict[int, Score] = {}
+    sizes = np.array([len(columns) for columns in choices])
+    for size in np.unique(sizes):
+        mine = np.flatnonzero(sizes == size).tolist()
+        at = np.array([choices[i] for i in mine], dtype=np.int64).reshape(len(mine), size)
+        block, gradient = information[at[:, :, None], at[:, None]], information[at, -1]
+        values, vectors = np.linalg.eigh((block + np.swapaxes(block, -1, -2)) / 2)
+        least = np.maximum(IDENTIFIABLE * values[:, -1:], IDENTIFIABLE / variance)
+        kept = values > least
+        along = (gradient[:, None] @ vectors)[:, 0] / np.where(kept, values, np.inf)
+        estimate = (vectors @ along[..., None])[..., 0]
+        statistic, rank = (estimate * gradient).sum(axis=1), kept.sum(axis=1)
+        p = special.chdtrc(np.maximum(rank, 1), np.maximum(statistic, 0.0))
+        p = np.where(rank > 0, p, 1.0)
+        for j, i in enumerate(mine):
+            scores[i] = Score(float(statistic[j]), int(rank[j]), float(p[j]),
+                              estimate[j] / scale[at[j]], np.inf)
+    return [scores[i] for i in range(len(choices))]
 
 
 def satterthwaite_freedom(

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import shlex
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from fisheye_svp_ros.diagnosis import NAMED_P, Comparison, Diagnosis, TraceStep, stage_shares
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -19,8 +18,13 @@ from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
-from fisheye_svp_ros.reporting.first_screen import first_screen, next_command
+from fisheye_svp_ros.reporting.first_screen import first_screen
 from fisheye_svp_ros.reporting.headline import VERDICTS
+from fisheye_svp_ros.reporting.next_steps import (
+    ReportInputs,
+    command_to_go_on,
+    follow_up_files,
+)
 from fisheye_svp_ros.reporting.outlier_rows import outlier_rows
 from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
@@ -47,21 +51,6 @@ _PICTURE_OF = {
 }
 _BAR = 220  # px of a share of 1
 _ROWS = 24
-
-
-class ReportInputs(NamedTuple):
-    """What was diagnosed, as the user named it; folder: where the report goes.
-
-    search: options of a command that finds the board in the photographs, where these are some.
-    """
-
-    observations: str
-    lens: tuple[str, ...]
-    poses: str | None
-    held_out: str | None
-    folder: Path
-    free_intrinsics: bool
-    search: tuple[str, ...] = ()
 
 
 def write_report(
@@ -95,28 +84,9 @@ def write_report(
         uncertainty=list(text.uncertainty_rows(diagnosis)),
         known=list(text.known_rows(known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
-        extended=_follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
+        extended=follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
     ))
     return [report, *pictures]
-
-
-def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
-    """Return the command to go on with, as a shell takes it."""
-    words = _follow_up_files(diagnosis, inputs)
-    lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
-    return next_command(diagnosis, words['observations'], words['options'], lenses)
-
-
-def _follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
-    """Return what commands need to go on: the observations, the extended lenses, the first one."""
-    files = {camera: inputs.folder / camera / text.LENS_FILE for camera in diagnosis.lenses}
-    options = [word for camera, path in files.items()
-               for word in ('--lens', f'{camera}={path}' if camera else str(path))]
-    return {
-        'observations': shlex.join([inputs.observations, *inputs.search]),
-        'options': shlex.join(options), 'search': shlex.join(inputs.search),
-        'first': shlex.quote(str(next(iter(files.values())))),
-    }
 
 
 def _next_views(wanted: NextViews | None) -> dict[str, Any]:

@@ -1,0 +1,45 @@
+"""What was diagnosed, as the user named it, and the command to go on with; draws nothing."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import NamedTuple
+
+from fisheye_svp_ros.diagnosis import Diagnosis
+from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE
+from fisheye_svp_ros.reporting.first_screen import next_command
+
+
+class ReportInputs(NamedTuple):
+    """What was diagnosed, as the user named it; folder: where the report goes.
+
+    search: options of a command that finds the board in the photographs, where these are some.
+    """
+
+    observations: str
+    lens: tuple[str, ...]
+    poses: str | None
+    held_out: str | None
+    folder: Path
+    free_intrinsics: bool
+    search: tuple[str, ...] = ()
+
+
+def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
+    """Return the command to go on with, as a shell takes it."""
+    words = follow_up_files(diagnosis, inputs)
+    lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
+    return next_command(diagnosis, words['observations'], words['options'], lenses)
+
+
+def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:
+    """Return what commands need to go on: the observations, the extended lenses, the first one."""
+    files = {camera: inputs.folder / camera / LENS_FILE for camera in diagnosis.lenses}
+    options = [word for camera, path in files.items()
+               for word in ('--lens', f'{camera}={path}' if camera else str(path))]
+    return {
+        'observations': shlex.join([inputs.observations, *inputs.search]),
+        'options': shlex.join(options), 'search': shlex.join(inputs.search),
+        'first': shlex.quote(str(next(iter(files.values())))),
+    }
