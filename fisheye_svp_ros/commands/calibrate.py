@@ -160,13 +160,20 @@ def _calibrate_camera(
         with progress('fitting the robot'):
             result, hand_eye = calibrate_hand_eye(result, kept, read_poses(args.poses).by_frame())
     try:
-        with stages('how far it may be trusted'):
+        with stages(_fit_line(result)):  # the lens is there in a second, its errors take longer
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
         raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
                             f'({cause}); is what the camera looked through another?') from cause
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
+
+
+def _fit_line(result: Calibration) -> str:
+    """Return the intrinsics as they were fitted, in a line."""
+    known = list(result.adjusted.lens.parameters.items())[:4]
+    values = ', '.join(f'{name} {value:.6g}' for name, value in known)
+    return f'{values}; finding their standard errors'
 
 
 def _write(found: CalibratedCamera, path: Path) -> None:

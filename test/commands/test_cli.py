@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -219,6 +220,22 @@ def test_views_that_are_set_aside_as_a_whole_are_named(scene, capsys):
 
 
 class TestCalibrate:
+    def test_the_lens_is_shown_while_its_errors_are_found(self, scene, tmp_path, monkeypatch):
+        shown = []
+
+        @contextmanager
+        def stages(description):
+            shown.append(description)
+            yield lambda *_: None
+
+        monkeypatch.setattr('fisheye_svp_ros.commands.calibrate.stages', stages)
+        lens = tmp_path / 'lens.yaml'
+        assert cli.main(['calibrate', str(scene[0] / 'observations.csv'), '--model',
+                         'equidistant', '--image-size', '1280x960', '-o', str(lens)]) == 0
+        fx = load_lens(lens).fx
+        assert [line.partition(',')[0] for line in shown] == [f'fx {fx:.6g}']
+        assert shown[0].endswith('standard errors')
+
     def test_writes_the_lens_and_its_covariance(self, scene, capsys, tmp_path):
         folder, _, table = scene
         observations, out = str(folder / 'observations.csv'), tmp_path / 'new' / 'mine.yaml'
