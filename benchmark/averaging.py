@@ -125,7 +125,7 @@ def trial(seed: int) -> Outcome:
     given = calibrate(table, 'kannala_brandt', (WIDTH, HEIGHT)).adjusted.lens
     found = diagnose(table, given, free_intrinsics=True)
     named = extended_lenses({'': given}, found.evaluation.null.linear.state, table)['']
-    shift, names = found.averaged.shifts, [cause.effect for cause in found.causes]
+    shift, names = found.averaged_model.shifts, [cause.effect for cause in found.causes]
     written = getattr(found.lens.viewpoint_shift, 'e0', 0.0)
     return Outcome(
         truth.viewpoint_shift.e0, written,  # type: ignore[union-attr]

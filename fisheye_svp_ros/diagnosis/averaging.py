@@ -76,7 +76,7 @@ class OpenShifts(NamedTuple):
     columns: Index
 
     @classmethod
-    def of(cls, selection: Selection) -> OpenShifts:
+    def from_selection(cls, selection: Selection) -> OpenShifts:
         """Return the simplest shift of each camera that has neither a shift nor a port.
 
         None where held-out frames refute one.
@@ -128,9 +128,10 @@ class AveragedModel:
     place: Index
 
     @classmethod
-    def of(cls, selection: Selection) -> AveragedModel:
+    def from_selection(cls, selection: Selection) -> AveragedModel:
         """Average over the shifts that a selection leaves open."""
-        shifts, null, linear = OpenShifts.of(selection), selection.null, selection.null.linear
+        shifts, null = OpenShifts.from_selection(selection), selection.null
+        linear = null.linear
         at = null.columns_and_residual(shifts.columns)
         found = shifts.posterior(null, null.information[np.ix_(at, at)])
         follow = found.follow / null.scale[: null.column_count, None]

@@ -95,7 +95,7 @@ def conclude(
     lens = decide_lens(LensFacts(
         [c.effect for c in causes if c.effect_class.budget_stage() == 'lens'],
         [c.effect for c in causes if c.effect_class.budget_stage() != 'noise'],
-        bool(evaluation.averaged.shifts),
+        bool(evaluation.averaged_model.shifts),
         (gain.value, gain.low), file, rays.offset if evaluation.free else None,
         [c.effect for c in causes if c.effect in _INTRINSIC], find_bounds(evaluation.null),
         evaluation.noise_px, evaluation.falling))

@@ -99,16 +99,16 @@ class FileFigure(NamedTuple):
 class LensFacts(NamedTuple):
     """What the lens is judged by.
 
-    lens_causes, causes: confirmed ones of the lens, and all that move predictions; averaged:
-    whether the extended lens has a shift that is likely, and not named; named_gain: value, low of
-    what all causes gain held out; offset: None where intrinsics were not fitted;
-    refitted: intrinsics that only a change of the lens explains, confirmed as causes;
+    lens_causes, causes: confirmed ones of the lens, and all that move predictions;
+    has_likely_shift: whether the extended lens has a viewpoint shift that is likely and not named;
+    named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
+    not fitted; refitted: intrinsics that only a change of the lens explains, confirmed as causes;
     falling: whether no error rises with the causes on the fitted frames.
     """
 
     lens_causes: Sequence[str]
     causes: Sequence[str]
-    averaged: bool
+    has_likely_shift: bool
     named_gain: tuple[float, float]
     file: FileFigure
     offset: LensOffset | None
@@ -133,7 +133,7 @@ def decide_lens(facts: LensFacts) -> Decision:
     if facts.refitted:
         names = ', '.join(facts.refitted)
         return Decision('recalibrate', f'{names} of the lens as given is wrong', gained, file.sure)
-    borne_out = facts.named_gain[0] > 0 if facts.causes else facts.averaged
+    borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
             'use_extended', f'on held-out frames it leaves {file.extended_px:.3g} px, the lens as '

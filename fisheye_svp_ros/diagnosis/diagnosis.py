@@ -199,9 +199,9 @@ class Diagnosis:
         return self.evaluation.written_model
 
     @property
-    def averaged(self) -> AveragedModel:
+    def averaged_model(self) -> AveragedModel:
         """The viewpoint shifts that are written and not named."""
-        return self.evaluation.averaged
+        return self.evaluation.averaged_model
 
     @property
     def errors(self) -> ModelErrors:
@@ -292,7 +292,8 @@ class Diagnosis:
             'causes': [asdict(cause) for cause in self.causes],
             'named': entry(self.figures.named),
             'lens': entry(self.figures.lens_only) | {
-                'ray_error_mrad': self.conclusion.ray_error_mrad(), **self.averaged.to_dict()},
+                'ray_error_mrad': self.conclusion.ray_error_mrad(),
+                **self.averaged_model.to_dict()},
             'extended': entry(self.figures.extended),
             **self.conclusion.to_dict(),
             'photographs': [
@@ -403,7 +404,7 @@ def _conclude(
     evaluation: Evaluation, candidates: list[UnconfirmedCause], cameras: list[TwoCameras]
 ) -> Diagnosis:
     """Return the diagnosis of an evaluated selection."""
-    selection, averaged = evaluation.selection, evaluation.averaged
+    selection, averaged = evaluation.selection, evaluation.averaged_model
     problem, observations = selection.problem, selection.problem.observations
     noise_causes = growth_cause(selection.revision.growth)
     noise_causes += table_causes(observations, selection.revision.outliers, problem.step)

@@ -179,19 +179,19 @@ class Evaluation:
         return [effect.name for effect, _, _ in self.selection.causes]
 
     @cached_property
-    def averaged(self) -> AveragedModel:
+    def averaged_model(self) -> AveragedModel:
         """The model whose lens is written: with the shifts that may be there."""
-        return AveragedModel.of(self.selection)
+        return AveragedModel.from_selection(self.selection)
 
     @cached_property
     def model_errors(self) -> ModelErrors:
         """What is known of the errors of the model whose lens is written."""
-        return self.averaged.errors(ModelErrors.from_null_model(self.null, self.fitted))
+        return self.averaged_model.errors(ModelErrors.from_null_model(self.null, self.fitted))
 
     @cached_property
     def written_model(self) -> Linearization:
         """The model whose lens is written, without random effects: poses are fitted anew."""
-        return _with_poses_anew(self.averaged.linear)
+        return _with_poses_anew(self.averaged_model.linear)
 
     @cached_property
     def uncertainty(self) -> dict[str, dict[str, float]]:
@@ -203,9 +203,9 @@ class Evaluation:
         """Standard errors of all that is shared."""
         return self._errors_of(self.null)
 
-    def _errors_of(self, null: NullModel, averaged: Collection[str] = ()) -> Array:
+    def _errors_of(self, null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
         return (standard_errors(null, jackknife=False) if self.selection.problem.options.quick
-                else total_errors(null, averaged))
+                else total_errors(null, averaged_kinds))
 
     def predict(
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
@@ -302,7 +302,7 @@ class Evaluation:
     @cached_property
     def _errors_without_shifts(self) -> Array:
         """Standard errors (K,) without those of the shifts that are averaged over."""
-        kinds = self.averaged.kinds
+        kinds = self.averaged_model.kinds
         return self._errors_of(self.null, kinds) if kinds else self.errors
 
     @cached_property
@@ -314,7 +314,7 @@ class Evaluation:
         known = np.sqrt(np.diag(inverse)) / scale
         larger = np.nan_to_num(self._errors_without_shifts) / np.maximum(known, 1e-300)
         larger = np.where(known > 0, np.maximum(larger, 1.0), 0.0) / scale
-        return self.averaged.widen(inverse * np.outer(larger, larger))
+        return self.averaged_model.widen(inverse * np.outer(larger, larger))
 
     @cached_property
     def base_quality(self) -> FitQuality:
@@ -413,12 +413,13 @@ class Evaluation:
         if self.medium is not None:
             return {}
         selection = self.selection
-        after = dict(zip(shared_names(self.averaged.linear),
-                         self.averaged.widen_errors(self._errors_without_shifts), strict=True))
+        written = self.averaged_model
+        after = dict(zip(shared_names(written.linear),
+                         written.widen_errors(self._errors_without_shifts), strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = self._errors_of(selection.first)
         rig = _count_rig_columns(selection.first, self.free)
-        was, now = selection.problem.base.parameters, self.averaged.linear.state.parameters
+        was, now = selection.problem.base.parameters, written.linear.state.parameters
         return {
             name: Intrinsic(
                 *given[name], was[name], float(before[rig + i]), now[name], float(after[name]))

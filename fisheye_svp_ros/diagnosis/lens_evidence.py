@@ -70,7 +70,7 @@ def compare_lens_files(evaluation: Evaluation) -> FileFigure:
 
 
 def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
-    null, shifts = evaluation.null, OpenShifts.of(evaluation.selection)
+    null, shifts = evaluation.null, OpenShifts.from_selection(evaluation.selection)
     linear, ratio = null.linear, noise_ratio(null.linear)
     now, given = _shared_values(evaluation)
     of_lens = np.append(lens_columns(linear), np.ones(len(shifts.columns), dtype=bool))
@@ -174,7 +174,7 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
-    averaged = evaluation.averaged
+    averaged = evaluation.averaged_model
     linear, of_lens = averaged.linear, lens_columns(averaged.linear)
     covariance = evaluation.covariance[np.ix_(of_lens, of_lens)]
     frames = np.zeros((linear.data.frames, 6))

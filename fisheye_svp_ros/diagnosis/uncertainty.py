@@ -41,12 +41,12 @@ _MIN_FRAMES = 3
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
 
 
-def total_errors(null: NullModel, averaged: Collection[str] = ()) -> Array:
+def total_errors(null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
     """Return the standard errors (K,) of all that is shared, other likely models allowed for.
 
-    averaged: kinds of effects whose share in these is counted elsewhere.
+    averaged_kinds: kinds of effects whose share in these is counted elsewhere.
     """
-    parts = standard_errors(null), field_uncertainty(null), model_uncertainty(null, averaged)
+    parts = standard_errors(null), field_uncertainty(null), model_uncertainty(null, averaged_kinds)
     return np.asarray(np.sqrt(np.square(parts).sum(axis=0)))
 
 
@@ -118,7 +118,7 @@ def field_uncertainty(null: NullModel) -> Array:
     return np.asarray(np.sqrt(added) / null.scale[: null.column_count])
 
 
-def model_uncertainty(null: NullModel, averaged: Collection[str] = ()) -> Array:
+def model_uncertainty(null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
     """Return what other models, likely too, add to standard errors (K,) of what is shared.
 
     Each model with more effects, or with another effect in the place of one, is as probable as its
@@ -126,14 +126,14 @@ def model_uncertainty(null: NullModel, averaged: Collection[str] = ()) -> Array:
     and of the square of the change.  Beside a further form of an effect or one that does nearly
     the same, or without it, its parameters mean something else: for them that model does not
     count.  What is added is hardly larger than large, however little the data say of it.
-    averaged: kinds of effects that are added to none.
+    averaged_kinds: kinds of effects that are added to none.
     """
     own, information, reported = null.column_count, null.information, _reporting_matrix(null)
     prior = np.zeros(len(information))
     for form, effect in enumerate(null.fixed.forms.effects):
         prior[null.form_columns(form)] = null.prior_precision(null.form_columns(form), effect)
     estimate, variance, _ = _estimate(information, np.arange(own), reported)
-    models = _likely_models(null, averaged)
+    models = _likely_models(null, averaged_kinds)
     weights = special.softmax([one.criterion / 2 for one in models])
     added = np.zeros(own)
     for weight, one in zip(weights, models, strict=True):
@@ -173,7 +173,7 @@ class _Model(NamedTuple):
     kinds: frozenset[str]
 
 
-def _likely_models(null: NullModel, averaged: Collection[str]) -> list[_Model]:
+def _likely_models(null: NullModel, averaged_kinds: Collection[str]) -> list[_Model]:
     """Return the chosen model, those with an effect exchanged, and larger, likelier ones of each.
 
     The likeliest of those at hand is extended first, and so many are enough.
@@ -187,7 +187,7 @@ def _likely_models(null: NullModel, averaged: Collection[str]) -> list[_Model]:
         for one in tests.candidates(
                 model.included, per_frame=False, worth=partial(_is_likely, null, 0.0)):
             kinds, gain = _effect_family(one.effect), _log_odds(null, one.score)
-            if model.kinds & kinds or {*one.effect.kinds} & {*averaged}:
+            if model.kinds & kinds or {*one.effect.kinds} & {*averaged_kinds}:
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, null.form_columns(one.form)])

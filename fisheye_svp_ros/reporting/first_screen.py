@@ -148,7 +148,7 @@ def _causes(d: Diagnosis) -> str:
 def _candidates(d: Diagnosis) -> str:
     words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (by its evidence '
              f'{100 * one.weight:.0f} % likely: e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} '
-             'mm is in the extended lens)' for one in d.averaged.shifts]
+             'mm is in the extended lens)' for one in d.averaged_model.shifts]
     words += [f'{one.effect} ({one.why})' for one in d.candidates[:_MAX_NAMES]]
     more = len(d.candidates) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')

@@ -32,7 +32,7 @@ def diagnosed(e0: float, noise: float, seed: int = 0, **settings: object) -> Dia
 def test_a_shift_that_is_likely_and_not_named_is_written_in_part() -> None:
     found = diagnosed(0.004, 0.1)
     assert not found.causes
-    (shift,) = found.averaged.shifts
+    (shift,) = found.averaged_model.shifts
     assert PRIOR_ODDS / (1 + PRIOR_ODDS) < shift.weight < 1
     written = found.lens.viewpoint_shift
     assert isinstance(written, Gennery) and written.e0 == pytest.approx(shift.e0)
@@ -60,26 +60,26 @@ def test_the_mean_is_that_of_two_models_weighed_by_their_evidence() -> None:
         alone, score[:-1])
     logs = np.linalg.slogdet(information)[1] - np.linalg.slogdet(alone)[1] + 2 * np.log(size)
     odds = PRIOR_ODDS * np.exp((gain - logs) / 2)
-    (shift,) = found.averaged.shifts
+    (shift,) = found.averaged_model.shifts
     assert shift.weight == pytest.approx(odds / (1 + odds), rel=1e-4)
     estimate = np.linalg.solve(information, score) / null.scale[both]
     assert shift.e0 == pytest.approx(shift.weight * estimate[-1], rel=1e-4)
-    moved = found.averaged.linear.state.lens.fx - null.linear.state.lens.fx
+    moved = found.averaged_model.linear.state.lens.fx - null.linear.state.lens.fx
     base = np.linalg.solve(alone, score[:-1]) / null.scale[both[:-1]]
     assert moved == pytest.approx(shift.weight * (estimate[0] - base[0]), rel=1e-3)
 
 
 def test_nothing_is_added_where_the_data_speak_against_a_shift_or_the_user_does() -> None:
-    assert not diagnosed(0.0, 0.05).averaged.shifts
+    assert not diagnosed(0.0, 0.05).averaged_model.shifts
     assert diagnosed(0.0, 0.05).lens.viewpoint_shift is None
     options = DiagnosisOptions(left_out=('viewpoint_shift',))
-    assert not diagnosed(0.004, 0.1, options=options).averaged.shifts
+    assert not diagnosed(0.004, 0.1, options=options).averaged_model.shifts
 
 
 def test_a_named_shift_is_written_as_it_is_named() -> None:
     found = diagnosed(0.004, 0.05)
     assert [cause.effect for cause in found.causes] == ['viewpoint_shift']
-    assert not found.averaged.shifts
+    assert not found.averaged_model.shifts
     named = found.causes[0].parameters['e0']['value']
     written = found.lens.viewpoint_shift
     assert isinstance(written, Gennery) and written.e0 == pytest.approx(named)
@@ -104,10 +104,10 @@ def test_ray_errors_file_figure_and_summary_are_of_the_lens_that_is_written() ->
 
 def test_a_refuted_shift_is_not_written() -> None:
     selection = diagnosed(0.004, 0.1).evaluation.selection
-    assert OpenShifts.of(selection).effects
+    assert OpenShifts.from_selection(selection).effects
     refuted = replace(selection, refuted=('viewpoint_shift',))
-    assert not OpenShifts.of(refuted).effects
-    assert not AveragedModel.of(refuted).shifts
+    assert not OpenShifts.from_selection(refuted).effects
+    assert not AveragedModel.from_selection(refuted).shifts
 
 
 def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:

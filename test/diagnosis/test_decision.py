@@ -55,9 +55,9 @@ def test_the_extended_lens_is_used_where_it_predicts_better_on_the_same_target()
 
 
 def test_a_lens_with_a_likely_shift_and_no_cause_is_used_where_it_predicts_better() -> None:
-    assert decide_lens(SOUND._replace(averaged=True, file=BETTER)).say == 'use_extended'
+    assert decide_lens(SOUND._replace(has_likely_shift=True, file=BETTER)).say == 'use_extended'
     assert decide_lens(SOUND._replace(file=BETTER)).say == 'keep'
-    assert decide_lens(SOUND._replace(averaged=True)).say == 'keep'
+    assert decide_lens(SOUND._replace(has_likely_shift=True)).say == 'keep'
 
 
 def test_figures_that_disagree_leave_it_undecided() -> None:
