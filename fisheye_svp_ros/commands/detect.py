@@ -60,7 +60,7 @@ def _print(detection: Detection, board: str) -> None:
               f'{apart}; {len(pairing.alone)} photographs without a partner')
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
-        print('  the board looks the same when turned, and too few photographs tell how it lies')
+        print('  the board looks the same when turned; too few photographs determine its turn')
     elif (sure < 1).any():
         print('  the board looks the same when turned; photographs were turned until their '
               f'residuals agree: {100 * sure.mean():.1f} % sure on average, '

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
                         help='poses of the camera (of a rig: its right one) or of the flange of a '
-                        'robot that carries it, which the data tell apart; unknown and fitted by '
+                        'robot that carries it, which the data separate; unknown and fitted by '
                         'default')
     parser.add_argument('--free', choices=['intrinsics'],
                         help='fit the intrinsics too; always so for a lens from `calibrate`')
@@ -60,12 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'without held-out frames in the choice')
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
                         help='distance, m, at which the ray errors of the lenses are stated as '
-                        'well, beside 0.3, 1 and 5 m')
+                        'well, besides 0.3, 1 and 5 m')
     parser.add_argument('--next', type=int, default=0, metavar='N', dest='count',
                         help='say which N photographs to take next: those that settle what the '
                         'cause may be mistaken for')
     parser.add_argument('--for', dest='number', metavar='NAME',
-                        help='with --next: those that tell this number best (e0, fx, ...)')
+                        help='with --next: minimize the error of one number (e0, fx, ...)')
     parser.add_argument('--room', type=float, nargs=2, metavar='M',
                         help='with --next: nearest and furthest distance at which the board is '
                         'sharp; by default a little beyond those that there are')

@@ -40,7 +40,7 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
             f'of {lens.width}x{lens.height} px; check cx, cy and the image size')
     if worst > LARGE_DEVIATION:
         say(f'{path}: no lens here comes nearer than {worst:.2g} px to the model of this file; '
-            'calibrate anew from its photographs')
+            'calibrate again from its photographs')
 
 
 class Lenses(dict[str, 'Lens']):

@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser)
     parser.add_argument('--model-error', action='store_true',
-                        help='covariances with what the lens file says of its own errors: its '
-                        'parameters, and the misfit that remains (an extended_lens.yaml)')
+                        help='covariances with the errors that the lens file states: its '
+                        'parameters, and its unexplained error (an extended_lens.yaml)')
     parser.add_argument('--rig', metavar='RIG',
                         help='where the cameras of a rig stand: rig.yaml from `calibrate`, the '
                         'folder that holds it, a camchain; one pose per frame from all cameras, '

@@ -37,7 +37,7 @@ def localize_cameras(
     note_left_out(table, found.left_out)
     note_gross_errors(found.table, found.outliers)
     if found.contradicted:
-        say(f'{rig}: the cameras do not stand as it says; calibrate the rig anew')
+        say(f'{rig}: the relative poses of the cameras differ; calibrate the rig again')
     if folder:
         with write_together():
             _write(folder, cameras, found)

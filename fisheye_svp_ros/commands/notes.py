@@ -82,7 +82,7 @@ def note_gross_errors(table: Observations, gross: Outliers) -> None:
         whole = [frame for frame in dict.fromkeys(frames.tolist())
                  if (frames == frame).sum() == (table.frame == frame).sum()]
         views = f'; all points of {list_frames(table, whole)}: in another order?' if whole else ''
-        say(f'{len(gross.rows)} of {len(table)} points lie too far off and are left out, '
+        say(f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
             f'furthest {worst}{views}')
 
 

@@ -55,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--blur', type=float, default=0.6, metavar='PX',
                         help='blur of the lens, px (0.6)')
     parser.add_argument('--noise', type=float, default=1.5, metavar='LEVELS',
-                        help='noise of a pixel, grey levels of 255 (1.5)')
+                        help='noise of a pixel, gray levels of 255 (1.5)')
     parser.add_argument('--seed', type=int, default=0, help='of poses and noise (0)')
 
 

@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'run {names}: {first!r} stands before --ros-args; ROS arguments '
                              f'come after it: fisheye-svp run {names} --ros-args ...')
     if len({*nodes}) < len(nodes):
-        raise ParameterError(f'run {names}: a node stands there twice, and its topics would be '
+        raise ParameterError(f'run {names}: a node is listed twice, and its topics would be '
                              'those of both; start one process for each namespace')
     raise SystemExit(executables.run(*nodes, args=arguments))
 

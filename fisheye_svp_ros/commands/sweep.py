@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> None:
         _solve(args, plan, parts, engine)
         if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
             raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are gone; '
-                              '--resume computes them anew')
+                              '--resume computes them again')
         with write_together():
             parts.join(args.output / 'sweep')
             _report(path, args.output, plan, mine)

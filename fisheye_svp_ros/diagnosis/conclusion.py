@@ -168,5 +168,5 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         most = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)
         return f'the scale of the board is off by {100 * most:.2g} %'
     if worst.effect == 'board_pose':
-        return 'its boards do not stand as said'
+        return 'its boards have other relative poses than stated'
     return f'{worst.effect} is confirmed'

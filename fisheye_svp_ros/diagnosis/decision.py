@@ -148,7 +148,7 @@ def decide_lens(facts: LensFacts) -> Decision:
         names = ', '.join(facts.lens_causes)
         return Decision(
             'undecided', f'{names} is confirmed, but the extended lens does not '
-            f'predict held-out frames better beyond chance ({file.extended_px:.3g} px, as '
+            f'predict held-out frames significantly better ({file.extended_px:.3g} px, as '
             f'given {file.given_px:.3g} px)', gained, file.sure, bounds)
     if hint is not None:
         sure = erf(hint.z / 2**0.5)
@@ -240,7 +240,7 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
         return Decision('more', f'{facts.frames} frames are few; take {_MIN_FRAMES} or more',
                         figure, None)
     if facts.lens == 'undecided':
-        return Decision('more', 'the lens is undecided; --next 6 says which views decide it',
+        return Decision('more', 'the lens is undecided; --next 6 lists the views that decide it',
                         figure, None)
     if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
         return Decision('more', f'{len(facts.unlike)} of {facts.frames} show what no other does',

@@ -87,7 +87,7 @@ class EffectTests:
         ranks: dict[str, int] = {}
         for effect, score in zip(forms.effects, self._score_forms(remaining), strict=True):
             ranks[effect.name] = max(score.rank, ranks.get(effect.name, 0))
-        taken = 'what it would do is taken up by what is free already'
+        taken = 'the estimated parameters absorb it'
         return forms.untestable | {name: taken for name, rank in ranks.items() if not rank}
 
     @property

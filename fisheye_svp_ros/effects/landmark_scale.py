@@ -27,7 +27,7 @@ class LandmarkScaleEffect(Effect):
     name = 'landmark_scale'
     stage = 'target'
     signature = (
-        'residuals as if all landmarks had moved away from the centre of the target, or away from '
+        'residuals as if all landmarks had moved away from the center of the target, or away from '
         'one line and towards another'
     )
     to_separate = (

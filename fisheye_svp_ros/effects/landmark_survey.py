@@ -1,4 +1,4 @@
-"""Single landmarks are not where they are said to be."""
+"""Single landmarks are displaced."""
 
 from __future__ import annotations
 

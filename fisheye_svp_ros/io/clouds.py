@@ -65,7 +65,7 @@ def unpack(cloud: Any, layout: np.dtype[np.void], what: str) -> Points:
         points[name] = raw[name]
     if len(set(points['landmark'].tolist())) < len(points):
         ids, counts = np.unique(points['landmark'], return_counts=True)
-        raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} stands there twice')
+        raise ObservationError(f'{what}: landmark {ids[counts > 1][0]} is listed twice')
     return points
 
 

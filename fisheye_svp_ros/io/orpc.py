@@ -79,12 +79,12 @@ def _read_boards(path: Path) -> dict[int, Board]:
         if len(fields) == 4:
             number = _parse_int(path, line, fields[0])
             if number in corners:
-                raise ObservationError(f'{path}, line {line}: board {number} stands there twice')
+                raise ObservationError(f'{path}, line {line}: board {number} is listed twice')
             corners[number] = []
         elif len(fields) == 6 and corners:
             values = _numbers(path, line, fields)
             if (corner := (number, *values[:3])) in places:
-                raise ObservationError(f'{path}, line {line}: this corner stands there twice')
+                raise ObservationError(f'{path}, line {line}: this corner is listed twice')
             places.add(corner)
             corners[number].append(values[3:])
         elif len(fields) != 2:
@@ -115,7 +115,7 @@ def _read_board_poses(path: Path, single: bool) -> dict[float, Array]:
         if not np.allclose(turn @ turn.T, np.eye(3), atol=_SQUARE) or np.linalg.det(turn) < 0:
             raise ObservationError(f'{path}: the pose of board {number:g} holds no rotation')
     if 13 * len(poses) < len(numbers):
-        raise ObservationError(f'{path}: a board stands there twice')
+        raise ObservationError(f'{path}: a board is listed twice')
     return poses
 
 

@@ -65,7 +65,7 @@ def _flatten(node: yaml.Node, prefix: str) -> dict[str, Any]:
         new = (_flatten(value, f'{name}.') if isinstance(value, yaml.MappingNode)
                else {name: _value(value)})
         if new.keys() & values.keys():
-            raise ValueError(f'{min(new.keys() & values.keys())!r} stands there twice, the second '
+            raise ValueError(f'{min(new.keys() & values.keys())!r} is listed twice, the second '
                              f'time in line {value.start_mark.line + 1}')
         values |= new
     return values

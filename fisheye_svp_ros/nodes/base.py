@@ -127,7 +127,7 @@ class BaseNode(Node):  # type: ignore[misc]
         if kind not in self._unforeseen and len(self._unforeseen) < _KINDS_OF_ERRORS:
             self._unforeseen.add(kind)
             text = ''.join(traceback.format_exception(error)).rstrip()
-            self.get_logger().error(f'internal error, told once: {text}')
+            self.get_logger().error(f'internal error, logged once: {text}')
 
     def start_timer(self, period: float, callback: Callable[[], None], clock: Any = None) -> Any:
         """Have a function called every `period` seconds, of real time where no clock is given."""

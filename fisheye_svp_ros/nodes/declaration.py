@@ -48,9 +48,9 @@ def unknown_parameters(node: Any, given: Mapping[str, Any], known: Sequence[str]
             continue
         meant = get_close_matches(name, known, 1)
         if meant:
-            yield f'parameter {name!r} means nothing to this node; did you mean {meant[0]!r}?'
+            yield f'parameter {name!r} is unknown to this node; did you mean {meant[0]!r}?'
         elif name not in for_all:
-            yield f'parameter {name!r} means nothing to this node; it knows {", ".join(known)}'
+            yield f'parameter {name!r} is unknown to this node; known are {", ".join(known)}'
 
 
 def _names_for_all(arguments: Sequence[str]) -> set[str]:

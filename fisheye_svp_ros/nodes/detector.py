@@ -260,7 +260,7 @@ class Detector(BaseNode):
         if self._size is not None and pixels.shape != self._size:
             raise ObservationError(
                 f'image: {pixels.shape[1]}x{pixels.shape[0]} px, but it was '
-                f'{self._size[1]}x{self._size[0]}; start the node anew for another camera')
+                f'{self._size[1]}x{self._size[0]}; restart the node for another camera')
 
     def _compare(self, told: tuple[int, int] | None, pixels: Pixels) -> None:
         """Take note where the camera_info is not of these images: the solvers cannot know."""

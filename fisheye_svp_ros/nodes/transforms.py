@@ -20,7 +20,7 @@ _MAX_SENT = 100  # transforms by which those that come back may be late
 class Transforms:
     """What one node tells tf2, if it is to; static: what holds until it is told anew.
 
-    A frame has one parent (REP 105): where another node tells of the same child, it is said.
+    A frame has one parent (REP 105): where another node publishes the same child, it is said.
     Raises ParameterError where it is to and tf2_msgs is not installed.
     """
 
@@ -57,7 +57,7 @@ class Transforms:
             child = transform.child_frame_id
             if child in self._children and transform not in self._sent:
                 self._node.warn(
-                    f'/tf: another node tells of {child!r} as well, in '
+                    f'/tf: another node publishes {child!r} as well, in '
                     f'{transform.header.frame_id!r}, and a frame has one parent: give one of them '
                     'another camera_frame, or publish_tf:=false')
 

@@ -122,7 +122,7 @@ def _residual_field(scenario: Scenario) -> ResidualSet:
 def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -> list[DemoRow]:
     """Return the rows of the demo from its table, as `tabulate` or `compute_demo` make it.
 
-    Raises BagError where a scenario is missing or stands there twice.
+    Raises BagError where a scenario is missing or is listed twice.
     """
     found: dict[tuple[str, str, float, str], dict[str, Any]] = {}
     for cells in zip(*columns.values(), strict=True):

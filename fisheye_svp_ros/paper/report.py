@@ -133,7 +133,7 @@ def _recovery(results: Results) -> Iterator[Block]:
         ]
     yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
     yield Text(
-        'Determined: the shift of Fish180 to some tenths of a millimetre over the whole field, '
+        'Determined: the shift of Fish180 to some tenths of a millimeter over the whole field, '
         'that of Fish214 up to where the landmarks end (88 degree); beyond, nothing holds it. '
         'Open: how f and the size of the shift share what the residuals say, the single '
         'coefficients of the curve, and the place of every single landmark. Fish180 wants the '
@@ -180,7 +180,7 @@ def _stopping(results: Results) -> Iterator[Block]:
         'Stopping early with Levenberg damping explains the cell: at 0.001 px² z of Fish180, '
         f'Whole, 2.0 m is off by {levenberg[0, 0]:.0f} % (published: 29 %) and Outer by '
         f'{levenberg[0, 2]:.0f} %, while every cell nearer than 2.0 m is off by less than 1 %, '
-        'since a millimetre moves the image more there. Stopping early with Marquardt damping '
+        'since a millimeter moves the image more there. Stopping early with Marquardt damping '
         'would spoil Inner first, and does not explain it.'
     )
 

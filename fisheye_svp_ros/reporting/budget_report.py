@@ -176,7 +176,7 @@ def _explain(axis: Any, model: str) -> None:
     axis.axis('off')
     axis.text(
         0.02, 0.95,
-        f'Colour: what {model} causes.\nHatched: more than the limit; {model} will not do.\n'
+        f'Color: what {model} causes.\nHatched: more than the limit; {model} will not do.\n'
         'Line: the limit is just met.\nStar: where you work.\n'
         'Limits that you do not state are what noise causes.\n\n'
         'Spread: largest incidence angle of the\nlandmarks, which fill a cap about the axis.',

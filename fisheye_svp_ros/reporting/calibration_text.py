@@ -91,13 +91,13 @@ class CalibratedCamera:
         if (abs(off[0]) > _MAX_CENTER_OFFSET * lens.width
                 or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height):
             found.append(
-                f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the centre of the '
+                f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of the '
                 'image: was it cropped, or is the image size another one?')
         out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
         edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
         if out < _MIN_COVERED_RADIUS * edge:
             found.append(
-                f'image points lie within {out:.0f} px of the centre, the nearest edge is at '
-                f'{edge:.0f} px: past {np.degrees(self.result.reached):.0f} deg nothing holds the '
-                'curve; photograph the target near the edges of the image, too')
+                f'image points lie within {out:.0f} px of the center, the nearest edge is at '
+                f'{edge:.0f} px: past {np.degrees(self.result.reached):.0f} deg the curve is '
+                'extrapolated; photograph the target near the edges of the image, too')
         return found

@@ -36,7 +36,7 @@ _CAPTIONS = {
              '(above) and across it (below).',
     'range': 'Residuals against the distance of the landmark. A lens without a single viewpoint '
              'shows here: its radial residuals change with the distance.',
-    'landmark': 'Residuals of each landmark. One that stands out is not where it is said to be.',
+    'landmark': 'Residuals of each landmark. One that stands out is displaced.',
     'frame': 'Residuals of each frame. A step or a drift is a change of the camera.',
     'phase': 'Residuals against the place within a pixel. Waves come from the detector of image '
              'points.',

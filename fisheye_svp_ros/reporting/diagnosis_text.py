@@ -42,7 +42,7 @@ _STRUCTURE_TEXTS = {
     'outliers': 'a few points are outliers',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
-    'size': 'the residuals are not of the size that sigma says',
+    'size': 'the residuals are not of the size that sigma states',
 }
 _HUMAN = {
     'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
@@ -185,7 +185,7 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
                 f'one point is an outlier, {which}')
     if variable == 'size':
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
-        return f'the residuals are {ratio:.2g} times as large as sigma says'
+        return f'the residuals are {ratio:.2g} times as large as sigma states'
     depends = f'residuals depend on {VARIABLES.get(variable, variable)}'
     return _STRUCTURE_TEXTS.get(variable, depends)
 
@@ -311,14 +311,14 @@ def _next_step(d: Diagnosis) -> str:
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
-        f'to tell {c.effect} from {join_names(c.indistinguishable_from, "and")}: {_remedy(c)}'
+        f'to separate {c.effect} from {join_names(c.indistinguishable_from, "and")}: {_remedy(c)}'
         for c in d.causes if c.indistinguishable_from
     ]
     steps += [_remedy(c) for c in d.causes if c.effect_class.stage == 'noise']
     if 'frame' in {one.variable for one in d.remaining}:
         steps += filter(None, (CATALOGUE[name].when_untestable for name in d.untestable))
     if d.remaining:
-        steps.append(f'look for the reason of what remains in the residuals: {remains(d)}')
+        steps.append(f'look for the cause of the remaining residuals: {remains(d)}')
     return '; '.join(dict.fromkeys(steps)) + '.'
 
 

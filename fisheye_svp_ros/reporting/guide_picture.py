@@ -31,10 +31,10 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
     if stand is not None and stand.settled:
         names = ' and '.join(stand.named) or 'no cause'
         if stand.alike:
-            names += f', or {" or ".join(stand.alike)}: photographs cannot tell'
+            names += f', or {" or ".join(stand.alike)}: photographs cannot separate them'
         return 'settled', f'diagnosis: {names}', taken
     if guide.is_finished:
-        return 'not settled', 'so many photographs do not settle it', taken
+        return 'not settled', 'these photographs do not decide it', taken
     if guide.thinking:
         return 'one moment', 'choosing the next photograph', taken
     ready = guide.score >= MIN_SCORE

@@ -38,9 +38,9 @@ _HEADLINES = {
     'flat_port': 'The camera looks through a port',
     'focal_drift': 'The focal length drifts',
     'session_step': 'The intrinsics jump between groups of frames',
-    'landmark_survey': 'Single landmarks are not where they are said to be',
+    'landmark_survey': 'Single landmarks are displaced',
     'landmark_scale': 'The target is stretched or of another size',
-    'board_pose': 'The boards stand otherwise than said',
+    'board_pose': 'The boards have other relative poses than stated',
     'rolling_shutter': 'Rows are exposed one after the other',
     'rig_flex': 'The rig bends',
 }

@@ -58,9 +58,9 @@ def purpose(wanted: NextViews) -> str:
     """Return what the photographs are for, and where matters stand."""
     if wanted.others:
         known = '' if wanted.answers[-1] > MIN_PROBABILITY else (
-            '; photographs hardly tell: what you know is not there can be left out, '
+            '; photographs hardly separate them: exclude what is absent by '
             + ' '.join(f'--without {name}' for name in wanted.others))
-        return (f'to tell {wanted.asked} from {" and ".join(wanted.others)}; now '
+        return (f'to separate {wanted.asked} from {" and ".join(wanted.others)}; now '
                 f'{expected_error(wanted, 0)}{known}')
     what = 'the whole lens' if wanted.asked == 'lens' else wanted.asked
     if wanted.unit:

@@ -42,7 +42,7 @@ def check_landmarks(landmarks: Landmarks, where: str) -> Landmarks:
         raise ObservationError(f'{where}: no landmark in it; at least one is needed')
     values, counts = np.unique(landmarks.ids, return_counts=True)
     if np.any(counts > 1):
-        raise ObservationError(f'{where}: landmark {values[counts > 1][0]} stands there twice')
+        raise ObservationError(f'{where}: landmark {values[counts > 1][0]} is listed twice')
     bad = ~np.isfinite(landmarks.points).all(axis=-1)
     if np.any(bad):
         raise ObservationError(f'{where}: landmark {landmarks.ids[bad][0]} has a coordinate '

@@ -334,6 +334,6 @@ def _check_determined(normal: Arrays, names: Sequence[str]) -> None:
     if len(names) and values[0] < _UNDETERMINED_EIGENVALUE:
         name = names[int(np.argmax(np.abs(vectors[:, 0])))]
         raise GeometryError(
-            f'{name} cannot be told from the poses in these views; fix it, or add views in which '
+            f'{name} is confounded with the poses in these views; fix it, or add views in which '
             'the target is tilted and covers the image'
         )

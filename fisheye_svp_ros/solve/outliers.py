@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -174,6 +173,8 @@ def _find_swaps(
 
     None where so many would by chance, as dense as landmarks are predicted around their own place.
     """
+    from scipy import special  # not while --help waits
+
     ids, first = np.unique(views.landmark[views.used], return_index=True)
     points = views.points[views.used][first]
     swapped, by_chance = np.zeros_like(far), 0.0

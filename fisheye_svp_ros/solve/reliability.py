@@ -29,7 +29,7 @@ _SUBSETS, _SUBSET, _FEW_SUBSETS, _KEPT, _ROUNDS = 120, 6, 30, 6, 8
 _FADE = 2.0  # standard deviations at which a point's weight falls to about half
 _MEDIAN = 1.1774  # median length of a plane Gaussian vector of unit deviation
 _INFINITE = 1e6  # standard deviations: what is more is as good as infinite
-_MAX_RANGE = 100.0  # m, a range at which landmarks are probably not in metres
+_MAX_RANGE = 100.0  # m, a range at which landmarks are probably not in meters
 _NOISIEST = 2.0  # px, that a detector leaves
 # Where sigma is unknown: a view may misfit this many times as much as most do; how many views
 # can be held against each other; and px below which residuals are rounding.
@@ -282,7 +282,7 @@ def _noisy_reason(sigma: float) -> str:
 def _far_reasons(views: Views, found: Localization) -> list[str]:
     away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
-    why = f'landmarks lie up to {farthest.max():.0f} m away: are they in metres?'
+    why = f'landmarks lie up to {farthest.max():.0f} m away: are they in meters?'
     return [why if far > _MAX_RANGE else '' for far in farthest]
 
 

@@ -40,7 +40,7 @@ class CameraSettings(Settings):
         fixed=True
     )
     publish_tf: bool = parameter(
-        False, 'Tell tf2 the true pose: `world_frame` to the frame of the camera with _true '
+        False, 'Publish the true pose on tf2: `world_frame` to the frame of the camera with _true '
         'after it', fixed=True
     )
 
@@ -117,8 +117,8 @@ class LocalizerSettings(SolverSettings):
     """Parameters of the localizer."""
 
     publish_tf: bool = parameter(
-        False, 'Tell tf2 the estimated pose: the frame of the landmarks to that of the camera; '
-        'only where no other node tells of the latter', fixed=True
+        False, 'Publish the estimated pose on tf2: frame of the landmarks to that of the camera; '
+        'only where no other node publishes the latter', fixed=True
     )
     camera_frame: str = parameter(
         '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True
@@ -134,7 +134,7 @@ class StereoCalibratorSettings(RigSettings):
     """Parameters of the stereo calibrator."""
 
     publish_tf: bool = parameter(
-        False, 'Tell tf2 the rig, as a static transform: the frame of the right camera to that of '
+        False, 'Publish the rig on tf2, statically: frame of the right camera to that of '
         'the left one', fixed=True
     )
 

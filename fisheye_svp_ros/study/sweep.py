@@ -68,7 +68,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     for name, table in tables.items():
         if isinstance(table, StereoDepthSettings) and table.rig != StereoDepthSettings.rig:
             raise ParameterError(f'{name}: rig is {table.rig!r}; a sweep measures with the true '
-                                 'rig, whatever came last on a topic')
+                                 'rig, not with one from a topic')
         if table.lens:
             model_of(table.lens, 1.0, table.solves_svp)
     check_sweep(base, sweep)

@@ -338,7 +338,7 @@ class TestWords:
                         to_separate='go nearer; or farther')
         wrong, _, following = verdict_sentences(with_changes(found, causes=[cause]))
         assert 'viewpoint_shift, confounded with flat_port or radial_profile' in wrong
-        assert 'to tell viewpoint_shift from flat_port and radial_profile: go nearer, or' in (
+        assert 'to separate viewpoint_shift from flat_port and radial_profile: go nearer, or' in (
             following)
 
     def test_unexplained(self, found):
@@ -349,7 +349,7 @@ class TestWords:
         assert 'depend on the distance of the landmark and the incidence angle' in wrong
         assert 'a few points are outliers' in wrong
         assert 'no extension improved on it' in gained
-        assert 'look for the reason' in following
+        assert 'look for the cause' in following
         *_, following = verdict_sentences(with_changes(
             found, remaining=[Structure('frame', 0.0, 0.5)], untestable={'focal_drift': 'no t'}))
         assert 'give the time of each frame (a column t, s)' in following
@@ -377,7 +377,7 @@ class TestWords:
             found, causes=[], advice=[], remaining=left, gross=gross,
             extended=extended))
         assert '2 points are outliers, furthest frame 4 landmark 17 (12.3 px)' in wrong
-        assert 'the residuals are 3 times as large as sigma says' in wrong
+        assert 'the residuals are 3 times as large as sigma states' in wrong
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
@@ -392,7 +392,7 @@ class TestWords:
         assert headline(with_changes(clean, remaining=more)).startswith(
             'The residual error has no cause that the catalogue holds')
         *_, following = verdict_sentences(with_changes(clean, remaining=more))
-        assert 'look for the reason' in following
+        assert 'look for the cause' in following
 
     def test_what_happened_to_the_frames_is_no_reason_to_keep_the_lens(self, found):
         cause = replace(found.causes[0], effect='rolling_shutter', to_separate='use a tripod')

@@ -69,7 +69,7 @@ def test_numbers_are_those_of_yaml_1_2() -> None:
 
 
 @pytest.mark.parametrize(('text', 'said'), [
-    ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' stands there twice"),
+    ('{"a": 1, "b": {"c": 1, "c": 2}}', "'c' is listed twice"),
     ('[' * 100_000, 'broken JSON'), ('{"a": ' + '9' * 5000 + '}', 'broken JSON'),
     ('[1]', 'a JSON object is expected'), ('', 'broken JSON'),
 ])
@@ -81,7 +81,7 @@ def test_hostile_json(text: str, said: str) -> None:
 @pytest.mark.parametrize(('text', 'said'), [
     (BOMB, 'an alias'),
     ('localizer: {ros__parameters: {}}\nlocalizer: {ros__parameters: {}}', 'a second time'),
-    ('localizer:\n  ros__parameters:\n    a.b: 1\n    a: {b: 2}\n', "'a.b' stands there twice"),
+    ('localizer:\n  ros__parameters:\n    a.b: 1\n    a: {b: 2}\n', "'a.b' is listed twice"),
     ('/(*: {ros__parameters: {a: 1}}', 'names no node'),
     ('/***: {ros__parameters: {a: 1}}', 'names no node'),
     ('ros__parameters: {a: 1}', 'names no node'),

@@ -335,9 +335,9 @@ class TestOrpc:
         (DSC_TWO, '', 'target.tp: a board number'),
         (DSC_TWO, TP_TWO.replace('0\n1 0', '5\n1 0', 1), 'board 0, corner 1 is not on the target'),
         (DSC_TWO, TP_TWO.replace('1 0', '1.1 0', 1), 'holds no rotation'),
-        (DSC_TWO, TP_TWO + TP_TWO, 'a board stands there twice'),
-        (DSC + DSC, None, 'board 0 stands there twice'),
-        (DSC + DSC.splitlines()[-1], None, 'this corner stands there twice'),
+        (DSC_TWO, TP_TWO + TP_TWO, 'a board is listed twice'),
+        (DSC + DSC, None, 'board 0 is listed twice'),
+        (DSC + DSC.splitlines()[-1], None, 'this corner is listed twice'),
     ])
     def test_bad_target(self, data, dsc, tp, says):
         with pytest.raises(ObservationError) as caught:

@@ -359,7 +359,7 @@ def test_quality_of_service_is_overridden(
     g.idle(0.5)
     assert not points, 'who asks for reliable messages does not get these'
     assert not set_parameter(node, name, 'reliable').successful
-    assert 'means nothing' not in capfd.readouterr().err
+    assert 'is unknown to this node' not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize('given', [
@@ -377,4 +377,4 @@ def test_an_override_for_a_topic_that_is_none_is_named(
     graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
 ) -> None:
     graph('qos_overrides./image_point.publisher.depth:=7').start(SyntheticCamera)
-    assert "'qos_overrides./image_point.publisher.depth' means nothing" in capfd.readouterr().err
+    assert "'qos_overrides./image_point.publisher.depth' is unknown to this node" in capfd.readouterr().err

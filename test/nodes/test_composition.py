@@ -116,4 +116,4 @@ def test_what_cannot_be_used_names_its_node(
 
 def test_a_node_that_stands_there_twice_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['run', 'localizer', 'localizer']) == 2
-    assert 'a node stands there twice' in capsys.readouterr().err
+    assert 'a node is listed twice' in capsys.readouterr().err

@@ -179,7 +179,7 @@ def test_a_camera_may_be_composed_in_one_process(
         camera.wait_for('listening to ')
     said = '\n'.join(camera.lines)
     assert said.count('process started with pid') == (1 if composed == 'true' else 3)
-    assert '/camera/camera_info' in said and 'means nothing' not in said
+    assert '/camera/camera_info' in said and 'is unknown to this node' not in said
 
 
 def test_the_commands_of_the_documentation_show_metrics(

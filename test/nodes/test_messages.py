@@ -165,7 +165,7 @@ def landmark_twice(_: Any) -> Any:
     (no_step, 'impossible type, count or offset'),
     (with_u(math.nan), "field 'u' of point 0 is nan; leave out points without a value"),
     (with_u(math.inf), "field 'u' of point 0 is inf"),
-    (landmark_twice, 'landmark 5 stands there twice'),
+    (landmark_twice, 'landmark 5 is listed twice'),
 ])
 def test_image_points_that_cannot_be_used(spoil: Any, reason: str) -> None:
     with pytest.raises(ObservationError, match=r'^left/image_points: ') as caught:

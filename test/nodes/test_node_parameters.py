@@ -210,8 +210,8 @@ def test_a_parameter_that_means_nothing_is_named(
 ) -> None:
     start('localizer', '-p', 'lenz:=fish180', '-p', 'noise_px:=1.0')
     said = capfd.readouterr().err
-    assert "parameter 'lenz' means nothing to this node; did you mean 'lens'?" in said
-    assert "parameter 'noise_px' means nothing to this node; it knows " in said
+    assert "parameter 'lenz' is unknown to this node; did you mean 'lens'?" in said
+    assert "parameter 'noise_px' is unknown to this node; known are " in said
 
 
 def test_what_a_file_says_of_all_nodes_may_be_for_others(
@@ -225,8 +225,8 @@ def test_what_a_file_says_of_all_nodes_may_be_for_others(
     start('localizer', '--params-file', str(file))
     said = capfd.readouterr().err
     assert 'noise_px' not in said and 'exposure' not in said
-    assert "'patence' means nothing to this node; did you mean 'patience'?" in said
-    assert "'radius' means nothing to this node; it knows" in said
+    assert "'patence' is unknown to this node; did you mean 'patience'?" in said
+    assert "'radius' is unknown to this node; known are" in said
 
 
 @pytest.mark.parametrize(('node', 'words', 'wanted'), [

@@ -555,7 +555,7 @@ def test_two_landmarks_of_one_id_are_refused(sets: Sets) -> None:
     sets.landmarks.publish(messages.landmarks_message(twice, 0, 'world'))
     sets.graph.until(lambda: sets.diagnostics and values(
         sets.diagnostics[-1])['landmarks: dropped'] == '1')
-    assert 'landmark 1 stands there twice' in sets.diagnostics[-1].status[0].message
+    assert 'landmark 1 is listed twice' in sets.diagnostics[-1].status[0].message
 
 
 @pytest.mark.parametrize('style', ['parallel', 'vergent', 'divergent'])

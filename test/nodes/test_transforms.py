@@ -159,7 +159,7 @@ def test_a_frame_that_another_node_tells_of_is_said(
 
     def said() -> Any:
         other.publish(tf_message(transforms=[transform]))
-        return next((m for m in reports if "/tf: another node tells of 'camera_optical_frame' as "
+        return next((m for m in reports if "/tf: another node publishes 'camera_optical_frame' as "
                      "well, in 'base_link'" in m.status[0].message), None)
 
     assert g.until(said).status[0].name == '/localizer: inputs'

@@ -42,7 +42,7 @@ def test_what_is_settled_and_what_photographs_cannot_tell(guide):
         settled=True)
     guide.adopt(stand)
     assert guide_words(guide) == (
-        'settled', 'diagnosis: viewpoint_shift, or flat_port: photographs cannot tell',
+        'settled', 'diagnosis: viewpoint_shift, or flat_port: photographs cannot separate them',
         '0 photographs, e0 -3 +- 0.1 mm, wanted +- 0.3')
 
 

@@ -95,7 +95,7 @@ WHOLE = 'a whole number from 0 to 4294967295 is needed'
     ('', 'it is empty; a header with landmark,x,y,z is needed'),
     ('landmark,x,y\n', "column 'z' is missing"),
     ('landmark,x,y,z\n', 'no row below the header; at least one is needed'),
-    ('landmark,x,y,z\n1,0,0,0\n1,1,1,1\n', 'landmark 1 stands there twice'),
+    ('landmark,x,y,z\n1,0,0,0\n1,1,1,1\n', 'landmark 1 is listed twice'),
     ('landmark,x,y,z\n1,0,nan,0\n', "line 2: y is 'nan'; a finite number is needed"),
     ('landmark,x,y,z\n1,0,0,0\n2,0,abc,0\n', "line 3: y is 'abc'; a number is needed"),
     ('landmark,x,y,z\n1,0,0\n', 'line 2: 3 fields where the header has 4'),

@@ -185,7 +185,7 @@ def test_landmarks_in_millimetres_are_said():
     _, views, _ = spoilt('millimetres', 'board', 1, np.random.default_rng(9))
     for weight in (views.weight, 0.5 * np.ones_like(views.weight)):
         views, model = views._replace(weight=weight), ForwardModel(lens.svp())
-        assert 'are they in metres?' in examine(model, views, localize(model, views)).reasons[0]
+        assert 'are they in meters?' in examine(model, views, localize(model, views)).reasons[0]
 
 
 class TestStereoDepth:

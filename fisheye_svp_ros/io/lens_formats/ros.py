@@ -120,7 +120,7 @@ def _lens_of(
     lens, worst = nearest_lens(name, size, intrinsics, distortion, where)
     if not worst <= _TOLERANCE:
         raise LensError(f'{where}: no lens here comes nearer than {worst:.2g} px to this {model}; '
-                        'calibrate it anew, as equidistant')
+                        'calibrate it again, as equidistant')
     return lens, worst
 
 
