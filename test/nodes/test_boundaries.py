@@ -377,4 +377,4 @@ def test_an_override_for_a_topic_that_is_none_is_named(
     graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str]
 ) -> None:
     graph('qos_overrides./image_point.publisher.depth:=7').start(SyntheticCamera)
-    assert "'qos_overrides./image_point.publisher.depth' is unknown to this node" in capfd.readouterr().err
+    assert "'qos_overrides./image_point.publisher.depth' is unknown" in capfd.readouterr().err
