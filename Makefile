@@ -18,7 +18,7 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare decisions rectification hand-eye kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -108,6 +108,10 @@ compare: .venv-compare/ready
 # docs/results/rectification.md; a minute.
 rectification: .venv-compare/ready
 	.venv-compare/bin/python -m benchmark.rectification
+
+# Rigs of four cameras beside OpenCV's multiview calibration, into docs/results/rigs.md; five minutes.
+rigs: $(VENV)/ready
+	$(BIN)/python -m benchmark.rigs
 
 # Cameras on robots beside OpenCV's hand-eye calibration, which OpenCV 5 has no more, into
 # docs/results/hand_eye.md; ten minutes.
