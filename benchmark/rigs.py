@@ -149,8 +149,8 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     lines += ['', 'Medians of the rms errors of the three cameras in the first one; ours with '
               'standard errors of lenses and rig, OpenCV states none.', '',
               f'Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie within 1.96 '
-              'of their standard errors: more than 95 %, since the errors of the lenses count every '
-              'shape of the target that the data admit.', '']
+              'of their standard errors: more than 95 %, since the errors of the lenses count '
+              'every shape of the target that the data admit.', '']
     write_text(path, '\n'.join(lines))
 
 
