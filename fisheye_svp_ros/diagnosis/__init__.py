@@ -38,7 +38,12 @@ from fisheye_svp_ros.diagnosis.diagnosis import (
 )
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
-from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
+from fisheye_svp_ros.diagnosis.evaluation import (
+    MAX_RMS_RATIO,
+    Evaluation,
+    FitQuality,
+    Intrinsic,
+)
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
 from fisheye_svp_ros.diagnosis.lens_errors import InAir, LensErrors
 from fisheye_svp_ros.diagnosis.null_model import NullModel
@@ -59,6 +64,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure, stag
 __all__ = [
     'CONFOUNDED_P',
     'DIAGNOSE_AIR',
+    'MAX_RMS_RATIO',
     'NAMED_P',
     'NAMES',
     'RETAKE',

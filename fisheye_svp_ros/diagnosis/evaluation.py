@@ -61,7 +61,7 @@ from fisheye_svp_ros.solve.rig_state import (
     rms_px,
 )
 
-_SAME_RMS = 0.995  # a rise by less is none: noise that grows with the angle has weights
+MAX_RMS_RATIO = 1.005  # a rise by less is none: noise that grows with the angle has weights
 
 
 @dataclass(frozen=True)
@@ -297,7 +297,7 @@ class Evaluation:
     def falling(self) -> bool:
         """Whether the rms of the fitted frames falls from base to named to extended."""
         sizes = [self.base_quality.rms_px, self.named_quality.rms_px, self.extended_quality.rms_px]
-        return all(one >= _SAME_RMS * other for one, other in pairwise(sizes))
+        return all(after <= MAX_RMS_RATIO * before for before, after in pairwise(sizes))
 
     @cached_property
     def _errors_without_shifts(self) -> Array:

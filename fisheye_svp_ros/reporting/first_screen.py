@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 
 from fisheye_svp_ros.diagnosis import (
+    MAX_RMS_RATIO,
     RETAKE,
     UNLIKE,
     Comparison,
@@ -114,7 +115,7 @@ def _facts(d: Diagnosis, source: str) -> str:
 
 
 def _warning(d: Diagnosis) -> str:
-    """Return which error is larger after than before."""
+    """Return which error is larger after than before, by more than rounding shows."""
     base, named, extended = d.figures.base, d.figures.named, d.figures.extended
     pairs = (
         ('rms on the fitted frames, with the causes', base.rms_px, named.rms_px),
@@ -123,7 +124,7 @@ def _warning(d: Diagnosis) -> str:
         ('held-out rms, with the extended lens on one target', d.file.given_px,
          d.file.extended_px))
     rising = [f'{name}: {before:.3g} → {after:.3g} px' for name, before, after in pairs
-              if after > before * (1 + 1e-6)]
+              if after > MAX_RMS_RATIO * before]
     return ('an error rises: ' + '; '.join(rising)) if rising else ''
 
 
