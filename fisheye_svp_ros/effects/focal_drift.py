@@ -31,8 +31,8 @@ class FocalDriftEffect(PlaneEffect):
     of_recording = True
     of_frames = True
     when_untestable = (
-        'give the time of each frame (a column t, s): what drifts, jumps or moves while rows are '
-        'exposed can then be told'
+        'give the time of each frame (a column t, s): drifts, jumps and motion during the '
+        'exposure become testable'
     )
     signature = 'residuals in proportion to the image height that change smoothly with time'
     to_separate = 'a longer recording with the temperature noted; frames well spread in time'

@@ -61,8 +61,8 @@ _UNCERTAIN = {
     'rotation_rad': ('orientation from one frame', 180 / math.pi, 'deg'),
 }
 COMPONENTS = {
-    'named_lens': 'lens, by name', 'named_target': 'target, by name',
-    'named_frame': 'frames, by name',
+    'named_lens': 'lens, identified', 'named_target': 'target, identified',
+    'named_frame': 'frames, identified',
     'image_broad': 'image field of a third', 'image_coarse': 'image field of a sixth',
     'image_fine': 'image field of a fourteenth', 'image_finest': 'finer image field',
     'landmark_in_plane': 'landmarks along their board',
