@@ -10,6 +10,8 @@ ROS := $(if $(shell $(PYTHON) -c 'import rclpy.node; print("sourced")' 2>&-),,$(
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
+# One more than there are cores: tests of nodes wait for messages most of the time.
+WORKERS ?= $(shell expr $$(nproc) + 1)
 # Further arguments of pytest, for example PYTEST='-k lens'.
 PYTEST ?=
 # Rooms whose tests start no process, nor diagnose whole sets.
@@ -26,15 +28,15 @@ demo: $(VENV)/ready
 # One thread each for NumPy, since the tests are spread over all cores.
 check test coverage test-oldest: export OMP_NUM_THREADS := 1
 test: $(VENV)/ready lint
-	$(BIN)/python -m pytest -n auto --dist loadgroup $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
 
 # For every save: lint, and the tests that take under two minutes on two cores.
 check: $(VENV)/ready lint
-	$(BIN)/python -m pytest -n auto --dist loadgroup -m 'not slow' $(QUICK) $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup -m 'not slow' $(QUICK) $(PYTEST)
 
 # All tests, and which lines of the package they run.
 coverage: $(VENV)/ready
-	$(BIN)/python -m pytest -n auto --dist loadgroup --cov=fisheye_svp_ros \
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup --cov=fisheye_svp_ros \
 		--cov-report=term:skip-covered $(PYTEST)
 
 lint: $(VENV)/ready
@@ -160,7 +162,7 @@ test-oldest:
 	@echo "Installing the oldest versions into .venv-oldest: about a minute"
 	$(PYTHON) -m venv .venv-oldest
 	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[fast,parquet,test$(ROS)]' -c test/oldest.txt
-	.venv-oldest/bin/python -m pytest -n auto --dist loadgroup
+	.venv-oldest/bin/python -m pytest -n $(WORKERS) --dist loadgroup
 
 $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"

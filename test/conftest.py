@@ -82,6 +82,8 @@ def ros_domain(monkeypatch: pytest.MonkeyPatch) -> Iterator[int]:
                 monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
                 monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
                 yield domain
+                if 'rclpy' in sys.modules:  # a node that refused to start has left it on
+                    sys.modules['rclpy'].try_shutdown()
                 return
     pytest.fail('all ROS domains from 1 to 101 are taken')
 

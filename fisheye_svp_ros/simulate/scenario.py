@@ -37,7 +37,7 @@ from fisheye_svp_ros.simulate.simulation import simulate, simulate_rig, simulate
 MONO = 'mono'
 CALIBRATION = 'calibration'
 # Sweeping one of these may name a file that cannot be read: found out before anything runs.
-_READ_FILES = ('lens', 'environment', 'poses_file', 'rig')
+_READ_FILES = ('lens', 'environment', 'poses_file', 'rig_file')
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Scenario:
         0.0, 'Standard deviation of the noise of image points', 'px', (0.0, 1e3)
     )
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
-    rig: str = parameter(
+    rig_file: str = parameter(
         '', 'Cameras in place of `lens` and `style`: a folder or file with their lenses and where '
         'they stand, as `calibrate` writes it; poses are of the first', file=True
     )
@@ -89,7 +89,7 @@ class Scenario:
 _SETS_PER_BLOCK = 1000  # sets that are simulated at once
 
 SCALARS = tuple(row.name for row in rows(Scenario)
-                if not isinstance(row.default, tuple) and row.name != 'rig')
+                if not isinstance(row.default, tuple) and row.name != 'rig_file')
 
 
 class Simulation(NamedTuple):
@@ -141,7 +141,7 @@ def simulate_in_pieces(
 def _simulate_poses(
     scenario: Scenario, poses: Pose, rng: np.random.Generator, lens: Lens | None = None
 ) -> Simulation:
-    if scenario.rig:
+    if scenario.rig_file:
         return _simulate_rig(scenario, poses, rng)
     lens = true_lens(scenario.lens, scenario.shift_scale) if lens is None else (
         _scale_shift(lens, scenario.shift_scale))
@@ -156,7 +156,7 @@ def _simulate_poses(
 
 def _simulate_rig(scenario: Scenario, poses: Pose, rng: np.random.Generator) -> Simulation:
     """Simulate the cameras of a file; poses (P,) of the first of them."""
-    names, lenses, places = scenario_cameras(scenario.rig)
+    names, lenses, places = scenario_cameras(scenario.rig_file)
     lenses = tuple(_scale_shift(lens, scenario.shift_scale) for lens in lenses)
     landmarks, count = scenario_landmarks(scenario), len(poses.position)
     each = tuple(poses.compose(places.take(i).broadcast_to(count)) for i in range(len(names)))
@@ -203,9 +203,9 @@ def scalars(scenario: Scenario) -> dict[str, Any]:
     Cameras of a file have lenses of their own: no solver takes that of a scenario for them.
     """
     values = {name: getattr(scenario, name) for name in SCALARS}
-    if scenario.rig:
+    if scenario.rig_file:
         del values['lens'], values['style']
-        values['rig'] = scenario.rig
+        values['rig_file'] = scenario.rig_file
     return values
 
 

@@ -77,9 +77,9 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
 
 def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
     """Return the solver nodes of a sweep; raise ParameterError where scenarios differ in them."""
-    if base.rig or sweep.lists.get('rig'):
-        raise ParameterError(f'{CAMERA}: rig is of a file; an offline sweep simulates one camera '
-                             'or a pair: leave rig out, and choose a style')
+    if base.rig_file or sweep.lists.get('rig_file'):
+        raise ParameterError(f'{CAMERA}: rig_file names a rig; an offline sweep simulates one '
+                             'camera or a pair: leave rig_file out, and choose a style')
     mono = {style == MONO for style in sweep.lists.get('style', (base.style,))}
     if len(mono) > 1:
         raise ParameterError(f'{SWEEP}style has {MONO} beside rigs; make two sweeps of it')

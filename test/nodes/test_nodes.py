@@ -208,7 +208,7 @@ def test_a_rig_of_three_cameras_has_a_namespace_each(
         save_lens(replace(lens, name=name, cx=lens.cx + number), tmp_path / f'{name}.yaml')
     steps = [Pose(np.eye(3), np.array([0.1 * (i + 1), 0.0, 0.0])) for i in range(2)]
     save_rig(steps, tmp_path / 'rig.yaml', names)
-    parameters = ('svp:=false', f'rig:={tmp_path}', f'localizer:lens:={tmp_path}/top.yaml',
+    parameters = ('svp:=false', f'rig_file:={tmp_path}', f'localizer:lens:={tmp_path}/top.yaml',
                   'rate:=20.0', 'radius:=0.5')
     g = Graph(*(word for one in parameters for word in ('-p', one)),
               '-r', 'localizer:image_points:=top/image_points',
@@ -419,7 +419,7 @@ def test_a_camera_that_stays_where_it_is_is_warned_of_in_every_set(
         sets.points.publish(messages.image_points_message(seen.landmark, uv, stamp, 'camera'))
         sets.result(stamp)
     said = [message.status[0].message for message in sets.results]
-    assert said[0] == '' and f'left out: landmark {seen.landmark[4]} (' in said[1]
+    assert said[0] == '' and f'outliers rejected: landmark {seen.landmark[4]} (' in said[1]
     assert all('times what sigma allows' in text for text in said[2:])
     sets.graph.until(lambda: len(sets.poses) == 5)
     for pose in sets.poses[3:]:

@@ -151,7 +151,7 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
     assert [len(row) for row in rows(doubt)] == [6, 6] and 'sure' in rows(doubt)[-1][-1]
     assert '--without' not in purpose(doubt._replace(answers=(0.1, 0.5, 0.9)))
     hardly = doubt._replace(answers=(0.02, 0.03, 0.04), others=('flat_port',))
-    assert purpose(hardly).endswith('can be left out, --without flat_port')
+    assert purpose(hardly).endswith('exclude what is absent by --without flat_port')
     sized = next_photographs(linear, [cause([])], NOISE, 2, room=ROOM)
     assert (sized.asked, sized.unit) == ('viewpoint_shift', 'm')
     assert 'mm' in rows(sized)[0][-1]

@@ -207,7 +207,7 @@ def four_cameras(folder):
 
 def test_cameras_of_a_file_see_what_they_would_alone(tmp_path):
     rig = four_cameras(tmp_path)
-    seen = simulate_scenario(Scenario(rig=str(tmp_path), radius=0.5,
+    seen = simulate_scenario(Scenario(rig_file=str(tmp_path), radius=0.5,
                                       poses=(0.01, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)))
     table = seen.observations
     assert table.cameras == ('cam0', 'cam1', 'cam2', 'cam3') and seen.rig is None
@@ -219,11 +219,11 @@ def test_cameras_of_a_file_see_what_they_would_alone(tmp_path):
         assert seen.lenses[number].cx == FISH180.cx + number
         assert rows.any() == (number != 2)  # which looks away from all landmarks
         np.testing.assert_allclose(table.uv[rows], image.uv, atol=1e-9)
-    assert 'lens' not in scalars(Scenario(rig=str(tmp_path)))
+    assert 'lens' not in scalars(Scenario(rig_file=str(tmp_path)))
 
 
 def test_a_rig_without_a_lens_is_refused(tmp_path):
     four_cameras(tmp_path)
     (tmp_path / 'cam2.yaml').unlink()
     with pytest.raises(LensError, match='the rig has the camera cam2, and there is no lens of it'):
-        simulate_scenario(Scenario(rig=str(tmp_path)))
+        simulate_scenario(Scenario(rig_file=str(tmp_path)))
