@@ -97,8 +97,9 @@ class SyntheticCamera(CameraNode):
 
     def configure(self, settings: SyntheticCameraSettings) -> None:
         """Start over with new settings."""
-        for style, rig in itertools.product(self._sweep.lists.get('style', (settings.style,)),
-                                            self._sweep.lists.get('rig_file', (settings.rig_file,))):
+        lists = self._sweep.lists
+        for style, rig in itertools.product(lists.get('style', (settings.style,)),
+                                            lists.get('rig_file', (settings.rig_file,))):
             for name in camera_names(style, rig):
                 self.camera(name)
         self.play(steps(settings, self._sweep))
