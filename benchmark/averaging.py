@@ -20,6 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from benchmark.true_rays import ray_error
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import diagnose
@@ -32,7 +33,6 @@ from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK, NOISE
 from fisheye_svp_ros.reporting.plots import legend_below, picture
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.ray_errors import points_on_rays, without_motion
 
 WIDTH, HEIGHT = 1280, 800
 
@@ -110,15 +110,6 @@ def draw_set(seed: int) -> tuple[Observations, Lens]:
     return make_observations(number, ids, uv, flat[ids], source=f'set {seed}'), lens
 
 
-def ray_error(lens: Lens, truth: Lens, uv: Array) -> float:
-    """Return the rms angle, mrad, between rays of two lenses, a common motion taken out."""
-    points = points_on_rays(truth, uv)
-    change = points_on_rays(lens, uv) - points
-    there = np.isfinite(change + points).all(axis=(0, 2))
-    angles = without_motion(points[:, there], change[:, there])
-    return 1e3 * float(np.sqrt((angles**2).sum(axis=-1).mean()))
-
-
 def trial(seed: int) -> Outcome:
     """Calibrate and diagnose one set."""
     table, truth = draw_set(seed)
@@ -131,8 +122,7 @@ def trial(seed: int) -> Outcome:
         truth.viewpoint_shift.e0, written,  # type: ignore[union-attr]
         shift[0].stderr if shift else 0.0, shift[0].weight if shift else 0.0,
         'viewpoint_shift' in names,
-        (ray_error(given, truth, table.uv), ray_error(named, truth, table.uv),
-         ray_error(found.lens, truth, table.uv)))
+        tuple(ray_error(lens, truth, table.uv) for lens in (given, named, found.lens)))
 
 
 def report(outcomes: Sequence[Outcome], command: str) -> str:

@@ -43,8 +43,7 @@ class Outcome:
 
     decision, target: the answers; bound: of the viewpoint shift, m, NaN where none is stated;
     shift: the true one; gain: the `file` figure; true_gain: 1 - ray error of the extended lens
-    over that of the given one, by the truth; stated: of `ray_error_mrad`, given and extended at
-    1 m, with the true ones.
+    over that of the given one, by the truth.
     """
 
     kind: str

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from scipy import stats
 
+from benchmark.true_rays import ray_error
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
@@ -30,7 +31,6 @@ from fisheye_svp_ros.scene.observations import Observations, make_observations, 
 from fisheye_svp_ros.simulate.simulation import predict_points
 from fisheye_svp_ros.solve.hand_eye import Transforms
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_hand_eye
-from fisheye_svp_ros.solve.ray_errors import points_on_rays, without_motion
 
 TRIALS, DIAGNOSED = 60, 12
 _DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'hand_eye.md'
@@ -154,11 +154,7 @@ def _ray_error(found: Calibration, case: Case) -> float:
     uv = grid.reshape(-1, 2)
     near = np.linalg.norm(uv[:, None] - case.table.uv, axis=-1).min(axis=1)
     uv = uv[near < _NEAR]
-    both = [points_on_rays(lens, uv, (0.5,)) for lens in (case.lens, found.adjusted.lens)]
-    known = np.isfinite(both[0] + both[1]).all(axis=(0, 2))
-    true, ours = (points[:, known] for points in both)
-    off = without_motion(true, ours - true)
-    return float(np.sqrt((off**2).sum(axis=-1).mean()))
+    return 1e-3 * ray_error(found.adjusted.lens, case.lens, uv, (0.5,))
 
 
 def _named(case: Case, found: Calibration) -> tuple[list[str], list[str], bool]:

@@ -199,7 +199,7 @@ def find_lens_rays(
             errors[name]['extended'].append(wider.errors()[-1])
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
         offsets.append(
-                _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px))
+            _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px))
     return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))
 
 
