@@ -52,9 +52,20 @@ def test_children_end_with_their_parent(tmp_path: Path, number: signal.Signals) 
 
 
 def _held(pid: int) -> set[str]:
-    """Return the shared memory of a process: segments, and not ports, which others soon have."""
-    return set(re.findall(r'/dev/shm/(fastrtps_[0-9a-f]{16})\b',
-                          Path(f'/proc/{pid}/maps').read_text()))
+    """Return the segments that a process has made, whose locks it alone holds.
+
+    Neither those of others, which it maps too, nor ports, which others soon have.
+    """
+    files = map(_target, Path(f'/proc/{pid}/fd').iterdir())
+    return {segment[1] for file in files
+            if (segment := re.fullmatch(r'/dev/shm/(fastrtps_[0-9a-f]{16})_el', file))}
+
+
+def _target(link: Path) -> str:
+    try:
+        return str(link.readlink())
+    except OSError:  # closed meanwhile
+        return ''
 
 
 def test_a_node_that_is_killed_leaves_no_shared_memory(tmp_path: Path, ros_domain: int) -> None:
