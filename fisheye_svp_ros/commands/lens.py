@@ -18,7 +18,7 @@ from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.optics.lens import PORT, Lens
+from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.rectify.maps import MAX_RANGE
 from fisheye_svp_ros.rectify.svp import nearest_svp_lens
 from fisheye_svp_ros.reporting.tables import print_table, range_text
@@ -65,6 +65,9 @@ def run(args: argparse.Namespace) -> None:
     for name, entry in lens.corrections.items():
         for parameter, value in entry.get('parameters', {}).items():
             print(f'  {f"{name} {parameter}":<18} {value:.10g}')
+    if lens.image_field is not None:
+        print(f'  {IMAGE_FIELD:<18}{lens.image_field.rms:.3g} px rms, splines of '
+              f'{" x ".join(map(str, lens.image_field.values.shape[1::-1]))} nodes')
     if foreign is not None:
         for camera, worst in foreign.worst_px.items():
             if worst > 0:
@@ -101,8 +104,9 @@ def _rigs(foreign: Foreign) -> None:
 def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands: bool) -> None:
     """Say what the form does not hold, px, by angle and range; or how that could be less."""
     port = () if lens.port is None else (PORT,)
+    field = [IMAGE_FIELD] if lens.image_field and not written.image_field else []
     own = [name for name in lens.corrections if name not in written.corrections]
-    named = [name for name in (*port, *own, *lens.target) if name != LANDMARKS]
+    named = [name for name in (*port, *own, *field, *lens.target) if name != LANDMARKS]
     if lens.viewpoint_shift is not None and written.viewpoint_shift != lens.viewpoint_shift:
         named.insert(0, 'the viewpoint shift')
     if named:

@@ -21,7 +21,15 @@ from fisheye_svp_ros.io.lens_formats import READABLE, Foreign, read_foreign
 from fisheye_svp_ros.io.share import without_camera
 from fisheye_svp_ros.optics.curve_base import Curve, ViewpointShift
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS, VIEWPOINT_SHIFTS
-from fisheye_svp_ros.optics.lens import INTRINSICS, PORT, Lens, check_lens, field_of_view
+from fisheye_svp_ros.optics.image_field import ImageField
+from fisheye_svp_ros.optics.lens import (
+    IMAGE_FIELD,
+    INTRINSICS,
+    PORT,
+    Lens,
+    check_lens,
+    field_of_view,
+)
 from fisheye_svp_ros.optics.ports import PORTS
 from fisheye_svp_ros.registry import Registry
 
@@ -107,6 +115,8 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
         viewpoint_shift=_viewpoint_shift(document.get('viewpoint_shift'), where),
         port=None if PORT not in own else _curve(
             own[PORT], PORTS, '', 0, f'{where}: corrections.port'),
+        image_field=None if IMAGE_FIELD not in own else ImageField.from_dict(
+            own[IMAGE_FIELD], where),
         target=target,
         calibration=_mapping(document, 'calibration', where),
         uncertainty=_mapping(document, 'uncertainty', where),
@@ -118,7 +128,7 @@ def lens_from_dict(document: Mapping[str, Any], where: str = 'lens') -> Lens:
     if given is not None:
         degrees = _number(document, 'max_incidence_deg', where)
         lens = check_lens(replace(lens, max_incidence=np.radians(degrees).item()), where)
-    own = {name: entry for name, entry in own.items() if name != PORT}
+    own = {name: entry for name, entry in own.items() if name not in (PORT, IMAGE_FIELD)}
     for entries in (_effects(document, _LEGACY_KEY, where), own):
         lens = extend_lens(lens, load_effects(entries, where))
     return lens if given is not None else replace(lens, max_incidence=field_of_view(lens))
@@ -139,7 +149,10 @@ def lens_to_dict(lens: Lens) -> dict[str, Any]:
                  for part in lens.viewpoint_shift.summands()]
         document['viewpoint_shift'] = parts if len(parts) > 1 else parts[0]
     own = {} if lens.port is None else {PORT: _curve_to_dict(lens.port, PORTS, '')}
-    document |= {'corrections': own | dict(lens.corrections), 'target': dict(lens.target)}
+    own |= lens.corrections
+    if lens.image_field is not None:
+        own[IMAGE_FIELD] = lens.image_field.to_dict()
+    document |= {'corrections': own, 'target': dict(lens.target)}
     for name in ('calibration', 'uncertainty'):
         section = getattr(lens, name)
         if section is not None:

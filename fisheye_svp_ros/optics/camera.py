@@ -23,7 +23,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.engines import ported
 from fisheye_svp_ros.optics.engines.results import Incidence as Incidence
-from fisheye_svp_ros.optics.lens import Lens, curve_limit
+from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, curve_limit
 from fisheye_svp_ros.optics.rays import caustic_range
 
 _EDGE_SLACK = 1e-9  # of h/f; keeps image points exactly at the edge of the field inside it
@@ -61,8 +61,7 @@ class LinearImage:
     @property
     def d_height(self) -> Array:
         """Derivatives (..., 2) by the image height, px for unit h/f."""
-        rays = self.incidence
-        return np.stack([self.lens.fx * rays.unit[0], self.lens.fy * rays.unit[1]], axis=-1)
+        return self.through_field(self._along_radius[..., None])[..., 0]
 
     @property
     def d_shift(self) -> Array:
@@ -74,6 +73,31 @@ class LinearImage:
         """Derivatives (..., 2, K) by the coefficients of the port."""
         return self._behind_port[1]
 
+    def d_intrinsics(self) -> dict[str, Array]:
+        """Return derivatives (..., 2) by f, fx, fy, cx and cy."""
+        height, _ = self.lens.image_height.value_and_slope(self.incidence.theta)
+        h = self._along_radius * height[..., None]
+        u, v = h[..., 0] / self.lens.fx, h[..., 1] / self.lens.fy
+        zero, one = np.zeros_like(u), np.ones_like(u)
+        columns = np.stack([np.stack([u, u, zero, one, zero], axis=-1),
+                            np.stack([v, zero, v, zero, one], axis=-1)], axis=-2)
+        columns = self.through_field(columns)
+        return dict(zip(('f', *INTRINSICS), np.moveaxis(columns, -1, 0), strict=True))
+
+    def through_field(self, columns: Array) -> Array:
+        """Return derivatives (..., 2, P) of image points from those of the ideal ones."""
+        if self.lens.image_field is None:
+            return columns
+        height, _ = self.lens.image_height.value_and_slope(self.incidence.theta)
+        ideal = self._along_radius * height[..., None] + [self.lens.cx, self.lens.cy]
+        return self.lens.image_field.carry(ideal, columns)
+
+    @property
+    def _along_radius(self) -> Array:
+        """Derivatives (..., 2) of ideal image points by the image height, px for unit h/f."""
+        rays = self.incidence
+        return np.stack([self.lens.fx * rays.unit[0], self.lens.fy * rays.unit[1]], axis=-1)
+
     @cached_property
     def _sight(self) -> ported.Sight:
         return ported.sight(self.lens, self.points.reshape(-1, 3))
@@ -82,7 +106,9 @@ class LinearImage:
     def _behind_port(self) -> tuple[Array, Array]:
         shift, port = ported.columns(self.lens, self._sight)
         shape = (*self.points.shape[:-1], 2)
-        return shift.reshape(shape), port.reshape(*shape, -1)
+        columns = np.concatenate([shift[..., None], port], axis=-1).reshape(*shape, -1)
+        columns = self.through_field(columns)
+        return columns[..., 0], columns[..., 1:]
 
 
 class Rays(NamedTuple):
@@ -137,15 +163,7 @@ def lens_columns(lens: Lens, image: LinearImage, names: Sequence[str]) -> Array:
     Raises LensError for a name the lens does not have.
     """
     theta = image.incidence.theta
-    height, _ = lens.image_height.value_and_slope(theta)
-    h = image.d_height * height[..., None]
-    columns: dict[str, Array] = {
-        'f': np.stack([h[..., 0] / lens.fx, h[..., 1] / lens.fy], axis=-1),
-        'fx': np.stack([h[..., 0] / lens.fx, np.zeros_like(theta)], axis=-1),
-        'fy': np.stack([np.zeros_like(theta), h[..., 1] / lens.fy], axis=-1),
-        'cx': np.broadcast_to([1.0, 0.0], image.uv.shape),
-        'cy': np.broadcast_to([0.0, 1.0], image.uv.shape),
-    }
+    columns = image.d_intrinsics()
     for curve, derivative in (
         (lens.image_height, image.d_height),
         (lens.viewpoint_shift, image.d_shift),
@@ -171,6 +189,7 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     camera's origin; theta is that in air.  Image points outside the field of view come back as NaN
     with valid False.
     """
+    uv = uv if lens.image_field is None else lens.image_field.invert(uv)
     mx = (np.asarray(uv[..., 0], dtype=float) - lens.cx) / lens.fx
     my = (np.asarray(uv[..., 1], dtype=float) - lens.cy) / lens.fy
     height = np.sqrt(mx * mx + my * my)

@@ -18,7 +18,8 @@ def kannala_brandt_equivalent(lens: Lens) -> Lens:
     Exact where the lens is Kannala-Brandt or equidistant; otherwise the least-squares fit of the
     five odd powers of theta over the field of view.  Corrections have no place in it.
     """
-    curve, bare = lens.image_height, replace(lens.svp(), corrections={}, target={})
+    curve = lens.image_height
+    bare = replace(lens.svp(), image_field=None, corrections={}, target={})
     exact = curve.with_powers(())
     if exact is not None:
         return replace(bare, image_height=exact)

@@ -10,10 +10,12 @@ import numpy as np
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.curve_base import ImageHeight, ViewpointShift
+from fisheye_svp_ros.optics.image_field import ImageField
 from fisheye_svp_ros.optics.ports import Port
 
 INTRINSICS = ('fx', 'fy', 'cx', 'cy')
 PORT = 'port'  # before the names of a port's coefficients, among those of a lens
+IMAGE_FIELD = 'image_field'
 _RANGE_MARGIN = 1 - 1e-6  # of the monotone range: at its very end the curve cannot be inverted
 
 
@@ -22,7 +24,8 @@ class Lens:
     """One fisheye lens on its camera; SVP is the same lens without shift and port.
 
     fx, fy, cx, cy in px (pixel centres at whole numbers); max_incidence in rad.  viewpoint_shift
-    is all of it, whatever it is made of, but for what a port brings.  corrections: effects of the
+    is all of it, whatever it is made of, but for what a port brings.  image_field: what moves
+    image points beside curves and port.  corrections: effects of the
     lens's own that have no other place in it, by name, as `effects.base.Effect.to_dict` gives
     them; target: those of the target that they were found on, and its landmarks, see
     `effects.target`; both are changed by `effects.extension.extend_lens`.  calibration: where a
@@ -40,6 +43,7 @@ class Lens:
     max_incidence: float
     viewpoint_shift: ViewpointShift | None = None
     port: Port | None = None
+    image_field: ImageField | None = field(default=None, repr=False)
     corrections: Mapping[str, Any] = field(default_factory=dict)
     target: Mapping[str, Any] = field(default_factory=dict, repr=False)
     calibration: Mapping[str, Any] | None = field(default=None, repr=False)
@@ -98,6 +102,11 @@ class Lens:
         return replace(self, viewpoint_shift=shift if own is None else own.plus(shift))
 
     @property
+    def is_bare(self) -> bool:
+        """Whether its curves are all there is, so that an engine solves with it by itself."""
+        return self.port is None and self.image_field is None
+
+    @property
     def focal(self) -> float:
         """Mean of fx and fy, px."""
         return (self.fx + self.fy) / 2
@@ -122,7 +131,10 @@ class Lens:
             if getattr(self, name) <= 0:
                 return f'{name} is {getattr(self, name)}; it must be above 0'
         parts = (self.image_height, self.viewpoint_shift, self.port)
-        return next((wrong for part in parts if part is not None and (wrong := part.check())), '')
+        wrong = next((wrong for part in parts if part is not None and (wrong := part.check())), '')
+        if wrong or self.image_field is None:
+            return wrong
+        return self.image_field.check(self.width, self.height)
 
 
 def parameter_values(lens: Lens, names: Sequence[str]) -> list[float]:

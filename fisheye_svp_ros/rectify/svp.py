@@ -38,7 +38,7 @@ def nearest_svp_lens(lens: Lens, range_m: float) -> tuple[Lens, float]:
     rays = model.back_project(uv[None]).reshape((len(uv),))
     uv, origin, direction = uv[rays.valid], rays.origin[rays.valid], rays.direction[rays.valid]
     points = meet_sphere(origin, direction, np.zeros(3), range_m)
-    square = lens.fx == lens.fy and not lens.corrections and lens.port is None
+    square = lens.fx == lens.fy and not lens.corrections and lens.is_bare
     names = (*(('f',) if square else ('fx', 'fy')), 'cx', 'cy', 'k1', 'k2', 'k3', 'k4')
     found = _fit_parameters(kannala_brandt_equivalent(ForwardModel(lens).lens), names, points, uv)
     reach = float(np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]).max())

@@ -208,7 +208,7 @@ class _Localization:
 
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
-    if model.plain and model.lens.port is None:
+    if model.plain and model.lens.is_bare:
         cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)

@@ -1,6 +1,7 @@
-"""mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, and LENSMODEL_STEREOGRAPHIC.
+"""mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, STEREOGRAPHIC and splined ones.
 
-mrcal has no model of Kannala and Brandt.  Its CAHVORE (Gennery, IJCV 2006) solves the equation of
+mrcal has no model of Kannala and Brandt.  A lens of one viewpoint that has an image field is a
+splined model (`mrcal_splined`).  Its CAHVORE (Gennery, IJCV 2006) solves the equation of
 this package; its image height is f (1 + r0 + r1 c^2 + r2 c^4) c, where c is theta for a
 linearity of 0, tan(l theta) / l above and sin(l theta) / l below.
 """
@@ -15,7 +16,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
-from fisheye_svp_ros.io.lens_formats import Foreign, radial
+from fisheye_svp_ros.io.lens_formats import Foreign, mrcal_splined, radial
 from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 
@@ -45,10 +46,13 @@ def read(text: str, where: str) -> Foreign:
         raise LensError(f'{where}: not a whole .cameramodel ({cause})'.splitlines()[0]) from cause
     if model == 'LENSMODEL_STEREOGRAPHIC' and len(values) == 4:
         return _read_stereographic(size, values, where)
+    if model.startswith(mrcal_splined.NAME):
+        lens = mrcal_splined.read(model, values, size, where)
+        return Foreign('mrcal', {'camera': lens}, (), {})
     match = _LINEARITY.match(model)
     if match is None or len(values) != 12:
-        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE and STEREOGRAPHIC '
-                        'can be read')
+        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE, '
+                        'STEREOGRAPHIC and SPLINED_STEREOGRAPHIC can be read')
     if max(map(abs, values[4:6])) > _AXIS:
         raise LensError(f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
                         'beta); that is not supported')
@@ -82,8 +86,11 @@ def _read_stereographic(size: list[int], values: list[float], where: str) -> For
 def write(lens: Lens) -> str:
     """Return the lens as CAHVORE of linearity 0, its shift included.
 
+    With an image field and without a shift it is a splined model.
     Raises LensError where three radial terms do not say its curve to a hundredth of a pixel.
     """
+    if lens.image_field is not None and lens.viewpoint_shift is None:
+        return _document(*mrcal_splined.fit_model(lens), (0.0, 0.0, 0.0), lens)
     theta = np.linspace(0.0, lens.max_incidence, _GRID)[1:]
     heights = lens.image_height.value_and_slope(theta)[0]
     powers = theta[:, None] ** np.arange(1, 2 * _TERMS, 2)
@@ -99,8 +106,14 @@ def write(lens: Lens) -> str:
     intrinsics = [lens.fx, lens.fy, lens.cx, lens.cy, 0.0, 0.0,
                   float(terms[0]) - 1, *map(float, terms[1:]), *e]
     # A constant part of the shift is where the camera stands.
-    place = [0.0, 0.0, -shift.s0 if shift is not None else 0.0]
+    place = (0.0, 0.0, -shift.s0 if shift is not None else 0.0)
+    return _document('LENSMODEL_CAHVORE_linearity=0', intrinsics, place, lens)
+
+
+def _document(
+    model: str, intrinsics: list[float], place: tuple[float, ...], lens: Lens
+) -> str:
     return ('{\n' + ''.join(f'    {key!r}: {value!r},\n' for key, value in (
-        ('lensmodel', 'LENSMODEL_CAHVORE_linearity=0'), ('intrinsics', intrinsics),
+        ('lensmodel', model), ('intrinsics', intrinsics),
         ('extrinsics', [0.0, 0.0, 0.0, *place]), ('imagersize', [lens.width, lens.height]),
     )) + '}\n')

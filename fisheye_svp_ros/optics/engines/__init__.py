@@ -2,8 +2,8 @@
 
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
 compile, which only long work pays back: what begins such work says so (`settle`).  A lens behind a
-port is traced by `ported`.  Anything else runs on NumPy, and gives the same to the last digit
-whatever was compiled before.
+port is traced by `ported`; an image field moves what any of them returns.  Anything else runs on
+NumPy, and gives the same to the last digit whatever was compiled before.
 FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
 
@@ -62,7 +62,7 @@ def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
     engine = _engine if lens.port is None else ported
     uv, valid = engine.project(lens, points, limited)
-    return uv, valid
+    return uv if lens.image_field is None else lens.image_field.apply(uv), valid
 
 
 def linearise_views(
@@ -75,6 +75,8 @@ def linearise_views(
     """
     engine = _engine if lens.port is None else ported
     uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
+    if lens.image_field is not None:
+        d_pose, uv = lens.image_field.carry(uv, d_pose), lens.image_field.apply(uv)
     return uv, valid, d_pose
 
 
@@ -86,7 +88,7 @@ def localize(
     row (S, N): below 0 for padding; minimum: usable points that a view must have.  Returns also
     how many have not converged, which remain for the solver, and how many targets are flat.
     """
-    if lens.port is not None:
+    if not lens.is_bare:
         return None
     found: tuple[Localization, int, int] | None = _engine.localize(lens, seen, row, minimum, start)
     return found
@@ -100,7 +102,7 @@ def adjust_rigs(
     lenses, seen: of the left and right cameras, S * V views; state: rotation (S, V, 3, 3) and
     position (S, V, 3) of the right camera, (S, 3, 3) and (S, 3) of the left one in the right one.
     """
-    if any(lens.port is not None for lens in lenses):
+    if not all(lens.is_bare for lens in lenses):
         return None
     rigs: Rigs | None = _engine.adjust_rigs(lenses, seen, state)
     return rigs

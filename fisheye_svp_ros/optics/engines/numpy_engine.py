@@ -84,7 +84,7 @@ def linearise_views(
 def pose_equations(
     lens: Lens, rotation: Array, position: Array, seen: Seen
 ) -> tuple[Array, Array, Array]:
-    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses; not for a port.
+    """Return costs (S,) and normal equations (S, 6, 6), (S, 6) of single poses, of a bare lens.
 
     rotation (S, 3, 3), position (S, 3): cameras in the world.  A point without an image costs
     infinity, unless its weight is 0.
