@@ -19,7 +19,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, r
 
 PORT_PLACE = ('port_distance', 'port_tilt_x', 'port_tilt_y')
 MEDIUM_INDEX, THICKNESS = 'port_medium_index', 'port_thickness'
-_LOST_PX = 5.0  # px: what leaves more explains nothing
+LOST_PX = 5.0  # px: what leaves more explains nothing
 _START_FRAMES = 12  # frames, enough for a start
 CURVE_TERMS = 8  # of a free lens curve
 _LIQUID_INDICES = (1.30, 1.56)  # refractive: of what one photographs through, water to oils
@@ -69,7 +69,7 @@ def fit_port(
     there = is_glass(freed.lens.parameters[THICKNESS])
     if there and gain > np.log(2 * len(data.observations)):
         state, names = freed, (*names, THICKNESS)
-    if rms_px(Linearization(data, state, ())) > _LOST_PX:
+    if rms_px(Linearization(data, state, ())) > LOST_PX:
         return None
     return data, outliers, state, names
 

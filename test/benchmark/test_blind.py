@@ -155,9 +155,9 @@ def test_fresh_trials(one_thread):
     seed = random.SystemRandom().randrange(2**32)
     print(f'seed {seed}')
     picked = random.Random(seed)
-    names = picked.sample(list(HIDDEN), 12)
+    names = picked.sample(list(HIDDEN), 6)
     one = [Task('one', 0.5, (name,), seed, number) for number, name in enumerate(names)]
-    clean = [Task('clean', 0.0, (), seed, number) for number in range(8)]
+    clean = [Task('clean', 0.0, (), seed, number) for number in range(4)]
     outcomes = run([*one, *clean], workers=2)
     named = sum(outcome.hit for outcome in outcomes[: len(one)])
     adequate = sum(outcome.verdict == 'adequate' for outcome in outcomes[len(one) :])

@@ -18,6 +18,8 @@ from fisheye_svp_ros import cli
 BROWSER = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', 'google-chrome'))),
                None)
 PHOTOGRAPHS = ROOT.parent / 'shared' / 'data' / 'photos' / 'chessboard'
+# One process makes both reports once.
+pytestmark = pytest.mark.xdist_group('browser')
 SIZES = ((1280, 800), (390, 844))
 _MEASURE = """<script>
 const bottom = name => [...document.querySelectorAll(name)].map(

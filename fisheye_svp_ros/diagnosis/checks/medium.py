@@ -31,6 +31,7 @@ from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.outliers import Outliers
 from fisheye_svp_ros.solve.port_fit import (
     CURVE_TERMS,
+    LOST_PX,
     MEDIUM_INDEX,
     PORT_PLACE,
     THICKNESS,
@@ -47,6 +48,7 @@ _UNITS = {MEDIUM_INDEX: '', 'port_distance': 'm', 'port_tilt_x': 'rad', 'port_ti
 _SUSPICIOUS_PX = 1.0  # px: less than this is no third of the image
 _MIN_MAGNIFICATION = 1.1  # than in air: what looks so much larger may be seen through a flat port
 _FOLDS = 5
+_CURVE_SHARE = 0.5  # of the squares in air, at most, are left by a curve behind a port
 _EXPLAINED_SHARE = 0.98  # of what a free lens curve explains
 _MAX_COST_RATIO = 1.5  # times as much misfit as a free lens curve leaves; lenses are not rigid
 _THICKNESS_SIGMAS = 3.0  # standard errors of its thickness
@@ -157,8 +159,7 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
         return None
     progress('asking whether the camera looks into another medium', 0.02)
     curve = fit_free_curve(data, base)
-    if not (_is_magnified(air, lens, curve)
-            or rms_px(Linearization(data, curve, ())) > _SUSPICIOUS_PX):
+    if not (_is_magnified(air, lens, curve) or _leaves_a_port(air, Linearization(data, curve, ()))):
         return None
     known = InAir.from_lens(lens)
     media = [_assess_port(table, lens, start_port(data, lens), free, 0.0)]
@@ -226,6 +227,16 @@ def _assess_port(
     return Medium(
         state, names, outliers, air, p_value, max(0.0, 1 - after / mine),
         bool(criteria[1] < criteria[0]), criteria[0] - criteria[1], moved > 0, _focal_error(lens))
+
+
+def _leaves_a_port(air: Linearization, curve: Linearization) -> bool:
+    """Return whether what a free lens curve explains, or cannot fit, leaves room for a port.
+
+    Where the curve explains little of a misfit in air, that is noise or lies elsewhere.
+    """
+    rms = rms_px(curve)
+    explains = sum_of_squares(curve) < _CURVE_SHARE * sum_of_squares(air)
+    return rms > LOST_PX or (rms > _SUSPICIOUS_PX and (explains or bool(air.free)))
 
 
 def _focal_error(lens: Lens) -> float:
