@@ -6,11 +6,13 @@ import re
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
+from rclpy.duration import Duration
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Index
@@ -20,6 +22,7 @@ from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
+from fisheye_svp_ros.nodes.session import RCLError
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -31,6 +34,7 @@ _TOPIC = re.compile(r'(~/|/)?[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)
 _CAMERA_FRAME = 'camera_optical_frame'
 _CLOCK_RESET_NS = 10**9  # ns by which a clock is not early but set back
 _REPUBLISH_TIMEOUT = 15.0  # s without an answer after which a set is published again
+_DELIVERY_TIMEOUT = 20.0  # s for which the end waits for subscribers that are held up
 
 
 class CameraTopics:
@@ -173,6 +177,7 @@ class CameraNode(BaseNode):
             raise NodeFailure(str(error)) from error
         if self._step is None:
             self._timer.cancel()
+            self._deliver()
             raise NodeExit('all sets are published')
         self._stamp = self.stamp_of(self._step)
         self._send()
@@ -181,6 +186,14 @@ class CameraNode(BaseNode):
         self._unanswered = set(self.settings.lock_step.split())
         self._sent = time.monotonic()
         self.publish_set(self._step, self._stamp)
+
+    def _deliver(self) -> None:
+        """Wait until reliable subscriptions have what was sent: it is lost with its publisher."""
+        end = time.monotonic() + _DELIVERY_TIMEOUT
+        for publisher in self.publishers:
+            left = max(end - time.monotonic(), 0.0)
+            with suppress(RCLError):  # of a middleware that cannot tell
+                publisher.wait_for_all_acked(Duration(seconds=left))
 
 
 def rows_by_frame(observations: Observations) -> dict[tuple[int, str], Index]:

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import math
-import signal
 import sys
-import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import rclpy
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.session import RCLError
-
-_SAME_INTERRUPT = 1.0  # s between two interrupts that are one
+from fisheye_svp_ros.nodes.signals import SignalHandler
 
 
 def run(kinds: Sequence[type[BaseNode]], args: list[str] | None = None) -> int:
@@ -25,40 +21,29 @@ def run(kinds: Sequence[type[BaseNode]], args: list[str] | None = None) -> int:
 
     It is 2 for unusable arguments.
     """
-    signal.signal(signal.SIGINT, _interrupting_without_echo())
+    signals = SignalHandler()
     try:
         try:
-            rclpy.init(args=args)
+            rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+            executor = SingleThreadedExecutor()
         except Exception as error:
             return _refuse(kinds, f'ROS arguments or environment: {error}')
-        return _run(kinds)
-    except KeyboardInterrupt:
-        return 0
+        return _run(kinds, executor, signals)
+    finally:
+        signals.restore()
 
 
-def _interrupting_without_echo() -> Callable[..., None]:
-    """Return a handler: below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch.
-
-    The second one would end what the first one has begun to put away.  A later one counts again:
-    the first is lost where C code calls Python and drops its exceptions.
-    """
-    last = -math.inf
-
-    def interrupt(*_: Any) -> None:
-        nonlocal last
-        before, last = last, time.monotonic()
-        if last - before > _SAME_INTERRUPT:
-            raise KeyboardInterrupt
-
-    return interrupt
-
-
-def _run(kinds: Sequence[type[BaseNode]]) -> int:
+def _run(
+    kinds: Sequence[type[BaseNode]], executor: SingleThreadedExecutor, signals: SignalHandler
+) -> int:
     nodes: list[BaseNode] = []
     try:
+        signals.begin()
         for kind in kinds:
             nodes.append(kind())
-        _spin(nodes)
+            executor.add_node(nodes[-1])
+        signals.spin()
+        _spin(executor, nodes[0])
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except NodeFailure as error:
@@ -74,24 +59,21 @@ def _run(kinds: Sequence[type[BaseNode]]) -> int:
                 return _refuse(kinds, f'ROS 2: {error}')
             raise
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signals.end()
         for node in nodes:
             node.destroy_node()
         rclpy.try_shutdown()
     return 0
 
 
-def _spin(nodes: Sequence[BaseNode]) -> None:
-    executor = SingleThreadedExecutor()
-    for node in nodes:
-        executor.add_node(node)
+def _spin(executor: SingleThreadedExecutor, first: BaseNode) -> None:
     while rclpy.ok():
         try:
             executor.spin()
         except (ExternalShutdownException, NodeExit):
             raise
         except Exception as error:  # of the client library, about what came over the wire
-            nodes[0].unforeseen(error)
+            first.unforeseen(error)
 
 
 def _refuse(kinds: Sequence[type[BaseNode]], error: Exception | str) -> int:

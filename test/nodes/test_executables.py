@@ -18,6 +18,7 @@ from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT, NodeProcess
 
 from fisheye_svp_ros.nodes import NODES, base, executables, running
+from fisheye_svp_ros.nodes.signals import SignalHandler
 
 _CODE = """
 import sys
@@ -101,7 +102,7 @@ def test_ros_arguments_without_ros_args_are_refused(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize('after', [0.0, 0.3, 0.6, 1.0, 1.5, 2.2])
+@pytest.mark.parametrize('after', [0.0, 0.4, 0.8, 1.2])
 def test_a_signal_while_a_node_starts_ends_it_quietly(
     start, number: signal.Signals, after: float  # type: ignore[no-untyped-def]
 ) -> None:
@@ -154,6 +155,48 @@ def handler_kept() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_building_of_a_node_there_and_then(
+    ros_domain: int, number: signal.Signals, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str], handler_kept: None
+) -> None:
+    """What rclpy does on SIGTERM, to end the context, makes the rest of the start fail."""
+    def signaled(*_: object, **__: object) -> None:
+        os.kill(os.getpid(), number)
+        went_on.append(True)
+
+    went_on: list[bool] = []
+    monkeypatch.setattr(base.BaseNode, 'announce', signaled)
+    assert executables.run('localizer', args=[]) == 0
+    assert not went_on and capfd.readouterr().err == ''
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+def test_a_signal_before_there_is_a_node_or_that_c_code_dropped_ends_it(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str],
+    handler_kept: None
+) -> None:
+    def drop(*_: object, **__: object) -> None:
+        signals._raises = False  # as C code does that drops what its callbacks raise
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    def signaled(**given: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        init(**given)
+
+    init = running.rclpy.init
+    monkeypatch.setattr(running.rclpy, 'init', signaled)
+    monkeypatch.setattr(base.BaseNode, 'announce', lambda *_, **__: pytest.fail('it goes on'))
+    assert executables.run('localizer', args=[]) == 0
+    monkeypatch.undo()
+    monkeypatch.setenv('ROS_DOMAIN_ID', str(ros_domain))
+    signals = SignalHandler()
+    monkeypatch.setattr(running, 'SignalHandler', lambda: signals)
+    monkeypatch.setattr(base.BaseNode, 'introduce', drop)
+    assert executables.run('synthetic_camera', args=[]) == 0
+    assert 'Traceback' not in capfd.readouterr().err
 
 
 @pytest.mark.usefixtures('handler_kept')

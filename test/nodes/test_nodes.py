@@ -80,8 +80,7 @@ def test_one_set_carries_one_stamp_on_all_topics(graph: Callable[..., Graph]) ->
     points = g.hear(PointCloud2, 'image_points')
     g.start(SyntheticCamera)
     run_to_the_end(g)
-    g.until(lambda: len(points) == 2)
-    g.idle(0.2)
+    g.until(lambda: all(len(one) == 2 for one in (points, scenarios, poses, landmarks, info)))
     assert len(set(stamps(points))) == 2
     for heard in (scenarios, poses, landmarks, info):
         assert stamps(heard) == stamps(points)

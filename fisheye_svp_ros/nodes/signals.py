@@ -1,0 +1,61 @@
+"""What SIGINT and SIGTERM do to a process of nodes, from its arguments to its end."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+
+from rclpy.signals import SignalHandlerOptions, install_signal_handlers
+
+_SAME_INTERRUPT = 1.0  # s between two interrupts that are one
+_NUMBERS = signal.SIGINT, signal.SIGTERM
+
+
+class SignalHandler:
+    """Raises KeyboardInterrupt while nodes are built; once they spin, rclpy deals with SIGTERM.
+
+    rclpy ends the context between any two calls of the node that is being built, and what comes
+    next then fails in a way of its own.  So it gets its handlers when there is an executor to end.
+
+    Below `ros2 launch` Ctrl-C comes twice, from the terminal and from launch, and the second one
+    would end what the first one has begun to put away.  A later one counts again: the first is
+    lost where C code calls Python and drops its exceptions.
+    """
+
+    def __init__(self) -> None:
+        self._raises = self._spinning = self._pending = False
+        self._last = -math.inf
+        self._before = {number: signal.signal(number, self._handle) for number in _NUMBERS}
+
+    def _handle(self, number: int, _: object) -> None:
+        if number == signal.SIGTERM and self._spinning:
+            return
+        before, self._last = self._last, time.monotonic()
+        self._pending = True
+        if self._raises and self._last - before > _SAME_INTERRUPT:
+            raise KeyboardInterrupt
+
+    def begin(self) -> None:
+        """Raise KeyboardInterrupt on signals from now on, and if there was one already."""
+        self._raises = True
+        self._raise_pending()
+
+    def spin(self) -> None:
+        """Let an executor be ended by signals; raise KeyboardInterrupt if there was one."""
+        install_signal_handlers(SignalHandlerOptions.ALL)  # these call the ones above, too
+        self._spinning = True
+        self._raise_pending()
+
+    def end(self) -> None:
+        """Ignore signals from now on: everything is put away."""
+        self._raises, self._spinning = False, True
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def restore(self) -> None:
+        """Give SIGTERM back what it did before; SIGINT stays ignored while Python ends."""
+        signal.signal(signal.SIGTERM, self._before[signal.SIGTERM])
+
+    def _raise_pending(self) -> None:
+        if self._pending:
+            raise KeyboardInterrupt
