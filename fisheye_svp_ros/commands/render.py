@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import itertools
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -24,7 +23,7 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.reporting.progress import progress
 from fisheye_svp_ros.scene.observations import make_observations
-from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, render
+from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, pixel_rays, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
 Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
@@ -135,27 +134,28 @@ def write_photographs(
     Of a rig each camera has a folder; one that sees nothing of the target takes no photograph.
     truth: folder for the true corners, observations.csv, and poses.csv.
     """
-    count, taken = len(poses.position), 0
-    uv: list[Array] = []
-    seen: list[Array] = []
-    with progress('rendering', count * len(cameras)) as done:
-        for number, (camera, (name, (lens, place))) in itertools.product(
-                range(count), enumerate(cameras.items())):
-            pose = poses.take(number).compose(place)
-            for kept, part in zip((uv, seen), visible(lens, boards, pose), strict=True):
-                kept.append(part)
-            if seen[-1].any() or len(cameras) == 1:
+    count = len(poses.position)
+    uv, seen = (np.stack(part) for part in zip(*(
+        visible(lens, boards, poses.take(frame).compose(place))
+        for frame in range(count) for lens, place in cameras.values()), strict=True))
+    in_sight = np.asarray(seen.reshape(count, len(cameras), -1).any(axis=-1))
+    if len(cameras) == 1:
+        in_sight[:] = True
+    with progress('rendering', int(in_sight.sum())) as done:
+        for camera, (name, (lens, place)) in enumerate(cameras.items()):
+            rays = pixel_rays(lens)
+            for number in np.flatnonzero(in_sight[:, camera]).tolist():
                 rng = np.random.default_rng([seed, number, *([camera] if camera else [])])
-                image = render(lens, boards, pose, exposure, rng)
+                image = render(lens, boards, poses.take(number).compose(place), exposure, rng,
+                               rays=rays)
                 write_bytes(folder / name / f'{number:03d}.png',
                             cv2.imencode('.png', image)[1].tobytes())
-                taken += 1
-            done()
+                done()
     view, board, corner = np.nonzero(seen)
     frame, camera_of = np.divmod(view, len(cameras))
     points = np.stack([one.pose.transform(one.printed.corners) for one in boards])
     write_observations(truth / 'observations.csv', make_observations(
-        frame, board * points.shape[1] + corner, np.stack(uv)[view, board, corner],
+        frame, board * points.shape[1] + corner, uv[view, board, corner],
         points[board, corner], board=board, camera=camera_of, cameras=tuple(cameras)))
     write_poses(truth / 'poses.csv', np.arange(count), poses)
-    return taken
+    return int(in_sight.sum())

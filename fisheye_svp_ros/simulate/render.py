@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import back_project, project
+from fisheye_svp_ros.optics.camera import Rays
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 
@@ -123,22 +124,26 @@ def render(
     exposure: Exposure,
     rng: np.random.Generator,
     moved: Field | None = None,
+    rays: Rays | None = None,
 ) -> NDArray[np.uint8]:
     """Return a photograph (H, W) of a board from a camera's pose in the board's frame.
 
     printed: also the boards of a target, in whose frame the camera is then; none may hide another.
     moved: what else moves the image of a place (..., 2), m, on the board, px (..., 2): effects
-    that are not among the lens's own.  The same rng gives the same photograph.
+    that are not among the lens's own.  rays (H, W): `pixel_rays(lens)`, for many photographs of
+    one lens.  The same rng gives the same photograph.
     """
-    v, u = np.mgrid[:lens.height, :lens.width].astype(float)
-    uv = np.stack([u, v], axis=-1)
-    theta = back_project(lens, uv).theta
+    uv, rays = _pixels(lens), pixel_rays(lens) if rays is None else rays
+    theta = rays.theta
     light = np.full(theta.shape, _ROOM)
     boards = [BoardPose(printed, identity())] if isinstance(printed, Print) else printed
     window = _window(lens, boards, camera)
     part = uv[window]
     if part.size:
-        seen = sum(_of_board(lens, board, camera, exposure, part, moved) for board in boards)
+        parts = Rays(rays.origin[window], rays.direction[window], theta[window],
+                     rays.valid[window])
+        seen = sum(_of_board(lens, board, camera, exposure, part, parts, moved)
+                   for board in boards)
         light[window] = _lens_blur(
             np.asarray(_ROOM + seen, np.float32), theta[window], exposure, lens.max_incidence)
     outwards = np.nan_to_num(theta / lens.max_incidence)
@@ -149,6 +154,17 @@ def render(
     scatter = exposure.noise * np.sqrt(0.5 + np.clip(level, 0, 255) / 255)
     level = np.round(level + scatter * rng.standard_normal(level.shape))
     return np.asarray(np.clip(level, 0, 255), dtype=np.uint8)
+
+
+def pixel_rays(lens: Lens) -> Rays:
+    """Return the rays of all pixels (H, W), camera frame."""
+    return back_project(lens, _pixels(lens))
+
+
+def _pixels(lens: Lens) -> Array:
+    """Return the image points of all pixels (H, W, 2)."""
+    v, u = np.mgrid[:lens.height, :lens.width].astype(float)
+    return np.stack([u, v], axis=-1)
 
 
 def _window(lens: Lens, boards: Sequence[BoardPose], camera: Pose) -> tuple[slice, slice]:
@@ -172,37 +188,41 @@ def _window(lens: Lens, boards: Sequence[BoardPose], camera: Pose) -> tuple[slic
 
 
 def _of_board(
-    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array, moved: Field | None
+    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array, rays: Rays,
+    moved: Field | None,
 ) -> NDArray[np.float32]:
-    """Return what a board adds to the light of the parts of pixels uv (H, W, 2)."""
-    places = _board_xy(lens, board, camera, exposure, uv)
+    """Return what a board adds to the light of the parts of pixels uv (H, W, 2), rays (H, W)."""
+    places = _board_xy(lens, board, camera, exposure, uv, rays)
     if moved is not None:
         for _ in range(3):
             # The image of a place is moved: look where the unmoved image of what is seen lies.
-            off = moved(_is_near_sheet(places, board.printed))
-            places = _board_xy(lens, board, camera, exposure, uv - off)
+            unmoved = uv - moved(_is_near_sheet(places, board.printed))
+            places = _board_xy(lens, board, camera, exposure, unmoved,
+                               back_project(lens, unmoved))
     return _light(board.printed, places) - np.float32(_ROOM)
 
 
-def _board_xy(lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array) -> Array:
+def _board_xy(
+    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array, rays: Rays
+) -> Array:
     """Return which place (H, W, 2), m, of the board is seen at uv (H, W, 2), px; NaN for none."""
-    flat = uv.reshape(-1, 2)
-    parts = [
-        _board_share(lens, board, camera, exposure, flat[i:i + _CHUNK])
-        for i in range(0, len(flat), _CHUNK)
-    ]
-    return np.concatenate(parts).reshape(uv.shape)
+    line = uv[..., 1].ravel() - (lens.height - 1) / 2
+    origin, direction = rays.origin.reshape(-1, 3), rays.direction.reshape(-1, 3)
+    parts = [slice(i, i + _CHUNK) for i in range(0, len(line), _CHUNK)]
+    return np.concatenate([
+        _board_share(board, camera, exposure, line[part], origin[part], direction[part])
+        for part in parts
+    ]).reshape(uv.shape)
 
 
 def _board_share(
-    lens: Lens, board: BoardPose, camera: Pose, exposure: Exposure, uv: Array
+    board: BoardPose, camera: Pose, exposure: Exposure, line: Array, origin: Array,
+    direction: Array,
 ) -> Array:
+    """Return places (N, 2) of rays (N, 3); line (N,): rows of the image after the middle one."""
     printed = board.printed
-    rays = back_project(lens, uv)
-    origin, direction = rays.origin, rays.direction
     if exposure.line_time:
-        time = exposure.line_time * (uv[:, 1] - (lens.height - 1) / 2)
-        twist = time[:, None] * np.array(exposure.twist)
+        twist = (exposure.line_time * line)[:, None] * np.array(exposure.twist)
         place = camera.position + twist[:, :3]
         turn = rotation_from_vector(twist[:, 3:]) @ camera.rotation
         origin = (turn @ origin[..., None])[..., 0] + place

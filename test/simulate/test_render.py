@@ -13,7 +13,7 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.points import find_points, local_axes
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.camera import project
-from fisheye_svp_ros.simulate.render import Exposure, Field, Print, render
+from fisheye_svp_ros.simulate.render import Exposure, Field, Print, pixel_rays, render
 from fisheye_svp_ros.simulate.targets import TARGETS, board_views, target_views, visible
 
 QUIET = Exposure(noise=0.0)
@@ -79,6 +79,15 @@ def test_effects_given_in_the_image_move_the_corners() -> None:
     assert not isinstance(points, str)
     expected = true_corners(pose) + np.stack([8 * PRINTED.corners[:, 1], np.zeros(30)], axis=-1)
     assert np.abs(points.uv - expected[points.ids]).max() < 0.02
+
+
+def test_rays_computed_once_give_the_same_photographs() -> None:
+    rays = pixel_rays(LENS)
+    shutter = replace(QUIET, line_time=3e-5, twist=(0.3, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for pose, exposure in ((poses(2).take(0), QUIET), (poses(2).take(1), shutter)):
+        first, second = (render(LENS, PRINTED, pose, exposure, np.random.default_rng(0), rays=one)
+                         for one in (None, rays))
+        np.testing.assert_array_equal(first, second)
 
 
 def test_the_same_seed_gives_the_same_photograph() -> None:
