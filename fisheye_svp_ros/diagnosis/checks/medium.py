@@ -159,7 +159,8 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
         return None
     progress('asking whether the camera looks into another medium', 0.02)
     curve = fit_free_curve(data, base)
-    if not (_is_magnified(air, lens, curve) or _leaves_a_port(air, Linearization(data, curve, ()))):
+    if not (_is_magnified(air, lens, curve)
+            or _leaves_a_port(air, Linearization(data, curve, ()))):
         return None
     known = InAir.from_lens(lens)
     media = [_assess_port(table, lens, start_port(data, lens), free, 0.0)]
