@@ -65,7 +65,7 @@ class BaseNode(Node):  # type: ignore[misc]
             self.undeclare_parameter(name)
         self.settings = declare(self, self.SETTINGS, self.given)
         self._inputs: dict[str, Input] = {}
-        self._silences: set[str] = set()
+        self._silences: set[tuple[str, str]] = set()
         self._complaint = ''
         self._unforeseen: set[tuple[object, ...]] = set()
         self._failures = 0
@@ -279,12 +279,13 @@ class BaseNode(Node):  # type: ignore[misc]
             name, {**counts, **more, 'internal errors': self._failures}, now, text, level))
 
     def _explain_silence(self) -> str:
-        """Say what does not come, if that has been so for a while; log it once."""
-        silent = [ones for ones in silent_inputs(self.needed_inputs(), self._inputs)
-                  if ones[0].silent_for() > LIMIT]
-        texts = [explain_silence(self, ones) for ones in silent]
-        for text in texts:
-            if text not in self._silences:
-                self._silences.add(text)
-                self.get_logger().warning(text)
+        """Say what does not come, or comes no more; log it once, until it comes again."""
+        texts, reasons = [], set()
+        for ones in silent_inputs(self.needed_inputs(), self._inputs, LIMIT):
+            start, reason = explain_silence(self, ones)
+            texts.append(f'{start}: {reason}')
+            reasons.add((ones[0].resolved, reason))
+            if (ones[0].resolved, reason) not in self._silences:
+                self.get_logger().warning(texts[-1])
+        self._silences = reasons
         return '; '.join(texts)

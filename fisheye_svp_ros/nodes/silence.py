@@ -16,25 +16,33 @@ _MAX_PROPOSALS = 3  # topics to propose
 
 
 def silent_inputs(
-    needed: Iterable[Sequence[str]], inputs: dict[str, Input]
+    needed: Iterable[Sequence[str]], inputs: dict[str, Input], limit: float
 ) -> list[Sequence[Input]]:
-    """Return the inputs on which nothing has come.
+    """Return the inputs on which nothing has come, or comes any more.
 
-    needed: topics one of which has to come, each.
+    needed: topics one of which has to come, each; limit: s without a message.
     """
     open_ones = [[inputs[topic] for topic in topics if topic in inputs] for topics in needed]
-    return [ones for ones in open_ones if ones and all(one.silent_for() for one in ones)]
+    return [ones for ones in open_ones if ones and all(one.is_silent(limit) for one in ones)]
 
 
-def explain_silence(node: Any, inputs: Sequence[Input]) -> str:
-    """Say on which topic nothing comes, why, and what to do; inputs: alternatives."""
+def explain_silence(node: Any, inputs: Sequence[Input]) -> tuple[str, str]:
+    """Say on which topic nothing comes, and since when; and why, and what to do.
+
+    inputs: alternatives.
+    """
     publishers = {one: node.get_publishers_info_by_topic(one.resolved) for one in inputs}
     one = next((one for one, found in publishers.items() if found), inputs[0])
-    return f'nothing has come on {one.resolved}: {_reason(node, inputs, one, publishers[one])}'
+    one = next((known for known in inputs if known.has_come), one)
+    since = f' for {one.silent_for():.0f} s' if one.has_come else ''
+    return (f'nothing has come on {one.resolved}{since}',
+            _reason(node, inputs, one, publishers[one]))
 
 
 def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence[Any]) -> str:
     if not publishers:
+        if one.has_come:
+            return 'nobody publishes it any more; start its publisher again'
         return 'nobody publishes it; ' + _proposal(node, inputs)
     right = [info for info in publishers if info.topic_type == one.typename]
     if not right:
@@ -42,6 +50,9 @@ def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence
         return (f'it is published as {kinds}, and {one.typename} is needed; '
                 + _proposal(node, inputs))
     names = ', '.join(sorted({info.node_name for info in right}))
+    if one.has_come:
+        return (f'{names} is still connected; see whether it still gets data of its own, with '
+                f'ros2 topic hz {one.resolved}')
     offers = [info.qos_profile for info in right]
     if not any(_is_compatible(offered, asked) for offered in offers for asked in one.profiles):
         return (f'{names} offers {qos_words(offers[0])}, and this node asks for '

@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
 from fisheye_svp_ros.nodes.inputs import Count
 from fisheye_svp_ros.nodes.quality import create_with_qos, overridden
 
+_LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
 _MAX_HASHES = 100  # messages by which one subscription of a topic may be ahead of another
 
 _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
@@ -42,24 +43,48 @@ class Input:
         self._node, self._kind, self._receive = node, kind, receive
         self._qos, self._latched = qos, latched
         self._subscriptions: dict[_Kind, Any] = {}
-        self._since, self._before = 0.0, 0
+        self._since = self._first = self._latest = 0.0  # s
+        self._heard = 0
 
     @property
     def profiles(self) -> list[Any]:
         """What is asked for; empty while the node does not listen."""
         return [one.qos_profile for one in self._subscriptions.values()]
 
+    @property
+    def has_come(self) -> bool:
+        """Whether a message has come since the node listens."""
+        return self._heard > 0
+
     def silent_for(self) -> float:
-        """Return for how many seconds it has been listened to in vain; 0 if it has not."""
-        waits = self._subscriptions and self.count.received == self._before
-        return time.monotonic() - self._since if waits else 0.0
+        """Return for how many seconds nothing has come; 0 while the node does not listen."""
+        if not self._subscriptions:
+            return 0.0
+        return time.monotonic() - (self._latest if self._heard else self._since)
+
+    def is_silent(self, limit: float) -> bool:
+        """Say whether nothing has come for `limit` seconds, or for what is long on this topic.
+
+        What is latched has come for good; else three times the mean interval is long.
+        """
+        if self._heard and self._latched:
+            return False
+        interval = (self._latest - self._first) / max(self._heard - 1, 1)
+        return self.silent_for() > max(limit, _LONG_INTERVALS * interval)
 
     def subscribe(self) -> None:
         """Listen."""
-        self._since, self._before = time.monotonic(), self.count.received
-        self._filter = DuplicateFilter(self._receive, self._latched)
+        self._since, self._heard = time.monotonic(), 0
+        self._first = self._latest = self._since
+        self._filter = DuplicateFilter(self._hear, self._latched)
         reliable = self._qos.reliability != ReliabilityPolicy.BEST_EFFORT
         self._add_subscription((reliable, False), self._qos)
+
+    def _hear(self, data: bytes) -> None:
+        self._latest = time.monotonic()
+        self._first = self._first if self._heard else self._latest
+        self._heard += 1
+        self._receive(data)
 
     def unsubscribe(self) -> None:
         """Listen no more."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from fisheye_svp_ros.nodes.detector import Detector
 from fisheye_svp_ros.nodes.localizer import Localizer
 from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
+from fisheye_svp_ros.nodes.subscriptions import Input
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
@@ -151,6 +153,15 @@ def large_images(hour: Hour, pattern: str) -> None:
     hour.says(pattern)
 
 
+@tries('Data stop: their publisher gets none any more, or has ended')
+def data_stop(hour: Hour, pattern: str) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    points = g.tell(PointCloud2, 'image_points')
+    points.publish(image_points())
+    hour.says(pattern)
+
+
 @tries('No errors: true poses have stamps of their own, and are far apart')
 def far_poses(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
@@ -265,11 +276,49 @@ def test_it_says_nothing_where_something_comes(hour: Hour) -> None:
     g = hour.begin(*SOLVING)
     g.start(Localizer)
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
-    told.publish(landmarks())
-    points.publish(image_points())
-    g.idle(2.5)
+    told.publish(landmarks())  # once, and for good
+    g.until(lambda: (points.publish(image_points()), len(hour.reports) > 2)[1])
     last = hour.reports[-1].status[0]
     assert last.level == last.OK and last.message == 'all inputs usable'
+
+
+def test_data_that_stop_are_missed_until_they_come_again(hour: Hour) -> None:
+    g = hour.begin(*SOLVING)
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(landmarks())
+    for stopped in (r'nothing has come on /image_points for \d+ s: probe is still connected',
+                    r'nothing has come on /image_points for \d+ s: nobody publishes it any more'):
+        hour.reports.clear()
+        g.until(lambda: (points.publish(image_points()), any(
+            m.status[0].message == 'all inputs usable' for m in hour.reports))[1])
+        if 'nobody' in stopped:
+            g.probe.destroy_publisher(points)
+        hour.says(stopped)
+        hour.reports.clear()
+        g.until(lambda: len(hour.reports) > 1)
+        said = hour._capfd.readouterr().err
+        assert len(re.findall(stopped, said)) == 1 and '/landmarks for' not in said
+
+
+def test_a_slow_publisher_is_not_missed_between_its_messages(
+    monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr('fisheye_svp_ros.nodes.subscriptions.time',
+                        SimpleNamespace(monotonic=lambda: now[0]))
+    node = SimpleNamespace(resolve_topic_name=str)
+    one = Input(node, PointCloud2, 'image_points', lambda _: None, SENSOR, latched=False)
+    monkeypatch.setattr(one, '_add_subscription', lambda kind, _: one._subscriptions.update(
+        {kind: SimpleNamespace()}))
+    one.subscribe()
+    for time in (10.0, 20.0, 30.0):
+        now[0] = time
+        one._hear(b'')
+    silent = []
+    for now[0] in (36.0, 59.0, 61.0):
+        silent.append(one.is_silent(5.0))
+    assert silent == [False, False, True]
 
 
 def test_a_lens_that_is_named_needs_no_scenario(hour: Hour) -> None:
