@@ -100,10 +100,10 @@ def _gain_text(outcomes: Sequence[Outcome]) -> str:
     good = Rate(int((shares >= 0.95).sum()), shares.size)
     quantiles = ', '.join(f'{100 * q:.1f}' for q in np.quantile(shares, (0.05, 0.25, 0.5)))
     return (
-        'Gain: of the held-out misfit above noise that the true model takes away, the extended '
-        f'one takes at least 95 % in {good}; 5, 25 and 50 % of trials are below {quantiles} %; '
-        f'the mean is {100 * shares.mean():.1f} %. (Effects that move points, size 1, 15 frames '
-        'held out.)'
+        'Gain: the true model removes a part of the held-out residual variance above noise. The '
+        f'extended model removes at least 95 % of that part in {good}. 5, 25 and 50 % of trials '
+        f'are below {quantiles} %; the mean is {100 * shares.mean():.1f} %. (Effects that move '
+        'points, size 1, 15 frames held out.)'
     )
 
 
@@ -196,8 +196,8 @@ def _background(outcomes: Sequence[Outcome], directory: Path) -> str:
     return '\n'.join([
         '## With local errors in the background', '',
         'Every set has errors that no catalogue holds: offsets of single landmarks, a smooth '
-        'field over the image, one anew in each frame, in random parts, and up to 1 % of points '
-        'far off. '
+        'field over the image, another one in each frame, in random proportions, and up to 1 % '
+        'outliers. '
         'Their RMS over the noise, poses and free intrinsics fitted, is 0.1 to 1. Half the sets '
         'have an effect of size 1 beside them.', '',
         _table(['background over the noise', 'effect named', 'interval', 'another name beside it',

@@ -41,9 +41,9 @@ class Outcome:
 
     causes: each named effect with its class; hit: whether every hidden effect is among them;
     extra: named effects whose class holds nothing hidden; oracle: whether it finds each hidden
-    effect; recovered: held-out misfit above noise that the extended model takes away, over what
-    the true one does; errors: of parameters, over their standard errors; p_values: of the first
-    screening; trace: its steps; background: rms of nameless local errors, over the noise.
+    effect; recovered: held-out residual variance above noise that the extended model removes, over
+    what the true one does; errors: of parameters, over their standard errors; p_values: of the
+    first screening; trace: its steps; background: rms of nameless local errors, over the noise.
     """
 
     task: Task
@@ -268,7 +268,7 @@ def _errors(case: Case, task: Task, found: Diagnosis) -> dict[str, float]:
 
 
 def _recovered(case: Case, found: Diagnosis) -> float | None:
-    """Return (before - after) / (before - true model) of the held-out misfit, px^2."""
+    """Return (before - after) / (before - true model) of the held-out residual variance, px^2."""
     if not (case.hidden[0].moves and case.hidden[0].lasting):
         return None
     moves = np.where(case.scene.seen[..., None], case.exact - case.ideal, 0.0)

@@ -3,7 +3,7 @@
 A camera photographs one board 15 to 35 times. Its viewpoint moves by 0, 3 or 7 mm (e0), the board
 is bent by 0, 0.4 or 1.2 mm. Beside that everything has errors of its own: corners and paper, a
 radial ripple and a decentering that the lens's model has no place for, a smooth static image
-field, another one in every photograph, points far off, points not found. The lens is calibrated as
+field, another one in every photograph, outliers, points not found. The lens is calibrated as
 Kannala-Brandt and diagnosed; then once more with the shift taken in, so that e0 is estimated
 whether it is named or not.
 

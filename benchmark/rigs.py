@@ -8,6 +8,7 @@ at our lenses: without a start it refuses these views.  Writes docs/results/rigs
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from time import process_time
@@ -133,12 +134,12 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     inside = (np.abs(z) < stats.norm.ppf(0.975)).mean()
     lines = [
         '# Rigs of four cameras', '',
-        'Written by `python -m benchmark.rigs` (`make rigs`). Four cameras of 1280 x 800 px, 180 '
-        'deg, 90 deg apart on a circle of 0.1 m, see a board of 9 x 6 corners in '
-        f'{_SEAMS} photographs between two of them and in {_FRAMES - _SEAMS} before one; '
-        f'{_NOISE_PX} px of noise, lenses unknown. {len(outcomes)} trials. OpenCV '
-        f'{cv2.__version__}: `cv2.calibrateMultiview` with fisheye models, started at our lenses; '
-        'without a start it refuses these views.', '',
+        'Written by `python -m benchmark.rigs` (`make rigs`). Four cameras of 1280 x 800 px and '
+        '180 deg stand 90 deg apart on a circle of 0.1 m. They photograph a board of 9 x 6 '
+        f'corners: {_SEAMS} photographs between two cameras, {_FRAMES - _SEAMS} before one. '
+        f'{_NOISE_PX} px of noise, unknown lenses, {len(outcomes)} trials. OpenCV '
+        f'{cv2.__version__} is `cv2.calibrateMultiview` with fisheye models. It starts at our '
+        'lenses, since it refuses these views without a start.', '',
         '| | place, mm | turn, deg | processor time, s |', '|---|---|---|---|',
     ]
     for name, errors, which in (('ours', [one.ours for one in outcomes], 0),
@@ -146,12 +147,13 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
         place, turn = np.median(np.array(errors), axis=0)
         took = np.median([one.seconds[which] for one in outcomes])
         lines.append(f'| {name} | {1e3 * place:.3f} | {np.degrees(turn):.4f} | {took:.1f} |')
-    lines += ['', 'Medians of the rms errors of the three cameras in the first one; ours with '
-              'standard errors of lenses and rig, OpenCV states none.', '',
+    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. OpenCV '
+              'states no standard errors.', '',
               f'Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie within 1.96 '
-              'of their standard errors: more than 95 %, since the errors of the lenses count '
-              'every shape of the target that the data admit.', '']
-    write_text(path, '\n'.join(lines))
+              'of their standard errors. That is more than 95 %, since the errors of the lenses '
+              'count every shape of the target that the data admit.', '']
+    write_text(path, '\n'.join(textwrap.fill(line, 100, break_on_hyphens=False)
+                               for line in lines))
 
 
 if __name__ == '__main__':

@@ -58,7 +58,7 @@ class _Worker:
 def bounded_map(
     function: Callable[[Any], Any], items: Iterable[Any], seconds: float
 ) -> Iterator[tuple[int, Any]]:
-    """Yield (number of the item, function(item)) as they are done, or (number, Late).
+    """Yield (number of the item, function(item)) as they are done, or (number, TimedOut).
 
     function: importable; a process that takes longer than `seconds` over an item is replaced.
     """
@@ -115,7 +115,7 @@ class BoundedCalls:
         self._busy = True
 
     def result(self) -> Any:
-        """Return the result of a call, Late in its place; None while there is nothing new."""
+        """Return the result of a call, or TimedOut; None while there is nothing new."""
         worker, result = self._worker, None
         if not self._busy:
             return None
