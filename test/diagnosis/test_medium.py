@@ -48,6 +48,17 @@ def test_water_is_named_and_measured(lens, others):
     assert 'in air, too' not in verdict_sentences(found)[2]
 
 
+def test_coarse_points_in_air_are_no_reason_to_fit_a_port(monkeypatch):
+    """A free lens curve explains next to nothing of noise of 1.5 px."""
+    def start_port(*_):
+        raise AssertionError('a port was fitted')
+
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.checks.medium.start_port', start_port)
+    found = diagnose(photographs(AIR, None, 8, noise=1.5), AIR,
+                     options=DiagnosisOptions(quick=True))
+    assert medium_of(found) is None
+
+
 def test_glass_that_stood_in_for_a_cause_is_gone_with_it():
     """The lens was off in air: so many millimetres of glass, even below none, would undo that."""
     rng = np.random.default_rng(0)
