@@ -14,6 +14,7 @@ Other rooms import what stands here, and nothing else.
 from fisheye_svp_ros.diagnosis.advice import (
     DIAGNOSE_AIR,
     RETAKE,
+    TURNED,
     UNLIKE,
     USE_EXTENDED,
     Advice,
@@ -70,6 +71,7 @@ __all__ = [
     'RETAKE',
     'SIGNIFICANCE',
     'STAGE_OF',
+    'TURNED',
     'UNLIKE',
     'USE_EXTENDED',
     'Advice',

@@ -10,6 +10,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.diagnosis.causes import Cause
 from fisheye_svp_ros.diagnosis.checks.medium import Medium
+from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
 from fisheye_svp_ros.diagnosis.variance_budget import Component
@@ -20,7 +21,7 @@ from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
                 'that: the lens was off in air')
 USE_EXTENDED = 'solve with the extended lens file'
-RETAKE, UNLIKE = 'retake', 'unlike'
+RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
 
@@ -29,8 +30,8 @@ _MAX_LISTED = 8
 class Advice:
     """One thing to do: what, to which frames, landmarks and boards; gain: of held-out variance.
 
-    photographs: the files of the frames, as far as they are known; kind: RETAKE, or UNLIKE where
-    the other frames do not predict these.
+    photographs: the files of the frames, as far as they are known; kind: RETAKE, UNLIKE where
+    the other frames do not predict these, or TURNED where their board is numbered otherwise.
     """
 
     what: str
@@ -64,6 +65,23 @@ def advise(
         advice += _calibrate_in_air(evaluation.medium, causes)
     # Advice without a figure keeps its order, after all that has one.
     return sorted(advice, key=lambda one: -one.gain)
+
+
+def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
+    """Return what to do about photographs whose board is numbered from another end."""
+    words = ((True, 'are', 'diagnosed in the order of the others; number them so'),
+             (False, 'may be', 'diagnosed as they are; look at them'))
+    advice = []
+    for corrected, are, what in words:
+        mine = [one for one in turned if one.corrected == corrected]
+        if mine:
+            least = min(one.odds for one in mine)
+            names = [one.photograph for one in mine if not one.photograph.startswith('frame ')]
+            advice.append(Advice(
+                f'corners {are} numbered from another end of the board in {len(mine)} of the '
+                f'photographs (odds {least:.2g} to 1 or more): {what}',
+                frames=[one.frame for one in mine], photographs=names, kind=TURNED))
+    return advice
 
 
 def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]:

@@ -11,11 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fisheye_svp_ros.diagnosis.advice import Advice, advise
+from fisheye_svp_ros.diagnosis.advice import Advice, advise, turn_advice
 from fisheye_svp_ros.diagnosis.averaging import AveragedModel
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
 from fisheye_svp_ros.diagnosis.checks.robot_poses import find_hand_eye, prepare_problem
+from fisheye_svp_ros.diagnosis.checks.turned_boards import (
+    TurnedFrame,
+    find_turned_frames,
+    turn_frames,
+)
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
 from fisheye_svp_ros.diagnosis.checks.two_datasets import (
     DatasetModel,
@@ -76,7 +81,8 @@ class SearchRecord(NamedTuple):
     """What else was tried: steps, what could not be tested and why, outliers, cross-checks.
 
     cameras: what each two cameras of a rig say of each other; against: what another data set says;
-    hand_eye: where the camera sits on the robot whose poses were given.
+    hand_eye: where the camera sits on the robot whose poses were given; turned: frames whose
+    board is numbered from another end.
     """
 
     trace: list[TraceStep]
@@ -85,6 +91,7 @@ class SearchRecord(NamedTuple):
     cameras: list[TwoCameras]
     against: TwoDatasets | None = None
     hand_eye: HandEye | None = None
+    turned: Sequence[TurnedFrame] = ()
 
 
 @dataclass(frozen=True)
@@ -308,6 +315,7 @@ class Diagnosis:
             'uncertainty': self.uncertainty,
             'trace': [asdict(step) for step in self.trace],
             **({'external': external} if external else {}),
+            'turned': [asdict(one) for one in self.record.turned],
             **({'hand_eye': self.hand_eye.to_dict()} if self.hand_eye else {}),
         }
 
@@ -377,8 +385,13 @@ def diagnose_against(
     return replace(found, record=found.record._replace(against=datasets))
 
 
-def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
-    """Take checked inputs through all stages."""
+def _run_stages(
+    inputs: Inputs, progress: Progress, turned: Sequence[TurnedFrame] = ()
+) -> Diagnosis:
+    """Take checked inputs through all stages, again where frames were in another order.
+
+    turned: the frames that were brought into the order of the others before.
+    """
     progress('fitting the simulation as it is', 0.0)
     problem, of_robot = prepare_problem(inputs)
     medium = find_medium(problem, progress)
@@ -393,7 +406,15 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
         one, FittedModel.solve_null_model(one.null), medium))
+    more = [] if turned or inputs.poses is not None else find_turned_frames(
+        evaluation.null, evaluation.fitted)
+    every = (*turned, *(one for one, _ in more))
+    if any(one.corrected for one in every[len(turned):]):
+        table = turn_frames(inputs.observations, more)
+        return _run_stages(replace(inputs, observations=table), progress, every)
     found = _conclude(evaluation, candidates, cameras)
+    found = replace(found, advice=[*turn_advice(every), *found.advice],
+                    record=found.record._replace(turned=every))
     if inputs.poses is None or not of_robot:
         return found
     hand_eye = find_hand_eye(found.model, inputs.poses)

@@ -183,6 +183,19 @@ class FittedModel:
         )[..., 0]
         return np.asarray(remaining * self.linear.row_mask)
 
+    def residuals_of_frames(self) -> Array:
+        """Return whitened residuals (F, M) beside what single frames have of their own alone.
+
+        What landmarks and the image have of their own is in them.
+        """
+        e, r = self.solution.e[..., None], self.solution.r[:, None]
+        eq = self.factored.equations
+        group, unit, shared = eq.split(e, r)
+        rows = predict_rows(self.random.columns, self.pose_columns, group, 0 * unit, 0 * shared,
+                            eq.units)[..., 0]
+        values = self.linear.shared_columns @ (self.solution.values / self.scale)
+        return np.asarray((self.linear.residual - rows - values) * self.linear.row_mask)
+
     def leverages(self) -> Array:
         """Return the diagonal (F, M) of the hat matrix, from random signs.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.diagnosis import (
     DIAGNOSE_AIR,
+    TURNED,
     USE_EXTENDED,
     Advice,
     Cause,
@@ -293,7 +294,8 @@ def _next_step(d: Diagnosis) -> str:
     lens = lens_words(d)
     if d.verdict == 'adequate':
         blind = f'; not testable here: {join_names(list(d.untestable))}' if d.untestable else ''
-        return '; '.join([lens, *_rig_advice(d)]) + f'{blind}.'
+        turned = [advice_text(one) for one in d.advice if one.kind == TURNED]
+        return '; '.join([lens, *_rig_advice(d), *turned]) + f'{blind}.'
     steps = [lens, *_rig_advice(d)]
     steps += [
         f'find out why {join_names(pair.cameras)} contradict each other about the target: was it '
