@@ -20,7 +20,7 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging image-field guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -82,6 +82,10 @@ blind-independent: $(VENV)/ready
 # What averaging over a viewpoint shift is worth, into docs/results/averaging.md and a picture.
 averaging: $(VENV)/ready
 	$(BIN)/python -m benchmark.averaging --sets 120
+
+# What the image field in a lens file is worth, into docs/results/image_field.md.
+image-field: $(VENV)/ready
+	$(BIN)/python -m benchmark.image_field --sets 30
 
 # The live guide tried on rendered images by somebody who holds the board, into docs/results/next/.
 guided: $(VENV)/ready

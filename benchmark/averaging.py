@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,10 +77,16 @@ def image_points(lens: Lens, points: Array) -> tuple[Array, Array]:
     return [lens.cx, lens.cy] + (height / radius)[:, None] * points[:, :2], theta
 
 
-def draw_set(seed: int) -> tuple[Observations, Lens]:
-    """Draw five to eight photographs of a board, and the lens that took them."""
+def draw_set(
+    seed: int, frames: tuple[int, int] = (5, 9), warp: Callable[[Array], Array] | None = None
+) -> tuple[Observations, Lens]:
+    """Draw photographs of a board, and the lens that took them.
+
+    frames: least number, and one more than the most; warp: displacements (N, 2), px, of image
+    points (N, 2).
+    """
     rng = np.random.default_rng(seed)
-    lens, frames, noise = draw_lens(rng), int(rng.integers(5, 9)), rng.uniform(0.03, 0.2)
+    lens, count, noise = draw_lens(rng), int(rng.integers(*frames)), rng.uniform(0.03, 0.2)
     columns, rows = int(rng.integers(7, 11)), int(rng.integers(6, 9))
     flat = rng.uniform(0.02, 0.035) * np.stack(
         [*np.meshgrid(np.arange(columns), np.arange(rows)), np.zeros((rows, columns))],
@@ -91,7 +97,7 @@ def draw_set(seed: int) -> tuple[Observations, Lens]:
     true = flat + rng.normal(0, 2.5e-5, flat.shape)
     true[:, 2] += bend @ [u * u, u * v, v * v]
     seen: list[tuple[Index, Array]] = []
-    while len(seen) < frames:
+    while len(seen) < count:
         turned = rotation_from_vector(np.append(rng.uniform(-0.8, 0.8, 2), rng.uniform(-0.6, 0.6)))
         angle, azimuth = rng.uniform(0, 0.75 * lens.max_incidence), rng.uniform(0, 2 * np.pi)
         axis = np.array([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth),
@@ -104,8 +110,9 @@ def draw_set(seed: int) -> tuple[Observations, Lens]:
             uv < [WIDTH - 4, HEIGHT - 4]).all(axis=1) & (np.linalg.norm(there, axis=1) > 0.04) & (
             np.abs(there @ facing[:, 2]) > 0.2 * np.linalg.norm(there, axis=1))
         if kept.sum() >= 25:
-            seen.append((np.flatnonzero(kept), uv[kept] + rng.normal(0, noise, uv[kept].shape)))
-    number = np.repeat(np.arange(frames), [len(ids) for ids, _ in seen])
+            moved = uv[kept] if warp is None else uv[kept] + warp(uv[kept])
+            seen.append((np.flatnonzero(kept), moved + rng.normal(0, noise, moved.shape)))
+    number = np.repeat(np.arange(count), [len(ids) for ids, _ in seen])
     ids, uv = (np.concatenate(parts) for parts in zip(*seen, strict=True))
     return make_observations(number, ids, uv, flat[ids], source=f'set {seed}'), lens
 

@@ -210,6 +210,11 @@ class Diagnosis:
         """The viewpoint shifts that are written and not named."""
         return self.evaluation.averaged_model
 
+    def written_field_entry(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds of the image field: nothing where none is predicted."""
+        field = self.evaluation.written_field
+        return {} if field is None else {'image_field': field.to_dict()}
+
     @property
     def errors(self) -> ModelErrors:
         """What is known of the errors of the model whose lenses are written."""
@@ -300,7 +305,7 @@ class Diagnosis:
             'named': entry(self.figures.named),
             'lens': entry(self.figures.lens_only) | {
                 'ray_error_mrad': self.conclusion.ray_error_mrad(),
-                **self.averaged_model.to_dict()},
+                **self.averaged_model.to_dict(), **self.written_field_entry()},
             'extended': entry(self.figures.extended),
             **self.conclusion.to_dict(),
             'photographs': [
@@ -446,6 +451,10 @@ def _conclude(
     lenses = {
         name: conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
         for name, lens in lenses.items()}
+    field = evaluation.written_field
+    if field is not None:
+        lenses = {name: field.add_to(lens, camera)
+                  for camera, (name, lens) in enumerate(lenses.items())}
     return Diagnosis(
         evaluation,
         Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,

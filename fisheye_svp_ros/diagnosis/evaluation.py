@@ -27,6 +27,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
+from fisheye_svp_ros.diagnosis.image_fields import WrittenField
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
@@ -182,6 +183,11 @@ class Evaluation:
     def averaged_model(self) -> AveragedModel:
         """The model whose lens is written: with the shifts that may be there."""
         return AveragedModel.from_selection(self.selection)
+
+    @cached_property
+    def written_field(self) -> WrittenField | None:
+        """The image field that is written, or why it is not; None where none is predicted."""
+        return WrittenField.from_selection(self.selection, self.fitted)
 
     @cached_property
     def model_errors(self) -> ModelErrors:

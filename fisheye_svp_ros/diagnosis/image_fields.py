@@ -1,0 +1,208 @@
+"""The image field that is written: what every frame shows alike in the image, and no cause holds.
+
+It is made of the predicted random effects of the image, with those of frames and target beside
+them in the model.  It is written only where it predicts frames that took no part: every fourth
+frame is left out in turn, and no contiguous third refutes it.  The variances stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.arrays import Array, Index, Mask
+from fisheye_svp_ros.diagnosis.averaging import OpenShifts
+from fisheye_svp_ros.diagnosis.cross_validation import refit_shared
+from fisheye_svp_ros.diagnosis.effect_forms import bump_values
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.random_effects import ImageGrid
+from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.mixed_model import (
+    Variances,
+    factor_equations,
+    make_equations,
+    posterior_covariance,
+    predict_rows,
+    solve_equations,
+)
+from fisheye_svp_ros.optics.image_field import MAX_NODES, MIN_NODES, ImageField
+from fisheye_svp_ros.optics.lens import Lens
+
+FOLDS, BLOCKS = 4, 3  # every fourth frame; contiguous thirds
+MIN_GAIN = 0.01  # of the rms of frames that are left out
+_BROAD = 'image_broad'  # what poses and intrinsics nearly take up
+_PITCH, _EDGE = 0.6, 2.0  # of the finest grid's: that of the spline, what lies around the bumps
+_DIGITS = 6  # px
+
+
+@dataclass(frozen=True)
+class WrittenField:
+    """The image fields of the cameras, by their number, and rms px of frames left out.
+
+    before, after: without and with it; refuted: frames, first and last of each contiguous third,
+    that the others predict worse with it; fields: none where it is not written.
+    """
+
+    before: float
+    after: float
+    refuted: tuple[tuple[int, int], ...]
+    fields: Mapping[int, ImageField]
+
+    @classmethod
+    def from_selection(cls, selection: Selection, fitted: FittedModel) -> WrittenField | None:
+        """Return what frames left out say of the predicted field.
+
+        None where there is nothing to predict, or several cameras have one lens.
+        """
+        data, lenses = fitted.linear.data, fitted.linear.state.lenses
+        if (not _of_field(fitted).any() or data.frames < 2 * FOLDS
+                or data.cameras > len(lenses)):
+            return None
+        variances, order = selection.null.variances, np.arange(data.frames)
+        squares = _hold_out(fitted, variances, order % FOLDS)
+        before, after = np.sqrt(2 * squares.sum(axis=0) / fitted.linear.row_mask.sum()).tolist()
+        if not after < (1 - MIN_GAIN) * before:
+            return cls(before, after, (), {})
+        block = order * BLOCKS // len(order)
+        squares = _hold_out(fitted, variances, block)
+        numbers = np.unique(data.views.frame)
+        refuted = tuple((int(mine[0]), int(mine[-1])) for i, (without, with_field)
+                        in enumerate(squares) if with_field > without
+                        for mine in [numbers[block == i]])
+        return cls(before, after, refuted, {} if refuted else _fields(selection, fitted))
+
+    def add_to(self, lens: Lens, camera: int) -> Lens:
+        """Return the lens of a camera with its field."""
+        field = self.fields.get(camera)
+        return lens if field is None else replace(lens, image_field=field)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what diagnosis.json holds."""
+        return {'written': bool(self.fields), 'without_px': self.before, 'with_px': self.after,
+                'refuted_by_frames': [list(ends) for ends in self.refuted],
+                'rms_px': max((field.rms for field in self.fields.values()), default=0.0)}
+
+
+def _of_field(fitted: FittedModel) -> Mask:
+    """Return which of the shared random columns the field is made of."""
+    mine = np.zeros(len(fitted.random.columns.shared_label), dtype=bool)
+    at = 0
+    for grid in fitted.random.grids:
+        mine[at : at + 2 * len(grid.centres)] = grid.name != _BROAD
+        at += 2 * len(grid.centres)
+    return mine
+
+
+def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
+    """Return squares (K, 2), px^2, of each fold of the frames, as the other folds predict them.
+
+    Without the field and with it; poses are fitted to the frames, the target is as predicted.
+    fold (F,): that of each frame.
+    """
+    linear = fitted.linear
+    squares = np.zeros((int(fold.max()) + 1, 2))
+    for k in range(len(squares)):
+        out = fold == k
+        whole, field = _predict(fitted, variances, out)
+        poses, weight = linear.frame_columns[out], linear.row_weight[out]
+        inverse = np.linalg.pinv(poses, rcond=1e-9)
+        left = linear.residual[out] - whole
+        for i, rows in enumerate((left + field, left)):
+            rest = rows - (poses @ (inverse @ rows[..., None]))[..., 0]
+            squares[k, i] = ((rest[weight > 0] / weight[weight > 0]) ** 2).sum()
+    return squares
+
+
+def _predict(
+    fitted: FittedModel, variances: Variances, out: Mask
+) -> tuple[Array, Array]:
+    """Return what the other frames predict of the rows (F, M) of some, and the field's part."""
+    linear, columns = fitted.linear, fitted.random.columns
+    height = linear.residual.shape[1]
+    row = np.arange(out.size * height).reshape(out.size, height)
+    trained, tested = (columns._replace(
+        group=columns.group[part], offset=columns.offset[part], unit=columns.unit[part],
+        shared=columns.shared[row[part].ravel()]) for part in (~out, out))
+    border = np.concatenate(
+        [linear.shared_columns / fitted.scale, linear.residual[..., None]], axis=-1)
+    eq = make_equations(trained, linear.frame_columns[~out], border[~out])
+    kept = factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight)
+    solution = solve_equations(kept)
+    _, unit, shared = kept.equations.split(solution.e[..., None], solution.r[:, None])
+    group = np.zeros((int(out.sum()), 6 + columns.group.shape[2], 1))
+    of_field = _of_field(fitted)
+    whole, field = (
+        predict_rows(tested, linear.frame_columns[out], group, offsets, values,
+                     kept.equations.units)[..., 0]
+        for offsets, values in ((unit, shared),
+                                (np.zeros_like(unit), np.where(of_field[:, None], shared, 0.0))))
+    fixed = linear.shared_columns[out] @ (solution.values / fitted.scale)
+    return whole + fixed, field
+
+
+def _fields(selection: Selection, fitted: FittedModel) -> dict[int, ImageField]:
+    """Return the predicted field of each camera, with what its lens has already."""
+    random, sigma = fitted.random, selection.null.variances.sigma
+    shared = _shared_coefficients(selection, fitted)
+    posterior = posterior_covariance(fitted.factored)
+    count = fitted.solution.e.size
+    root = sigma * fitted.factored.equations.split(
+        posterior.root[:count].reshape(*fitted.solution.e.shape, -1), posterior.root[count:])[2]
+    by_camera: dict[int, list[tuple[ImageGrid, Array, Array]]] = {}
+    at = 0
+    for grid in random.grids:
+        own = slice(at, at + 2 * len(grid.centres))
+        at = own.stop
+        if grid.name != _BROAD:
+            by_camera.setdefault(grid.camera, []).append((grid, shared[own], root[own]))
+    lenses = fitted.linear.state.lenses
+    return {camera: _field(parts, lenses[camera].image_field)
+            for camera, parts in by_camera.items()}
+
+
+def _shared_coefficients(selection: Selection, fitted: FittedModel) -> Array:
+    """Return the shared random coefficients (Q,) beside the shifts that are written."""
+    null, shifts = selection.null, OpenShifts.from_selection(selection)
+    at = null.columns_and_residual(shifts.columns)
+    information = null.information[np.ix_(at, at)]
+    _, _, combination = refit_shared(null, information, (), ())
+    likely = shifts.posterior(null, information)
+    combination[:-1] -= np.append(
+        likely.follow @ likely.mean, likely.mean * null.scale[shifts.columns])
+    whole = np.zeros(len(null.scale) + 1)
+    whole[at] = combination
+    e, r = null.factorization.coefficients(whole)
+    return null.equations.split(e[..., None], r[:, None])[2][:, 0]
+
+
+def _field(
+    parts: Sequence[tuple[ImageGrid, Array, Array]], known: ImageField | None
+) -> ImageField:
+    """Return the field of bumps: grid, coefficients, root of covariance; known: added to it."""
+    finest = min(grid.pitch for grid, _, _ in parts)
+    reach = [(grid.centres - _EDGE * grid.pitch, grid.centres + _EDGE * grid.pitch)
+             for grid, _, _ in parts]
+    low = np.min([one.min(axis=0) for one, _ in reach], axis=0)
+    high = np.max([one.max(axis=0) for _, one in reach], axis=0)
+    if known is not None:
+        low, high = np.minimum(low, known.nodes[0, 0]), np.maximum(high, known.nodes[-1, -1])
+    low = np.round(low)
+    columns, rows = (np.ceil((high - low) / (_PITCH * finest)).astype(int) + 1).clip(
+        MIN_NODES, MAX_NODES)
+    pitch = np.full(2, round(_PITCH * finest, _DIGITS))
+    nodes = ImageField(low, pitch, np.zeros((rows, columns, 2))).nodes
+    moved: Array = np.zeros((nodes.size // 2, 2))
+    spread = np.zeros((nodes.size // 2, 2, parts[0][2].shape[-1]))
+    for grid, values, root in parts:
+        bumps = bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
+        moved = moved + bumps @ values.reshape(-1, 2)
+        spread += (bumps @ root.reshape(len(grid.centres), -1)).reshape(spread.shape)
+    there = moved.reshape(nodes.shape)
+    if known is not None:
+        there = there + known.displacement(nodes)
+    stderr = np.sqrt((spread**2).sum(axis=-1).mean(axis=-1)).reshape(rows, columns)
+    field = ImageField.interpolate(low, pitch, there, np.round(stderr, _DIGITS))
+    return replace(field, values=np.round(field.values, _DIGITS))
