@@ -79,7 +79,7 @@ class OpenShifts(NamedTuple):
     def from_selection(cls, selection: Selection) -> OpenShifts:
         """Return the simplest shift of each camera that has neither a shift nor a port.
 
-        None where held-out frames refute one.
+        None where one is refuted, by held-out frames or by its size.
         """
         null = selection.null
         if (ViewpointShiftEffect.name in selection.refuted

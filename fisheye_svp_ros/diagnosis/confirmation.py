@@ -141,7 +141,7 @@ def confirm(
             doubt.effect, parameters_of(effect, values, evaluation.errors[columns]), test.p_value,
             doubt.why)
         selection = without_cause(selection, doubt.effect)
-        if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE):
+        if doubt.why in (REFUTED_BY_FRAMES, REFUTED_BY_FILE) or _implausible(effect, values):
             selection = replace(selection, refuted=(*selection.refuted, doubt.effect))
 
 

@@ -73,7 +73,7 @@ class Selection:
     """The causes that were found, in the null model around the state with them.
 
     first: the null model of the simulation, before any cause; trace: what was tried; refuted: by
-    held-out frames.
+    held-out frames, or since no lens can have so much.
     """
 
     problem: Problem

@@ -120,3 +120,11 @@ def test_ray_errors_are_stated_at_the_range_that_is_asked_for() -> None:
     assert 'ray error at 0.5 m' in first_screen(found, 'table').facts
     with pytest.raises(ParameterError, match='a distance in m'):
         DiagnosisOptions(range_m=0.0)
+
+
+def test_a_shift_that_no_lens_can_have_is_not_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.confirmation._FAR_SHIFT', 1e-3)
+    found = diagnosed(0.006, 0.02, options=DiagnosisOptions(quick=True))
+    why = {one.effect: one.why for one in found.candidates}
+    assert 'more than a lens can have' in why['viewpoint_shift']
+    assert found.lens.viewpoint_shift is None and not found.averaged_model.shifts
