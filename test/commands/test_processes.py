@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import signal
@@ -13,6 +14,7 @@ import pytest
 from helpers.nodes import need_ros, until
 
 from fisheye_svp_ros.cli import main
+from fisheye_svp_ros.commands import shared_memory
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments
 from fisheye_svp_ros.commands.sweep_file import lens_folder, read_sweep
@@ -82,6 +84,22 @@ def test_a_node_that_is_killed_leaves_no_shared_memory(tmp_path: Path, ros_domai
         remove_orphans(segments() - ended)
         assert _held(other) <= segments()
     assert not (left | ended) & segments()
+
+
+def test_shared_memory_of_a_living_process_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is its lock tried, which it might want at that moment; new segments have none yet."""
+    monkeypatch.setattr(shared_memory, '_FOLDER', tmp_path)
+    monkeypatch.setattr(shared_memory, '_is_locked', lambda lock: False)
+    held, orphan = (tmp_path / f'fastrtps_port{number}' for number in (1, 2))
+    for file in (held, orphan):
+        file.touch()
+        file.with_name(f'{file.name}_el').touch()
+    with held.with_name('fastrtps_port1_el').open('rb') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        remove_orphans(set())
+        assert held.exists() and not orphan.exists()
 
 
 def _runs(pid: int) -> bool:
