@@ -67,6 +67,7 @@ setup(
             # pytest-xdist 3.8 does not see its groups in pytest 9.2.
             'pytest>=7.4,<9.2', 'pytest-xdist>=3.3', 'mpmath>=1.3', 'psutil>=5.9',
             'hypothesis>=6.80', 'pytest-cov>=4.1', 'jsonschema>=4.10', 'statsmodels>=0.14',
+            'pytest-rerunfailures>=12.0',
         ],
         'docs': ['sphinx>=7.2', 'myst-parser>=2.0', 'furo'],
         # mypy takes the types of NumPy 2.5, which are written for Python 3.12, for others.

@@ -43,11 +43,18 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
         remove_orphans(_SEGMENTS)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep what needs the compiled engine in one process, so that it is compiled once."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Keep what needs the compiled engine in one process, so that it is compiled once.
+
+    Processes that talk are at the mercy of the machine: such a test that fails runs once more.
+    """
+    again = config.pluginmanager.hasplugin('rerunfailures')
     for item in items:
-        if {'engine', 'compiled'} & set(getattr(item, 'fixturenames', ())):
+        fixtures = set(getattr(item, 'fixturenames', ()))
+        if {'engine', 'compiled'} & fixtures:
             item.add_marker(pytest.mark.xdist_group('engines'))
+        if again and 'ros_domain' in fixtures:
+            item.add_marker(pytest.mark.flaky(reruns=1))
 
 
 @pytest.fixture(autouse=True)

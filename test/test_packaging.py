@@ -28,7 +28,7 @@ ROSDEP = {
     'pytest': 'python3-pytest', 'pytest-xdist': 'python3-pytest-xdist',
     'pytest-cov': 'python3-pytest-cov', 'jsonschema': 'python3-jsonschema',
     'hypothesis': 'python3-hypothesis', 'psutil': 'python3-psutil', 'mpmath': None,
-    'statsmodels': None,
+    'statsmodels': None, 'pytest-rerunfailures': None,
 }
 
 

@@ -55,7 +55,7 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
                                    start_new_session=True, stdout=stream,
                                    stderr=subprocess.STDOUT)
         try:
-            status = process.wait(240)
+            status = process.wait(120)
         finally:
             with suppress(ProcessLookupError):  # what a block that failed has left behind
                 os.killpg(process.pid, signal.SIGKILL)
