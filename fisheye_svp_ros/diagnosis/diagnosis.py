@@ -390,13 +390,35 @@ def diagnose_against(
     return replace(found, record=found.record._replace(against=datasets))
 
 
-def _run_stages(
-    inputs: Inputs, progress: Progress, turned: Sequence[TurnedFrame] = ()
-) -> Diagnosis:
-    """Take checked inputs through all stages, again where frames were in another order.
+class _Evaluated(NamedTuple):
+    """What the stages up to the evaluation return; of_robot: the poses are those of a flange."""
 
-    turned: the frames that were brought into the order of the others before.
-    """
+    evaluation: Evaluation
+    candidates: list[UnconfirmedCause]
+    cameras: list[TwoCameras]
+    of_robot: bool
+
+
+def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
+    """Take checked inputs through all stages, twice where frames were in another order."""
+    evaluated = _evaluate(inputs, progress)
+    turned = [] if inputs.poses is not None else find_turned_frames(
+        evaluated.evaluation.null, evaluated.evaluation.fitted)
+    if any(one.corrected for one, _ in turned):
+        table = turn_frames(inputs.observations, turned)
+        evaluated = _evaluate(replace(inputs, observations=table), progress)
+    found = _conclude(evaluated.evaluation, evaluated.candidates, evaluated.cameras)
+    frames = tuple(one for one, _ in turned)
+    found = replace(found, advice=[*turn_advice(frames), *found.advice],
+                    record=found.record._replace(turned=frames))
+    if inputs.poses is None or not evaluated.of_robot:
+        return found
+    hand_eye = find_hand_eye(found.model, inputs.poses)
+    return replace(found, record=found.record._replace(hand_eye=hand_eye))
+
+
+def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
+    """Take checked inputs through the stages up to the evaluation of confirmed causes."""
     progress('fitting the simulation as it is', 0.0)
     problem, of_robot = prepare_problem(inputs)
     medium = find_medium(problem, progress)
@@ -411,19 +433,7 @@ def _run_stages(
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
         one, FittedModel.solve_null_model(one.null), medium))
-    more = [] if turned or inputs.poses is not None else find_turned_frames(
-        evaluation.null, evaluation.fitted)
-    every = (*turned, *(one for one, _ in more))
-    if any(one.corrected for one in every[len(turned):]):
-        table = turn_frames(inputs.observations, more)
-        return _run_stages(replace(inputs, observations=table), progress, every)
-    found = _conclude(evaluation, candidates, cameras)
-    found = replace(found, advice=[*turn_advice(every), *found.advice],
-                    record=found.record._replace(turned=every))
-    if inputs.poses is None or not of_robot:
-        return found
-    hand_eye = find_hand_eye(found.model, inputs.poses)
-    return replace(found, record=found.record._replace(hand_eye=hand_eye))
+    return _Evaluated(evaluation, candidates, cameras, of_robot)
 
 
 def _conclude(

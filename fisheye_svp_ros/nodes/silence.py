@@ -33,15 +33,15 @@ def explain_silence(node: Any, inputs: Sequence[Input]) -> tuple[str, str]:
     """
     publishers = {one: node.get_publishers_info_by_topic(one.resolved) for one in inputs}
     one = next((one for one, found in publishers.items() if found), inputs[0])
-    one = next((known for known in inputs if known.has_come), one)
-    since = f' for {one.silent_for():.0f} s' if one.has_come else ''
+    one = next((known for known in inputs if known.has_messages), one)
+    since = f' for {one.silent_for():.0f} s' if one.has_messages else ''
     return (f'nothing has come on {one.resolved}{since}',
             _reason(node, inputs, one, publishers[one]))
 
 
 def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence[Any]) -> str:
     if not publishers:
-        if one.has_come:
+        if one.has_messages:
             return 'nobody publishes it any more; start its publisher again'
         return 'nobody publishes it; ' + _proposal(node, inputs)
     right = [info for info in publishers if info.topic_type == one.typename]
@@ -50,7 +50,7 @@ def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence
         return (f'it is published as {kinds}, and {one.typename} is needed; '
                 + _proposal(node, inputs))
     names = ', '.join(sorted({info.node_name for info in right}))
-    if one.has_come:
+    if one.has_messages:
         return (f'{names} is still connected; see whether it still gets data of its own, with '
                 f'ros2 topic hz {one.resolved}')
     offers = [info.qos_profile for info in right]

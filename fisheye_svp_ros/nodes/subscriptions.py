@@ -52,7 +52,7 @@ class Input:
         return [one.qos_profile for one in self._subscriptions.values()]
 
     @property
-    def has_come(self) -> bool:
+    def has_messages(self) -> bool:
         """Whether a message has come since the node listens."""
         return self._heard > 0
 

@@ -155,12 +155,11 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     ):
         return None
     air = problem.linear
-    if not (_is_magnified(air, lens, base) if free else rms_px(air) > _SUSPICIOUS_PX):
+    if not (_is_magnified(air, lens, air) if free else rms_px(air) > _SUSPICIOUS_PX):
         return None
     progress('asking whether the camera looks into another medium', 0.02)
-    curve = fit_free_curve(data, base)
-    if not (_is_magnified(air, lens, curve)
-            or _leaves_a_port(air, Linearization(data, curve, ()))):
+    curve = Linearization(data, fit_free_curve(data, base), ())
+    if not (_is_magnified(air, lens, curve) or _leaves_room_for_port(air, curve)):
         return None
     known = InAir.from_lens(lens)
     media = [_assess_port(table, lens, start_port(data, lens), free, 0.0)]
@@ -230,7 +229,7 @@ def _assess_port(
         bool(criteria[1] < criteria[0]), criteria[0] - criteria[1], moved > 0, _focal_error(lens))
 
 
-def _leaves_a_port(air: Linearization, curve: Linearization) -> bool:
+def _leaves_room_for_port(air: Linearization, curve: Linearization) -> bool:
     """Return whether what a free lens curve explains, or cannot fit, leaves room for a port.
 
     Where the curve explains little of a misfit in air, that is noise or lies elsewhere.
@@ -250,10 +249,10 @@ def _focal_error(lens: Lens) -> float:
     return 0.0
 
 
-def _is_magnified(air: Linearization, lens: Lens, state: RigState) -> bool:
+def _is_magnified(air: Linearization, lens: Lens, fitted: Linearization) -> bool:
     """Whether a fitted lens sees things larger than in air, as a port makes them."""
     theta = np.array(0.5 * air.scene.theta_max)
-    model = Linearization(air.data, state, ()).model.camera(0).lens
+    model = fitted.model.camera(0).lens
     height, known = (one.focal * float(one.image_height.value_and_slope(theta)[0])
                      for one in (model, lens))
     return height > _MIN_MAGNIFICATION * known
