@@ -24,7 +24,7 @@ from benchmark.true_rays import ray_error
 from benchmark.workers import in_processes
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import diagnose
-from fisheye_svp_ros.diagnosis.diagnosis import extended_lenses
+from fisheye_svp_ros.diagnosis.stages import extended_lenses
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens

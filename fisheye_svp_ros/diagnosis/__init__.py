@@ -7,6 +7,7 @@
     fitted_model     FittedModel    estimates, residuals, predicted random effects
     evaluation       Evaluation     held-out prediction, shares of variance, uncertainty
     diagnosis        Diagnosis      the answer
+    stages           diagnose       runs the stages one after another
 
 Other rooms import what stands here, and nothing else.
 """
@@ -34,8 +35,6 @@ from fisheye_svp_ros.diagnosis.diagnosis import (
     Diagnosis,
     Figures,
     SearchRecord,
-    diagnose,
-    diagnose_against,
 )
 from fisheye_svp_ros.diagnosis.effect_forms import simplest_form
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
@@ -51,6 +50,7 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection
+from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P, TraceStep
 from fisheye_svp_ros.diagnosis.uncertainty import (
     ErrorParts,

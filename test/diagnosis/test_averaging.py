@@ -15,9 +15,9 @@ from fisheye_svp_ros.diagnosis.averaging import (
     AveragedModel,
     OpenShifts,
 )
-from fisheye_svp_ros.diagnosis.diagnosis import extended_lenses
 from fisheye_svp_ros.diagnosis.lens_errors import LensErrors
 from fisheye_svp_ros.diagnosis.lens_evidence import find_lens_rays
+from fisheye_svp_ros.diagnosis.stages import extended_lenses
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.reporting.first_screen import first_screen

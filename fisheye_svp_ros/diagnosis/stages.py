@@ -1,0 +1,235 @@
+"""The stages of a diagnosis, from checked inputs to the answer.
+
+Problem -> NullModel -> EffectTests -> Selection -> FittedModel -> Evaluation -> Diagnosis.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis.advice import advise, turn_advice
+from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
+from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
+from fisheye_svp_ros.diagnosis.checks.robot_poses import find_hand_eye, prepare_problem
+from fisheye_svp_ros.diagnosis.checks.turned_boards import find_turned_frames, turn_frames
+from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
+from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
+from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, conclude
+from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause, confirm
+from fisheye_svp_ros.diagnosis.diagnosis import Diagnosis, Figures, SearchRecord
+from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
+from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.lens_errors import with_uncertainty
+from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Inputs, Progress
+from fisheye_svp_ros.diagnosis.selection import select_causes
+from fisheye_svp_ros.diagnosis.variance_budget import (
+    Component,
+    Structure,
+    add_outliers,
+    remaining_structure,
+    significant_components,
+)
+from fisheye_svp_ros.effects.extension import extend_lens
+from fisheye_svp_ros.effects.of_cameras import camera_terms
+from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.table_checks import ROUNDING, check_distinct, dither
+from fisheye_svp_ros.solve.rig_state import RigState
+
+
+def diagnose(
+    observations: Observations, lens: Lens | Mapping[str, Lens], *,
+    free_intrinsics: bool | None = None,
+    poses: dict[int, Pose] | None = None, held_out: Observations | None = None,
+    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
+) -> Diagnosis:
+    """Find what a lens's simulation gets wrong about observations.
+
+    lens: of every camera, or the lenses of a rig by camera.
+    free_intrinsics: whether they were (or are to be) fitted; None asks the lens's `calibration`.
+    poses: by frame, of the camera (of a rig: its right one), or of the flange of a robot that
+    carries it, which the data tell apart; held_out: other frames of the same camera
+    and target; options: effects to include or leave out; progress: told what is being done, and
+    which share is done.
+    Raises GeometryError or ObservationError where the data cannot be solved at all.
+    """
+    inputs = Inputs.check(
+        observations, lens, options or DiagnosisOptions(), free_intrinsics=free_intrinsics,
+        poses=poses, held_out=held_out)
+    diagnosis = _run_stages(inputs, progress)
+    if diagnosis.noise_px > ROUNDING:
+        return diagnosis
+    return _run_stages(replace(inputs, observations=dither(inputs.observations)), progress)
+
+
+def diagnose_against(
+    observations: Observations, other: Observations, lens: Lens | Mapping[str, Lens], *,
+    options: DiagnosisOptions | None = None, progress: Progress = lambda *_: None,
+    free_intrinsics: bool | None = None, **settings: Any,
+) -> Diagnosis:
+    """Diagnose a data set, and ask another one of the same camera whether the lens's causes hold.
+
+    other: its target may be another one; the rest as in `diagnose`.  Causes of the lens that the
+    other set refutes are given up.
+    Raises ObservationError for data sets of several cameras, and what `diagnose` raises.
+    """
+    for table in (observations, other):
+        if len(np.unique(table.camera)) > 1:
+            raise ObservationError(f'{table.source}: two data sets of one camera are compared; '
+                                   'choose the rows of one camera')
+    check_distinct(observations, other)
+    options = options or DiagnosisOptions()
+
+    def diagnose_one(
+        table: Observations, options: DiagnosisOptions, begin: float, end: float, prefix: str = '',
+        **settings: Any,
+    ) -> Diagnosis:
+        return diagnose(
+            table, lens, free_intrinsics=free_intrinsics, options=options,
+            progress=lambda stage, done: progress(prefix + stage, begin + done * (end - begin)),
+            **settings)
+
+    found = diagnose_one(observations, options, 0.0, 0.35, **settings)
+    second = diagnose_one(other, options, 0.35, 0.7, 'the other set: ')
+    progress('validating each set by the other', 0.7)
+    models = [DatasetModel(one.simulation, one.evaluation.null) for one in (found, second)]
+    datasets = compare_datasets(models[0], models[1], observations.source, other.source)
+    gone = tuple(name for name in datasets.refuted_causes if name not in options.included)
+    if gone:
+        found = diagnose_one(observations, options.leave_out(*gone), 0.7, 0.85,
+                             'without what the other set refutes: ', **settings)
+        datasets = replace(datasets, withdrawn=gone)
+    return replace(found, record=found.record._replace(against=datasets))
+
+
+class _Evaluated(NamedTuple):
+    """What the stages up to the evaluation return; of_robot: the poses are those of a flange."""
+
+    evaluation: Evaluation
+    candidates: list[UnconfirmedCause]
+    cameras: list[TwoCameras]
+    of_robot: bool
+
+
+def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
+    """Take checked inputs through all stages, twice where frames were in another order."""
+    evaluated = _evaluate(inputs, progress)
+    turned = [] if inputs.poses is not None else find_turned_frames(
+        evaluated.evaluation.null, evaluated.evaluation.fitted)
+    if any(one.corrected for one, _ in turned):
+        table = turn_frames(inputs.observations, turned)
+        evaluated = _evaluate(replace(inputs, observations=table), progress)
+    found = _conclude(evaluated.evaluation, evaluated.candidates, evaluated.cameras)
+    frames = tuple(one for one, _ in turned)
+    found = replace(found, advice=[*turn_advice(frames), *found.advice],
+                    record=found.record._replace(turned=frames))
+    if inputs.poses is None or not evaluated.of_robot:
+        return found
+    hand_eye = find_hand_eye(found.model, inputs.poses)
+    return replace(found, record=found.record._replace(hand_eye=hand_eye))
+
+
+def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
+    """Take checked inputs through the stages up to the evaluation of confirmed causes."""
+    progress('fitting the simulation as it is', 0.0)
+    problem, of_robot = prepare_problem(inputs)
+    medium = find_medium(problem, progress)
+    if medium is not None:
+        problem = behind_port(problem, medium)
+    selection = select_causes(problem, progress)
+    if medium is not None and (thinner := medium.without_glass(selection.null)) is not None:
+        # What stood in for a cause was no glass.
+        medium = thinner
+        selection = select_causes(behind_port(problem, medium), progress)
+    selection, cameras = agree_on_target(selection, progress)
+    progress('measuring the gain on held-out data', 0.8)
+    evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
+        one, FittedModel.solve_null_model(one.null), medium))
+    return _Evaluated(evaluation, candidates, cameras, of_robot)
+
+
+def _conclude(
+    evaluation: Evaluation, candidates: list[UnconfirmedCause], cameras: list[TwoCameras]
+) -> Diagnosis:
+    """Return the diagnosis of an evaluated selection."""
+    selection, averaged = evaluation.selection, evaluation.averaged_model
+    problem, observations = selection.problem, selection.problem.observations
+    noise_causes = growth_cause(selection.revision.growth)
+    noise_causes += table_causes(observations, selection.revision.outliers, problem.step)
+    components = evaluation.components({c.effect: c.p_value for c in noise_causes})
+    causes = evaluation.causes(components) + noise_causes
+    significant = significant_components(components)
+
+    def lenses_of(state: RigState) -> dict[str, Lens]:
+        return extended_lenses(problem.inputs.lenses, state, observations)
+
+    lenses = with_uncertainty(
+        evaluation.model_errors, averaged.linear, evaluation.noise_px,
+        evaluation.uncertainty['image_px']['misfit'], lenses_of)
+    advice = advise(evaluation, causes, significant)
+    conclusion = conclude(
+        evaluation, causes, components, advice, candidates, problem.inputs.lenses, lenses_of,
+        any(pair.verdict == 'contradict' for pair in cameras))
+    lenses = {
+        name: conclusion.with_ray_error(averaged.with_shift_entry(lens, name), name)
+        for name, lens in lenses.items()}
+    field = evaluation.written_field
+    if field is not None:
+        lenses = {name: field.add_to(lens, camera)
+                  for camera, (name, lens) in enumerate(lenses.items())}
+    return Diagnosis(
+        evaluation,
+        Figures(evaluation.base_quality, evaluation.named_quality, evaluation.lens_quality,
+                evaluation.extended_quality,
+                evaluation.gain),
+        components, causes, _remaining(evaluation, noise_causes, significant),
+        advice_on_lens(advice, conclusion), lenses,
+        SearchRecord(list(selection.trace), EffectTests(selection.first).untestable,
+                     _outliers(evaluation), cameras), conclusion)
+
+
+def _outliers(evaluation: Evaluation) -> list[dict[str, Any]]:
+    """Return the outliers of the data and of held-out data, as diagnosis.json has them."""
+    selection = evaluation.selection
+    rows = outlier_rows(selection.problem.observations, selection.revision.outliers)
+    table, test = selection.problem.inputs.held_out, evaluation.held_out
+    if table is not None and test is not None:
+        rows += outlier_rows(table, test.outliers, 'held out: ')
+    return rows
+
+
+def _remaining(
+    evaluation: Evaluation, noise_causes: Sequence[Cause], components: Sequence[Component]
+) -> list[Structure]:
+    """Return what residuals still depend on."""
+    selection = evaluation.selection
+    observations = selection.problem.observations
+    # The weights are relative where the noise itself is a cause: sigma is no longer tested.
+    stated = bool(np.isfinite(observations.sigma).all()) and not noise_causes
+    remaining = remaining_structure(
+        EffectTests(selection.null), evaluation.fitted, components, stated)
+    remaining = add_outliers(remaining, selection.revision.outliers, len(observations))
+    hidden = {name for cause in noise_causes for name in cause.effect_class.hidden_structure}
+    return [one for one in remaining if one.variable not in hidden]
+
+
+def extended_lenses(
+    lenses: Mapping[str, Lens], state: RigState, observations: Observations
+) -> dict[str, Lens]:
+    """Return the lenses that were fitted, with their effects, for every command and node."""
+    # What happened to one recording is no part of the lens.
+    lasting = [term for term in state.terms if not term[0].of_recording]
+    extended = {}
+    for camera, (name, fitted) in enumerate(zip(lenses, state.lenses, strict=True)):
+        # A fitted height curve may turn a little earlier than the one the lens came with.
+        limit = min(lenses[name].max_incidence, fitted.image_height.limit * (1 - 1e-6))
+        own = replace(fitted, calibration=lenses[name].calibration, max_incidence=limit)
+        extended[name] = extend_lens(own, camera_terms(lasting, camera), observations)
+    return extended
