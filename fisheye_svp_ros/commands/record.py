@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from contextlib import suppress
 from pathlib import Path
 from shutil import rmtree
 
@@ -70,9 +71,11 @@ def _record(args: argparse.Namespace) -> None:
         from fisheye_svp_ros.nodes.recorder import Recorder
         from fisheye_svp_ros.nodes.session import ros_session
 
-    with ros_session(args.ros_args), BagWriter(args.output) as bag:
+    with (ros_session(args.ros_args) as signals, BagWriter(args.output) as bag,
+          suppress(KeyboardInterrupt)):
+        signals.begin()
         recorder = Recorder(bag, args.topics)
-        recorder.spin()
+        recorder.spin(signals)
         recorder.destroy_node()
     if not bag.count:
         rmtree(args.output)

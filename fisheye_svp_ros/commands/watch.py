@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -24,18 +25,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Follow every result topic until interrupted."""
     from fisheye_svp_ros.commands.ros import prepare_ros
+    from fisheye_svp_ros.nodes.executables import ending_quietly
 
-    prepare_ros()
-    from rich.live import Live
+    with ending_quietly():
+        prepare_ros()
+        from rich.live import Live
 
-    from fisheye_svp_ros.nodes.session import ros_session
-    from fisheye_svp_ros.nodes.watcher import Watcher
-    from fisheye_svp_ros.reporting.tables import console
+        from fisheye_svp_ros.nodes.session import ros_session
+        from fisheye_svp_ros.nodes.watcher import Watcher
+        from fisheye_svp_ros.reporting.tables import console
 
-    with ros_session(args.ros_args):
+    with ros_session(args.ros_args) as signals, suppress(KeyboardInterrupt):
+        signals.begin()
         watcher = Watcher()
         with Live(console=console(), refresh_per_second=4) as live:
-            watcher.spin(lambda: live.update(_result_table(watcher, live.console.width)))
+            watcher.spin(lambda: live.update(_result_table(watcher, live.console.width)), signals)
         watcher.destroy_node()
 
 

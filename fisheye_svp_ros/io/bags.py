@@ -35,6 +35,7 @@ from fisheye_svp_ros.io.recording_files import (
 )
 
 _MAX_LISTED = 3  # places of damage
+_DEPTH = 100  # messages that a player offers to send again, of latched topics as well
 _CHECKSUM = 9 + 3 * 8  # bytes from the start of a chunk to its checksum
 _UNLIMITED_TIME = QosTime(9223372036, 854775807)  # as rmw has it
 
@@ -248,7 +249,7 @@ def _profile(offered: OfferedQos) -> Qos:
     """Return a profile as a recording holds it; discovery does not tell of the history."""
     return Qos(
         history=QosHistory.KEEP_LAST,
-        depth=1 if offered.latched else 100,
+        depth=_DEPTH,
         reliability=QosReliability.RELIABLE if offered.reliable else QosReliability.BEST_EFFORT,
         durability=(QosDurability.TRANSIENT_LOCAL if offered.latched
                     else QosDurability.VOLATILE),

@@ -21,7 +21,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
-from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
+from fisheye_svp_ros.nodes.quality import LATCHED_SETS, SENSOR
 from fisheye_svp_ros.nodes.session import RCLError
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
@@ -47,7 +47,7 @@ class CameraTopics:
         space = [] if settings.camera_frame else node.get_namespace().strip('/').split('/')
         words = [*space, name, settings.camera_frame or _CAMERA_FRAME]
         self.frame = '_'.join(filter(None, words))
-        self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED)
+        self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED_SETS)
         # Who solves listens to the true pose, but not to images.
         self._pose = node.announce(PoseStamped, f'{prefix}true_pose', wait=photographs)
         self._images = self._points = None
@@ -86,7 +86,7 @@ class CameraNode(BaseNode):
     def __init__(self, node_name: str | None = None, **options: Any) -> None:
         super().__init__(node_name, **options)
         self._landmarks = (
-            None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED))
+            None if self.photographs else self.announce(PointCloud2, 'landmarks', LATCHED_SETS))
         self._scenario = self.announce(DiagnosticArray, 'scenario')
         self.transforms = Transforms(self, self.settings.publish_tf)
         self._cameras: dict[str, CameraTopics] = {}

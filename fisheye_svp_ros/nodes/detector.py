@@ -29,7 +29,7 @@ from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.quality import LATCHED, SENSOR
+from fisheye_svp_ros.nodes.quality import INFO_INPUT, LATCHED, SENSOR
 from fisheye_svp_ros.planning.guide import NUMBERS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
@@ -116,7 +116,7 @@ class Detector(BaseNode):
         self.collect(CompressedImage, _COMPRESSED, partial(_read, CompressedImage), self._take,
                      SENSOR, name=compressed_topic(self, _RAW))
         self.collect(CameraInfo, CAMERA_INFO, read_camera_info,
-                     partial(self._infos.hear, CAMERA_INFO), SENSOR, latched=True)
+                     partial(self._infos.hear, CAMERA_INFO), INFO_INPUT, latched=True)
         self.start()
         if self.settings.guide:
             self._guiding = Guiding(self, self.settings, self._pattern, self._infos)

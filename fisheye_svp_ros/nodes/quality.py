@@ -14,8 +14,12 @@ from fisheye_svp_ros.errors import ParameterError
 # All but images are reliable; inputs are deep enough for what comes while a solver is busy.
 RELIABLE = QoSProfile(depth=100)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# What each set has one of: kept as long as its image points, to be sent again where it is lost.
+LATCHED_SETS = QoSProfile(depth=RELIABLE.depth, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 INPUT = QoSProfile(depth=1000)
+# Of camera_info: drivers send it as sensor data, and each set has one of its own.
+INFO_INPUT = QoSProfile(depth=INPUT.depth, reliability=ReliabilityPolicy.BEST_EFFORT)
 TRANSFORMS = {'/tf': RELIABLE,
               '/tf_static': QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import signal
 import time
 from collections.abc import Sequence
 from importlib import import_module
@@ -14,6 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from fisheye_svp_ros.io.bags import BagWriter, OfferedQos
+from fisheye_svp_ros.nodes.signals import SignalHandler
 from fisheye_svp_ros.nodes.timers import start_timer
 
 _COUNTED_TOPICS = ('/image_points', '/result')
@@ -35,21 +35,20 @@ class Recorder(Node):  # type: ignore[misc]
         start_timer(self, _LOOK_EVERY, self._look)
         start_timer(self, _FLUSH_EVERY, bag.flush)
 
-    def spin(self) -> None:
-        """Record until SIGINT or SIGTERM, and then what is on its way; a second one ends that."""
-        executor, signals, quiet = SingleThreadedExecutor(), list[float](), False
+    def spin(self, signals: SignalHandler) -> None:
+        """Record until a signal comes, and then what is on its way; a second one ends that."""
+        executor, quiet = SingleThreadedExecutor(), False
         executor.add_node(self)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: signals.append(time.monotonic()))
-        while not signals:
+        signals.collect()
+        while not signals.times:
             executor.spin_once(timeout_sec=_LOOK_EVERY)
         for timer in self.timers:
             timer.cancel()
-        while len(signals) == 1 and not quiet:
+        while len(signals.times) == 1 and not quiet:
             # Only a whole wait that brought nothing says so: this process may have been held up.
             # Where others go on publishing, it is enough that nothing waits to be taken.
             start, count = time.monotonic(), self._bag.count
-            patience = _IDLE_TIME if start - signals[0] < _MAX_WAIT else 0.0
+            patience = _IDLE_TIME if start - signals.times[0] < _MAX_WAIT else 0.0
             executor.spin_once(timeout_sec=patience)
             quiet = self._bag.count == count and time.monotonic() - start >= patience
 

@@ -25,7 +25,7 @@ from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
-from fisheye_svp_ros.nodes.quality import SENSOR
+from fisheye_svp_ros.nodes.quality import INFO_INPUT, SENSOR
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
@@ -114,7 +114,7 @@ class Rectifier(BaseNode):
         self.collect(CompressedImage, image + COMPRESSED_SUFFIX, _read_compressed, take, SENSOR,
                      name=compressed_topic(self, image))
         self.collect(CameraInfo, topic, read_camera_info, partial(self._infos.hear, topic),
-                     SENSOR, latched=True)
+                     INFO_INPUT, latched=True)
 
     def needed_inputs(self) -> Sequence[Sequence[str]]:
         """Return the topics without which there is nothing to rectify."""

@@ -24,7 +24,8 @@ class SignalHandler:
     """
 
     def __init__(self) -> None:
-        self._raises = self._spinning = self._pending = False
+        self.times: list[float] = []  # s, of the monotonic clock: when there was a signal
+        self._raises = self._spinning = False
         self._last = -math.inf
         self._before = {number: signal.signal(number, self._handle) for number in _NUMBERS}
 
@@ -32,14 +33,19 @@ class SignalHandler:
         if number == signal.SIGTERM and self._spinning:
             return
         before, self._last = self._last, time.monotonic()
-        self._pending = True
-        if self._raises and self._last - before > _SAME_INTERRUPT:
-            raise KeyboardInterrupt
+        if self._last - before > _SAME_INTERRUPT:
+            self.times.append(self._last)
+            if self._raises:
+                raise KeyboardInterrupt
 
     def begin(self) -> None:
         """Raise KeyboardInterrupt on signals from now on, and if there was one already."""
         self._raises = True
         self._raise_pending()
+
+    def collect(self) -> None:
+        """Raise nothing from now on: `times` tells of signals."""
+        self._raises = False
 
     def spin(self) -> None:
         """Let an executor be ended by signals; raise KeyboardInterrupt if there was one."""
@@ -53,9 +59,11 @@ class SignalHandler:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def restore(self) -> None:
-        """Give SIGTERM back what it did before; SIGINT stays ignored while Python ends."""
-        signal.signal(signal.SIGTERM, self._before[signal.SIGTERM])
+        """Give signals back what they did before; one that is ignored at the end stays so."""
+        for number, before in self._before.items():
+            if signal.getsignal(number) == self._handle:
+                signal.signal(number, before)
 
     def _raise_pending(self) -> None:
-        if self._pending:
+        if self.times:
             raise KeyboardInterrupt

@@ -35,7 +35,7 @@ from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin
 from fisheye_svp_ros.nodes.lenses import lens_of, lenses_of, shift_scale
 from fisheye_svp_ros.nodes.lifecycle import ManagedNode
-from fisheye_svp_ros.nodes.quality import SENSOR
+from fisheye_svp_ros.nodes.quality import INFO_INPUT
 from fisheye_svp_ros.nodes.standing import StandingLandmarks
 from fisheye_svp_ros.optics import engines
 from fisheye_svp_ros.optics.lens import Lens
@@ -213,7 +213,7 @@ class SolverNode(ManagedNode):
             if not self.listens_to(topic):
                 self._join.expect(topic)
                 self.collect(CameraInfo, topic, read_camera_info, functools.partial(hear, topic),
-                             SENSOR, latched=True)
+                             INFO_INPUT, latched=True)
 
     def _collect(self, kind: Any, topic: str, read: Any) -> None:
         self.collect(kind, topic, read, functools.partial(self._add, topic))
@@ -238,6 +238,7 @@ class SolverNode(ManagedNode):
         if self._arrivals.go_on(now):
             self._wake.trigger()
             return
+        self._skip_unpublished()
         for one in self._join.pop_complete(now, patience):
             self._backlog.append(one)
             self._compare_stamps(one)
@@ -256,6 +257,12 @@ class SolverNode(ManagedNode):
             self._look_at(*self._unread.popleft())
         if self._backlog or self._unread:
             self._wake.trigger()
+
+    def _skip_unpublished(self) -> None:
+        """Do not let sets wait for true poses that nobody publishes."""
+        for topic in self._poses if len(self._join) else ():
+            if not self.count_publishers(self._inputs[topic].resolved):
+                self._join.expect_no_more(topic)
 
     def _compare_stamps(self, one: Pending) -> None:
         """Say how far off the true poses are that come and are of no use to a set."""

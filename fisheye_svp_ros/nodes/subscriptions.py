@@ -18,10 +18,11 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
 
 from fisheye_svp_ros.nodes.inputs import Count
-from fisheye_svp_ros.nodes.quality import create_with_qos, overridden
+from fisheye_svp_ros.nodes.quality import INPUT, create_with_qos, overridden
 
 _LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
-_MAX_HASHES = 100  # messages by which one subscription of a topic may be ahead of another
+# Messages by which one subscription of a topic may be ahead of another: as many as may wait.
+_MAX_HASHES = INPUT.depth
 
 _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import signal
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -14,6 +13,7 @@ from rclpy.node import Node
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.decoding import read_key_values
 from fisheye_svp_ros.nodes.quality import RELIABLE
+from fisheye_svp_ros.nodes.signals import SignalHandler
 from fisheye_svp_ros.nodes.timers import start_timer
 
 _TYPE = 'diagnostic_msgs/msg/DiagnosticArray'
@@ -53,13 +53,12 @@ class Watcher(Node):  # type: ignore[misc]
         self.results: dict[str, Results] = {}
         start_timer(self, _LOOK_EVERY, self._look)
 
-    def spin(self, show: Callable[[], None]) -> None:
-        """Follow until SIGINT or SIGTERM; `show` is called after whatever came."""
-        executor, ended = SingleThreadedExecutor(), []
+    def spin(self, show: Callable[[], None], signals: SignalHandler) -> None:
+        """Follow until a signal comes; `show` is called after whatever came."""
+        executor = SingleThreadedExecutor()
         executor.add_node(self)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: ended.append(True))
-        while not ended:
+        signals.collect()
+        while not signals.times:
             executor.spin_once(timeout_sec=_LOOK_EVERY)
             show()
 

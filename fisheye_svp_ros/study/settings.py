@@ -67,8 +67,9 @@ class SolverSettings(Settings):
     sigma_px: float = parameter(
         1.0, 'Standard deviation of an image point, for the covariance', 'px', (1e-6, 1e3)
     )
+    # Fast DDS tells every 3 s what it has sent, and what was lost last comes after that.
     patience: float = parameter(
-        2.0, 'How long image points wait for what shares their stamp on other topics', 's',
+        4.0, 'How long image points wait for what shares their stamp on other topics', 's',
         (0.0, 3600.0)
     )
     true_pose_gap: float = parameter(

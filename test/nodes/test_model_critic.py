@@ -204,7 +204,7 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
 ) -> None:
     bag, errors, extended = (tmp_path / name for name in ('bag', 'errors', 'extended.yaml'))
     replay = ['run', 'measured_camera', '--ros-args', *values(
-        observations=bag, repeat='false', rate=20.0)]
+        observations=bag, repeat='false', rate=100.0)]
 
     def ask() -> Any:
         return caller.call('std_srvs/srv/Trigger', '/model_critic/write_extended_lens')
@@ -213,7 +213,7 @@ def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
         processes.start('recorder', ['record', '-o', str(bag)])
         processes.start('camera', ['run', 'synthetic_camera', '--ros-args', *values(
             lens=scene / 'hidden.yaml', environment=scene / 'landmarks.csv',
-            poses_file=scene / 'poses.csv', noise_px=0.05, rate=20.0, repeat='false',
+            poses_file=scene / 'poses.csv', noise_px=0.05, rate=100.0, repeat='false',
             wait_for_subscribers=1)])
         processes.wait(['camera'], TIMEOUT)
         processes.stop('recorder')

@@ -418,7 +418,7 @@ def test_no_empty_recording_is_left_behind(
     ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(Recorder, 'spin', lambda _: None)  # interrupted before anything came
+    monkeypatch.setattr(Recorder, 'spin', lambda *_: None)  # interrupted before anything came
     assert main(['record', '-o', str(tmp_path / 'bag')]) == 2
     assert 'no message came on a topic that is recorded, and nothing is kept' in (
         capsys.readouterr().err)

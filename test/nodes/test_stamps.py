@@ -86,6 +86,18 @@ def test_true_poses_of_a_tracker_are_interpolated_without_delay(
         assert metrics['position_error_m'] < 1e-6 and metrics['rotation_error_rad'] < 1e-6
 
 
+def test_a_true_pose_that_nobody_publishes_is_not_waited_for(
+    graph: Callable[..., Graph]
+) -> None:
+    g = graph('lens:=fish214', 'svp:=true', 'patience:=3600.0')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
+    told.publish(messages.landmarks_message(LANDMARKS, 0, 'world'))
+    points.publish(points_message(moved(1.0), 1000 * MS))
+    assert not g.until(lambda: results)[0].status[0].message
+
+
 def test_poses_that_are_too_far_apart_give_no_error_and_no_delay(
     graph: Callable[..., Graph]
 ) -> None:

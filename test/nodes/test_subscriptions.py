@@ -49,9 +49,20 @@ def test_no_message_is_kept_and_memory_is_bounded() -> None:
     before = sys.getrefcount(data)
     hear(data)
     assert sys.getrefcount(data) == before
-    for number in range(1000):
+    for number in range(3000):
         hear(b'%d' % number)
-    assert len(once._passed) == 100 and len(once._heard) <= 100
+    assert len(once._passed) == 1000 and len(once._heard) <= 1000
+
+
+def test_one_subscription_may_be_a_whole_queue_behind_another() -> None:
+    heard: list[bytes] = []
+    once = DuplicateFilter(heard.append, history=True)
+    one, other = once.callback(), once.callback()
+    sent = [b'%d' % number for number in range(1000)]
+    for hear in (one, other):
+        for data in sent:
+            hear(data)
+    assert heard == sent
 
 
 def test_subscriptions_are_added_as_publishers_need_them(graph: Callable[..., Graph]) -> None:
