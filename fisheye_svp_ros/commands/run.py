@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from itertools import takewhile
-from typing import TYPE_CHECKING
 
 from fisheye_svp_ros.commands.ros import prepare_ros
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.nodes import NODES, executables
-
-if TYPE_CHECKING:
-    from fisheye_svp_ros.io.parameters import Row
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +29,7 @@ def run(args: argparse.Namespace) -> None:
     nodes, arguments = [args.node, *more], args.arguments[len(more):]
     if {'-h', '--help'} & set(arguments):
         for node in nodes:
-            _print_parameters(node)
+            executables.print_parameters(node)
         return
     first, names = next(iter(arguments), '--ros-args'), ' '.join(nodes)
     if first != '--ros-args':
@@ -44,19 +39,3 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'run {names}: a node is listed twice, and its topics would be '
                              'those of both; start one process for each namespace')
     raise SystemExit(executables.run(*nodes, args=arguments))
-
-
-def _print_parameters(node: str) -> None:
-    from fisheye_svp_ros.reporting.tables import print_table
-
-    def meaning(row: Row) -> str:
-        unit, allowed = row.unit and f' [{row.unit}]', row.constraint()
-        return row.description + unit + (allowed and f' ({allowed})')
-
-    table = executables.parameters(node)
-    print_table(
-        f'{node}: parameters, as in --ros-args -p NAME:=VALUE',
-        ('parameter', 'default', 'meaning'),
-        [(row.name, json.dumps(row.default), meaning(row)) for row in table],
-        words=('default', 'meaning'),
-    )

@@ -26,6 +26,7 @@ from fisheye_svp_ros.study.settings import Settings
 
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 _KINDS_OF_ERRORS = 100  # that are told from each other
+_REPORT_PERIOD = 1.0  # s, on /diagnostics
 
 T = TypeVar('T')
 
@@ -72,7 +73,7 @@ class BaseNode(Node):  # type: ignore[misc]
         self._candidate: tuple[Settings, Any] | None = None
         self._waited_for: list[Any] = []
         self._diagnostics = self.announce(DiagnosticArray, '/diagnostics')
-        self.start_timer(1.0, self._publish_diagnostics)
+        self.start_timer(_REPORT_PERIOD, self._publish_diagnostics)
 
     def start(self) -> None:
         """Take the initial parameters into use, and every later change of them.

@@ -5,14 +5,18 @@ It loads a node only when it is run, so that a signal while that takes place end
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
+from itertools import takewhile
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros import __version__
 from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.threads import set_thread_count
 
@@ -60,7 +64,41 @@ def _node_class(name: str) -> type[BaseNode]:
     return kind
 
 
+def print_parameters(name: str) -> None:
+    """Print the table of a node's parameters; rclpy must be there."""
+    from fisheye_svp_ros.reporting.tables import print_table
+
+    def meaning(row: Row) -> str:
+        unit, allowed = row.unit and f' [{row.unit}]', row.constraint()
+        return row.description + unit + (allowed and f' ({allowed})')
+
+    print_table(
+        f'{name}: parameters, as in --ros-args -p NAME:=VALUE',
+        ('parameter', 'default', 'meaning'),
+        [(row.name, json.dumps(row.default), meaning(row)) for row in parameters(name)],
+        words=('default', 'meaning'),
+    )
+
+
+def _main(name: str) -> int:
+    """Run a node with the arguments of its executable, which nodes commonly overlook."""
+    words = sys.argv[1:]
+    misplaced = [word for word in takewhile('--ros-args'.__ne__, words) if word.startswith('-')]
+    if {'-h', '--help'} & {*words}:
+        with ending_quietly():
+            print_parameters(name)
+    elif '--version' in words:
+        print(f'{name} {__version__}')
+    elif misplaced:
+        print(f'{name}: {misplaced[0]!r} stands before --ros-args; ROS arguments come after it: '
+              f'{name} --ros-args ...', file=sys.stderr)
+        return 2
+    else:
+        return run(name)
+    return 0
+
+
 def __getattr__(name: str) -> Callable[..., int]:
     if name not in NODES:
         raise AttributeError(f'no node is called {name!r}')
-    return partial(run, name)
+    return partial(_main, name)

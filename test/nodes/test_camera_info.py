@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -20,7 +21,7 @@ from fisheye_svp_ros.errors import FisheyeSvpError, LensError, ObservationError
 from fisheye_svp_ros.io.decoding import read_camera_info, read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
-from fisheye_svp_ros.io.lens_formats.ros import lens_of
+from fisheye_svp_ros.io.lens_formats.ros import camera_info_text, lens_of
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
@@ -185,3 +186,22 @@ def test_every_model_as_opencv_projects_it(model: str, d: tuple[float, ...]) -> 
     assert seen.valid.sum() > 100
     off = np.abs(seen.uv - uv[:, 0])[seen.valid].max()
     assert off < max(1.05 * worst, 1e-5) and worst <= 0.2
+
+
+@pytest.mark.parametrize('skew', [-0.97, 4.26])
+@pytest.mark.parametrize('d', [(0.02, -0.01, 0.003, -0.0005), (0.02, -0.01, 0.003, -0.0005, 0.0)])
+def test_a_skew_is_taken_over_from_message_and_file(
+    skew: float, d: tuple[float, ...], tmp_path: Path
+) -> None:
+    """Real calibrations have it; some drivers send more coefficients, which are zero."""
+    matrix = np.array([[K[0], skew, K[2]], [0, K[1], K[3]], [0, 0, 1.0]])
+    model = read_camera_info(info(k=matrix.ravel().tolist(), d=list(d)))
+    file = tmp_path / 'info.yaml'
+    file.write_text(camera_info_text('camera', (640, 480), matrix, 'equidistant', d,
+                                     np.eye(3, 4)))
+    rays = np.array([[0.3, 0.4, 1.0], [-0.5, 0.2, 1.0], [0.1, -0.6, 1.0]])
+    plane, _ = cv2.fisheye.projectPoints(
+        rays[:, None], np.zeros(3), np.zeros(3), np.eye(3), np.array(d[:4]))
+    wanted = plane[:, 0] @ matrix[:2, :2].T + matrix[:2, 2]
+    for lens in (lens_of(*model, 'camera', 'camera_info')[0], load_lens(file)):
+        assert forward.project(lens, rays).uv == pytest.approx(wanted, abs=1e-5)

@@ -17,6 +17,7 @@ import pytest
 from helpers import graph  # noqa: F401 - skips where there is no rclpy
 from helpers.nodes import ROOT, NodeProcess
 
+from fisheye_svp_ros import __version__
 from fisheye_svp_ros.nodes import NODES, base, executables, running
 from fisheye_svp_ros.nodes.signals import SignalHandler
 
@@ -45,7 +46,7 @@ def start(
     return run
 
 
-@pytest.mark.parametrize('arguments', [
+UNUSABLE = [
     ['--params-file', 'nosuch.yaml'],
     ['--params-file', 'BROKEN'],
     ['-r', 'foo'],
@@ -56,20 +57,51 @@ def start(
     ['-p', 'lens:=[]'],
     ['-p', 'patience:=-1.0'],
     ['-p', 'qos_overrides./image_points.subscription.reliability:=sometimes'],
-])
+]
+
+
+def assert_refused(arguments: list[str], status: int, lines: list[str]) -> None:
+    assert status == 2
+    told = [line for line in lines if line.startswith('localizer: ')]
+    assert len(told) == 1 and len(told[0]) > 20, lines
+    assert arguments != ['--nosuch'] or 'ROS arguments' in told[0]  # rclpy: a bare list
+    assert ('a list must' in told[0]) == (arguments == ['-p', 'lens:=[]'])
+    assert 'Traceback' not in '\n'.join(lines)
+
+
+@pytest.mark.usefixtures('handler_kept')
+@pytest.mark.parametrize('arguments', UNUSABLE)
 def test_arguments_that_cannot_be_used_end_a_node_with_the_reason(
-    start, arguments: list[str], tmp_path: Path  # type: ignore[no-untyped-def]
+    arguments: list[str], ros_domain: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     broken = tmp_path / 'broken.yaml'
     broken.write_text('/**:\n  ros__parameters: {lens: [fish214\n')
     given = [str(broken) if word == 'BROKEN' else word for word in arguments]
-    node = start('localizer', '--ros-args', *given)
-    assert node.finish() == 2
-    told = [line for line in node.lines if line.startswith('localizer: ')]
-    assert len(told) == 1 and len(told[0]) > 20, node.lines
-    assert arguments != ['--nosuch'] or 'ROS arguments' in told[0]  # rclpy: a bare list
-    assert ('a list must' in told[0]) == (arguments == ['-p', 'lens:=[]'])
-    assert 'Traceback' not in '\n'.join(node.lines)
+    status = executables.run('localizer', args=['--ros-args', *given])
+    assert_refused(arguments, status, capfd.readouterr().err.splitlines())
+
+
+@pytest.mark.parametrize('arguments', [['--nosuch'], ['-p', 'patience:=-1.0']])
+def test_a_process_that_cannot_use_its_arguments_ends_with_the_reason(
+    start, arguments: list[str]  # type: ignore[no-untyped-def]
+) -> None:
+    node = start('localizer', '--ros-args', *arguments)
+    assert_refused(arguments, node.finish(), node.lines)
+
+
+@pytest.mark.parametrize(('words', 'status', 'said'), [
+    (['--help'], 0, 'localizer: parameters, as in --ros-args -p NAME:=VALUE'),
+    (['--version'], 0, f'localizer {__version__}'),
+    (['-p', 'lens:=fish180'], 2, "localizer: '-p' stands before --ros-args; ROS arguments come"),
+])
+def test_an_executable_overlooks_no_argument(
+    words: list[str], status: int, said: str, monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, 'argv', ['localizer', *words])
+    monkeypatch.setattr(executables, 'run', lambda *_: pytest.fail('it runs'))
+    assert executables.localizer() == status
+    assert said in ''.join(capsys.readouterr())
 
 
 def test_security_that_cannot_be_had_ends_a_node_with_the_reason(
