@@ -76,7 +76,7 @@ def weakest_cause(evaluation: Evaluation) -> Doubt | None:
         if not why and other is not None and change_between(
                 evaluation.predict([effect.name]), other).z < -1:
             why = REFUTED_BY_FILE
-        why = why or _confounder(tests, effect, columns, twins) or _implausible(effect, values)
+        why = why or find_confounder(tests, effect, columns, twins) or _implausible(effect, values)
         if why:
             doubts.append(Doubt(effect.name, change.z, why))
     return min(doubts, key=lambda one: one.z, default=None)
@@ -94,7 +94,7 @@ def _confounded_pairs(tests: EffectTests) -> list[tuple[str, Index, list[str]]]:
             for effect, columns, _ in tests.null.terms if not effect.per_frame]
 
 
-def _confounder(
+def find_confounder(
     tests: EffectTests, effect: Effect, columns: Index,
     twins: Sequence[tuple[str, Index, list[str]]],
 ) -> str:
@@ -104,16 +104,14 @@ def _confounder(
         if other == effect.name or not names:
             continue
         rest = np.setdiff1d(null.included_columns, np.concatenate([columns, theirs]))
-        for twin in names:
-            # One with more parameters would explain more than the cause in whose place it stands.
-            forms = [null.form_columns(form) for form, one in enumerate(null.fixed.forms.effects)
-                     if one.name == twin and len(null.form_columns(form)) <= len(theirs)]
-            if not forms:
-                continue
-            best = max(forms, key=lambda form: tests.score_beside(rest, form).statistic)
-            score = tests.score_beside(np.concatenate([rest, best]), columns)
-            if score.p_value * tests.effect_count > SIGNIFICANCE:
-                return f'with {twin} in place of {other} it is not needed'
+        # One with as many parameters as both causes explains nothing more simply than they do.
+        for twin in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
+            beside = np.concatenate([rest, null.form_columns(twin.form)])
+            place = f'with {twin.effect.name} in place of {other}'
+            if tests.score_beside(beside, columns).p_value * tests.effect_count > SIGNIFICANCE:
+                return f'{place} it is not needed'
+            if not tests.held_out_gain(beside, columns, effect).sufficient:
+                return f'{place} it gains nothing on held-out frames beyond its error'
     return ''
 
 

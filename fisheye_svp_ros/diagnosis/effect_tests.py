@@ -7,7 +7,7 @@ what the effect may be mistaken for, and the scatter of the score from landmark 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -142,6 +142,17 @@ class EffectTests:
             candidates.append(
                 Candidate(form, effect, score, self._correct(effect, score), criterion))
         return sorted(candidates, key=lambda candidate: -candidate.criterion)
+
+    def likeliest_forms(
+        self, included: Index, names: Sequence[str], most: int
+    ) -> list[Candidate]:
+        """Return the best form of each named effect that has one of at most so many parameters."""
+        best: dict[str, Candidate] = {}
+        for candidate in self.candidates(included, per_frame=False):
+            name = candidate.effect.name
+            if name in names and len(candidate.effect.parameters) <= most:
+                best.setdefault(name, candidate)
+        return list(best.values())
 
     def significant_candidates(self, included: Index) -> Iterator[Candidate]:
         """Yield what is significant, best criterion first, the variances' uncertainty taken in."""

@@ -30,6 +30,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.scene.observations import Views
 
+_PAUSE = 4.0  # times the median time between views: over so long no motion is known
 _MAX_PLAUSIBLE = 30.0  # times what would be a large value of a parameter
 STAGES = {'target': 3, 'pose': 6, 'ray': 2, 'image': 2, 'detector': 2, 'noise': 0}
 
@@ -92,13 +93,21 @@ class Scene:
 
     @cached_property
     def twist(self) -> Array:
-        """Velocity (S, 6) of each view's camera, m/s and rad/s, from its neighbours in time."""
+        """Velocity (S, 6) of each view's camera, m/s and rad/s, from its neighbours in time.
+
+        Zero where it is unknown: of a view with pauses before and after it.
+        """
         twist = np.zeros((len(self.times), 6))
         for camera in np.unique(self.views.camera):
             mine = np.flatnonzero((self.views.camera == camera) & np.isfinite(self.times))
             order = mine[np.argsort(self.times[mine], kind='stable')]
-            if len(order) > 2:
-                twist[order] = _velocities(self.pose.take(order), self.times[order])
+            if len(order) < 2:
+                continue
+            step = np.diff(self.times[order])
+            pauses = np.flatnonzero(step > _PAUSE * np.median(step)) + 1
+            for burst in np.split(order, pauses):
+                if len(burst) > 1:
+                    twist[burst] = _velocities(self.pose.take(burst), self.times[burst])
         return twist
 
     def normalized_uv(self) -> Array:
@@ -346,7 +355,13 @@ def require_motion(scene: Scene) -> Array:
 
 
 def _velocities(pose: Pose, t: Array) -> Array:
-    """Velocities by the parabola through each pose and its two neighbours in time."""
+    """Velocities by the parabola through each pose and its two neighbours in time.
+
+    Of two poses by the line through them.
+    """
+    if len(t) == 2:
+        change = pose.take(np.array([1])).difference(pose.take(np.array([0])))
+        return np.repeat(change / max(t[1] - t[0], 1e-9), 2, axis=0)
     middle = np.clip(np.arange(len(t)), 1, len(t) - 2)
     before, after = pose.take(middle - 1), pose.take(middle + 1)
     here = pose.take(middle)

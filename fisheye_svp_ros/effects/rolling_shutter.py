@@ -13,7 +13,7 @@ from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_motio
 
 @dataclass(frozen=True)
 class RollingShutterEffect(Effect):
-    """The read-out time from the first row to the last; motion from the neighbouring frames."""
+    """The read-out time from the first row to the last; motion from neighbours without a pause."""
 
     name = 'rolling_shutter'
     stage = 'pose'

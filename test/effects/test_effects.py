@@ -16,6 +16,8 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import FlatPort
+from fisheye_svp_ros.pose import identity
+from fisheye_svp_ros.scene.observations import views_of
 
 DESIGN_NAMES = {
     'viewpoint_shift', 'radial_profile', 'focal_length', 'principal_point', 'aspect', 'skew',
@@ -242,3 +244,16 @@ def test_every_effect_says_where_it_stands_in_the_budget_and_what_it_is():
         assert of_cameras(kind).budget_stage() == stages[name]
         assert kind.summary().endswith('.') and kind.to_separate and kind.signature
     assert 'along the axis' in CATALOGUE['viewpoint_shift'].summary()
+
+
+def test_no_motion_is_taken_from_a_pause():
+    """Four frames, then two, then one, with seconds between: the last one's motion is unknown."""
+    t = np.array([0.0, 0.1, 0.2, 0.3, 3.0, 3.1, 6.0])
+    speed = np.array([0.2, -0.1, 0.3, 0.5, 0.2, -0.4])
+    pose = identity(7).retract(t[:, None] * speed)
+    pose.position[4:6] += 1.0
+    views = views_of(np.eye(3), np.zeros((7, 3, 2)))
+    views = views._replace(t=np.broadcast_to(t[:, None], views.board.shape))
+    twist = Scene(views, lens(), pose, np.zeros((7, 3, 2))).twist
+    assert twist[:6] == pytest.approx(np.tile(speed, (6, 1)), abs=1e-6)
+    assert not twist[6].any()

@@ -1,0 +1,110 @@
+"""A cause stays confirmed only beside what the other causes may be mistaken for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from helpers.scenes import lens, observe, scene
+from helpers.water import AIR
+
+from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
+from fisheye_svp_ros.diagnosis.confirmation import find_confounder
+from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.effects.focal_drift import FocalDriftEffect
+from fisheye_svp_ros.effects.session_step import SessionStepEffect
+from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.scene.observations import views_of
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import group_by_frame
+
+SIGMA = 0.2
+
+
+def bursts(rng, frames):
+    """Return poses, speeds and views of one board: bursts of four at 10 Hz, pauses of seconds."""
+    x, y = np.meshgrid(np.arange(9) - 4.0, np.arange(6) - 2.5)
+    board = 0.035 * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
+    burst, within = np.divmod(np.arange(frames), 4)
+    count = burst[-1] + 1
+    angle = rng.normal(size=(count, 3)) * [0.3, 0.6, 0.4]
+    incidence, azimuth = rng.uniform(0, 0.9, count), rng.uniform(0, 2 * np.pi, count)
+    way = np.stack([np.sin(incidence) * np.cos(azimuth), np.sin(incidence) * np.sin(azimuth),
+                    np.cos(incidence)], axis=-1)
+    away = np.exp(rng.uniform(np.log(0.25), np.log(0.9), count))[:, None]
+    place = -(rotation_from_vector(angle) @ (away * way)[..., None])[..., 0]
+    speed = rng.normal(size=(count, 6)) * [0.2, 0.2, 0.2, 0.5, 0.5, 0.5]
+    move = 0.1 * within[:, None] * speed[burst]
+    pose = Pose(rotation_from_vector(angle[burst] + move[:, 3:]), place[burst] + move[:, :3])
+    views = views_of(board, np.zeros((frames, len(board), 2)))
+    t = np.broadcast_to((3.0 * burst + 0.1 * within)[:, None], views.board.shape)
+    return pose, speed[burst], views._replace(frame=np.arange(frames), t=t)
+
+
+def names(found):
+    return {cause.effect for cause in found.causes}
+
+
+@pytest.mark.parametrize('seed', [3, 7])
+def test_a_rolling_shutter_in_bursts_is_no_tilt_of_the_sensor(seed):
+    """What happens in the pauses says nothing of how the camera moves."""
+    rng = np.random.default_rng(seed)
+    pose, speed, views = bursts(rng, 17)
+    table, later = (observe(AIR, (), where, views, 0.0, rng)
+                    for where in (pose, pose.retract(1e-4 * speed)))
+    exposed = 0.03 * (table.uv[:, 1:] / AIR.height - 0.5)
+    uv = table.uv + exposed * (later.uv - table.uv) / 1e-4
+    found = diagnose(replace(table, uv=uv + rng.normal(size=uv.shape) * SIGMA), AIR,
+                     free_intrinsics=True)
+    assert names(found) == {'rolling_shutter'}
+    readout = found.causes[0].parameters['readout']
+    assert abs(readout['value'] - 0.03) < 3 * readout['stderr'] < 0.03
+
+
+def test_a_tilt_beside_a_jump_stays_confirmed():
+    rng = np.random.default_rng(1)
+    pose, _, views = bursts(rng, 24)
+    terms = [(SessionStepEffect((float(views.t[12, 0]),)), np.array([0.01, 6.0, -5.0])),
+             (CATALOGUE['sensor_tilt'](), np.array([0.008, -0.008]))]
+    found = diagnose(observe(AIR, terms, pose, views, SIGMA, rng), AIR, free_intrinsics=True)
+    assert len(names(found)) == 2
+    step, = (cause for cause in found.causes if cause.effect == 'session_step')
+    tilt, = (cause for cause in found.causes if cause.effect != 'session_step')
+    assert 'sensor_tilt' in (tilt.effect, *tilt.indistinguishable_from)
+    jump = step.parameters['step1.cx']
+    assert abs(jump['value'] - 6.0) < 4 * jump['stderr']
+
+
+@pytest.fixture(scope='module')
+def false_tilt():
+    """Return the tests of a jump of the intrinsics that is fitted as a drift beside a tilt."""
+    rng = np.random.default_rng(4)
+    pose, views = scene(rng)
+    step = SessionStepEffect((float(views.t[8, 0]),)), np.array([0.004, 2.0, 1.0])
+    data = group_by_frame(observe(lens(), [step], pose, views, SIGMA, rng))
+    false = (FocalDriftEffect(2), np.zeros(2)), (CATALOGUE['sensor_tilt'](), np.zeros(2))
+    state = adjust(data, replace(initial_state(data, lens()), terms=false), ())
+    return EffectTests(NullModel.estimate(data, state, ()))
+
+
+def confounder(tests):
+    (_, drift, _), (tilt, columns, _) = tests.null.terms
+    return find_confounder(tests, tilt, columns, [('focal_drift', drift, ['session_step'])])
+
+
+def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_tilt):
+    assert confounder(false_tilt) == 'with session_step in place of focal_drift it is not needed'
+
+
+def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
+        false_tilt, monkeypatch):
+    """Significant it is here at any p-value."""
+    module = 'fisheye_svp_ros.diagnosis.confirmation'
+    monkeypatch.setattr(f'{module}.SIGNIFICANCE', 1e9)
+    gain = HeldOutGain(1.0, 0.5)
+    monkeypatch.setattr(EffectTests, 'held_out_gain', lambda *_: gain)
+    assert not confounder(false_tilt)
+    gain = HeldOutGain(1.0, 2.0)
+    assert confounder(false_tilt) == ('with session_step in place of focal_drift it gains nothing '
+                                      'on held-out frames beyond its error')
