@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
+from helpers.nodes import until
 
 if TYPE_CHECKING:
     from helpers.graph import Graph
+
+    from fisheye_svp_ros.detect.workers import BoundedCalls
 
 
 @pytest.fixture(autouse=True)
@@ -20,11 +23,34 @@ def frequent_reports(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyP
         monkeypatch.setattr(base, '_REPORT_PERIOD', 0.1)
 
 
+@pytest.fixture(scope='session')
+def searches() -> Iterator[Callable[..., BoundedCalls]]:
+    """Return what makes the process that searches images: the same one, which takes a second."""
+    from fisheye_svp_ros.detect.workers import BoundedCalls
+
+    class Lasting(BoundedCalls):
+        def stop(self) -> None:
+            until(lambda: (self.result(), not self.busy)[1])
+
+    made: list[Lasting] = []
+
+    def make(function: Any, first: Any) -> BoundedCalls:
+        made[:] = made or [Lasting(function, first)]
+        return made[0]
+
+    yield make
+    for one in made:
+        BoundedCalls.stop(one)
+
+
 @pytest.fixture
-def graph(ros_domain: int) -> Iterator[Callable[..., Graph]]:
+def graph(
+    ros_domain: int, searches: Callable[..., BoundedCalls], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Callable[..., Graph]]:
     """Return a function that starts a graph; each argument is a parameter NAME:=VALUE."""
     from helpers.graph import Graph
 
+    monkeypatch.setattr('fisheye_svp_ros.nodes.detector.BoundedCalls', searches)
     started: list[Graph] = []
 
     def start(*parameters: str) -> Graph:
