@@ -21,24 +21,25 @@ from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.threads import set_thread_count
 
 COMMANDS = {
-    'budget': 'at which range and angle the SVP error passes what the application allows',
-    'calibrate': 'a lens from measured observations: poses unknown, no start values',
-    'demo': 'the whole node graph as processes, recorded, summarised and plotted',
-    'detect': 'photographs, video or recordings of a board to observations',
-    'diagnose': 'what a simulation gets wrong about measured observations, and why',
-    'example': 'photographs of a bent board through a shifting lens, to try everything on',
-    'lens': 'a lens shown, checked, converted; also those of other tools',
-    'localize': 'a pose a frame, without start values: residuals, covariance',
-    'paper': "Kita's tables and figures beside the published ones, and past them",
-    'plan': 'which photographs to take to calibrate a lens: a shot list to print',
-    'plot': 'pictures of a recording, a table or a sweep',
-    'record': 'topics of the node graph to a rosbag2 recording (MCAP)',
-    'render': 'photographs of a chessboard through a lens, and the truth about them',
-    'run': 'one node, as `ros2 run` starts it, or several in one process',
-    'sweep': 'a sweep of simulated scenarios, offline, one row a scenario',
-    'table': 'a recording to a table, one row an input stamp',
-    'undistort': 'photographs and stereo pairs as ideal cameras take them; maps for cv2.remap',
-    'watch': 'the results of running nodes, live, in the terminal',
+    'budget': 'find the range and the angle at which the SVP error exceeds your limits',
+    'calibrate': 'calibrate a lens, or a rig, from observations; no poses, no initial guess',
+    'demo': 'run all nodes on simulated scenarios; record, tabulate and plot the errors',
+    'detect': 'find the points of a board in photographs, videos or recordings',
+    'diagnose': 'find the model errors in measured observations and name their causes',
+    'example': 'write example photographs: a bent board, a lens with a moving viewpoint',
+    'lens': 'show, check or convert a lens file, also those of other tools',
+    'localize': 'estimate one pose per frame, with residuals and covariance; no initial guess',
+    'paper': "reproduce the tables and figures of Kita's paper, and extend them",
+    'plan': 'plan the photographs that calibrate a lens; print them as a shot list',
+    'plot': 'plot a recording, a table or a sweep',
+    'record': 'record the topics of the nodes into a rosbag2 recording (MCAP)',
+    'render': 'render photographs of a chessboard through a lens, with their true corners and '
+              'poses',
+    'run': 'run one node, as `ros2 run` does, or several in one process',
+    'sweep': 'run a sweep of simulated scenarios offline; write one row per scenario',
+    'table': 'turn a recording into a table with one row per stamp of the input',
+    'undistort': 'undistort photographs, rectify stereo pairs, write maps for cv2.remap',
+    'watch': 'show the results of running nodes live in the terminal',
 }
 _SOLVING = ('budget', 'calibrate', 'demo', 'detect', 'diagnose', 'localize', 'paper', 'sweep')
 # Others project many points at once, for which the compiled engine takes every core.
@@ -67,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if str(error.name).startswith('fisheye_svp_ros'):
             raise
-        print(f'fisheye-svp: the Python package {error.name} is not installed, and this needs it',
+        print(f'fisheye-svp: this needs the Python package {error.name}, which is not installed',
               file=sys.stderr)
         return _BAD_INPUT
     except UnicodeEncodeError as error:
@@ -90,8 +91,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str]) -> None:
     parser = _Parser(
         prog='fisheye-svp',
-        description='What the single-viewpoint approximation of a fisheye lens costs, and what a '
-        'simulation gets wrong about measured image points.',
+        description='Measure what the single-viewpoint (SVP) approximation of a fisheye lens '
+                    'costs, and find the model errors in calibration data.',
     )
     parser.add_argument('--version', action='version', version=f'%(prog)s {__version__}')
     commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
@@ -138,15 +139,15 @@ def _refuse(parser: argparse.ArgumentParser, word: str) -> NoReturn:
     from difflib import get_close_matches
 
     near = get_close_matches(word.partition('=')[0], parser.format_help().split(), 1, 0.8)
-    parser.error(f'unknown argument {word}' + (f'; {near[0]}?' if near else ''))
+    parser.error(f'unknown argument {word}' + (f'; did you mean {near[0]}?' if near else ''))
 
 
 def _add_engine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--engine', choices=('auto', 'numpy', 'numba'),
-        help='what projects and solves: numpy, or numba (extra `fast`), which is compiled at its '
-        'first use on a machine (a minute); default: FISHEYE_SVP_ENGINE, or auto: numba for work '
-        'that is long enough, numpy otherwise',
+        help='numpy, or numba (extra `fast`), which compiles for about a minute at its first use '
+        'on a machine; auto: numba for long work, numpy otherwise; default: '
+        'FISHEYE_SVP_ENGINE, or auto',
     )
 
 

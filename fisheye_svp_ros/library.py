@@ -464,11 +464,13 @@ def rectify_maps(
 
 def _check_names(node: str, values: Mapping[str, Any]) -> None:
     if node not in sweeps.TABLES:
-        raise ParameterError(f'{node!r} is no node of a sweep: {", ".join(sweeps.TABLES)}')
+        raise ParameterError(f'{node!r} is not a node of a sweep; known are '
+                             f'{", ".join(sweeps.TABLES)}')
     known = [row.name for row in rows(sweeps.TABLES[node])]
     for name in (given.removeprefix(SWEEP) for given in values):
         if name not in known:
-            raise ParameterError(f'{name!r} is no parameter of {node}: {", ".join(known)}')
+            raise ParameterError(f'{name!r} is not a parameter of {node}; known are '
+                                 f'{", ".join(known)}')
 
 
 def _table(given: AnyObservations) -> Observations:

@@ -54,7 +54,7 @@ def render(
 
     pattern = parse_pattern(board)
     if pattern.kind != 'chessboard':
-        raise ParameterError(f'board {board!r}: chessboards alone can be rendered')
+        raise ParameterError(f'board {board!r}: only chessboards can be rendered')
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     return expose(load_lens(lens), printed, pose, Exposure(noise=noise),
                   np.random.default_rng(seed))

@@ -32,7 +32,7 @@ def calibrate_rig(
     table, _ = posable_observations(table, known)
     group, *others = rig_calibration.connected_cameras(table)
     if others:
-        raise ObservationError(f'{table.source}: nothing holds {" and ".join(others[0])} to '
+        raise ObservationError(f'{table.source}: {" and ".join(others[0])} cannot be related to '
                                f'{", ".join(group)}: no frame shows the target to both at once')
     return rig_calibration.calibrate_rig(table, known, table.cameras)
 

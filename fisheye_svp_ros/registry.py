@@ -50,9 +50,11 @@ class Registry(Mapping[str, T]):
         try:
             kind = entry.load()
         except Exception as cause:  # whatever somebody else's module raises
-            raise ParameterError(f'{whose} cannot be loaded ({cause}); mend it') from cause
+            raise ParameterError(
+                f'{whose} cannot be loaded ({cause}); fix or uninstall it') from cause
         if entry.name in self._own or getattr(kind, 'name', entry.name) != entry.name:
-            raise ParameterError(f'{whose} has a name of its own or of another; rename it')
+            raise ParameterError(
+                f'{whose}: the name is taken, or is not that of its class; rename it')
         if not issubclass(kind if isinstance(kind, type) else type(kind), self._base):
-            raise ParameterError(f'{whose} is no {self._base.__name__}; derive it from that')
+            raise ParameterError(f'{whose} is not derived from {self._base.__name__}')
         return kind

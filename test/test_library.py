@@ -154,11 +154,11 @@ def test_calibrate_writes_the_lens_of_the_command(
 
 
 def test_an_unknown_parameter_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"'noise' is no .*noise_px"):
+    with pytest.raises(ParameterError, match=r"'noise' is not a .*noise_px"):
         fsvp.simulate_scenario(noise=0.1)
-    with pytest.raises(ParameterError, match="'radii' is no parameter"):
+    with pytest.raises(ParameterError, match="'radii' is not a parameter"):
         fsvp.sweep({'radii': [1.0]})
-    with pytest.raises(ParameterError, match="'solver' is no node"):
+    with pytest.raises(ParameterError, match="'solver' is not a node"):
         fsvp.sweep({'radius': [1.0]}, solver={})
 
 

@@ -67,7 +67,7 @@ def test_lenses_of_a_rig_do_not_go_into_a_folder_called_yaml(
     fsvp.write_observations(tmp_path / 'o.csv', seen.observations)
     assert cli.main(['calibrate', str(tmp_path / 'o.csv'), '--image-size', '424x400', '-o',
                      str(tmp_path / 'lens.yaml')]) == 2
-    assert 'the lenses of left, right and their rig go into a folder' in capsys.readouterr().err
+    assert 'left, right and their rig are written to a folder' in capsys.readouterr().err
     assert not (tmp_path / 'lens.yaml').exists()
 
 

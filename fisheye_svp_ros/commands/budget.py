@@ -21,26 +21,27 @@ _LIMITS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='a lens file with a viewpoint_shift or a port, or the name of one '
-                        'that comes with the package')
+                        help='lens file with a viewpoint_shift or a port, or the name of a lens '
+                        'of this package')
     parser.add_argument('--range', type=float, default=0.5, metavar='M', dest='working_range',
                         help='nearest range of the landmarks or targets; default: 0.5')
     parser.add_argument('--spread', type=float, metavar='DEG',
-                        help='largest angle of the landmarks from the axis; default: all of the '
-                        'field of view but 1 degree, of a lens from `calibrate` as far as its '
-                        'image points reached')
+                        help='largest angle of the landmarks from the axis; default: 1 degree '
+                        'less than the field of view, or, for a lens from `calibrate`, the '
+                        'largest angle of its image points')
     parser.add_argument('--noise', type=float, default=0.3, metavar='PX',
-                        help='noise of u and of v; default: 0.3')
+                        help='standard deviation of u and of v; default: 0.3')
     parser.add_argument('--baseline', type=float, default=0.15, metavar='M',
-                        help='of the stereo rig; default: 0.15')
+                        help='baseline of the stereo rig; default: 0.15')
     parser.add_argument('--style', default='parallel', metavar='STYLE',
-                        help='of the rig: parallel, vergent or divergent; default: parallel')
+                        help='style of the stereo rig: parallel, vergent or divergent; default: '
+                        'parallel')
     for option, unit, _, what in _LIMITS.values():
         parser.add_argument(option, type=float, metavar=unit,
-                            help=f'{what} that is allowed; where none is stated, all are held '
-                            'against what noise alone causes')
+                            help=f'largest {what} that you allow; default: unlimited, or, without '
+                            'any limit, what noise alone causes')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for budget.json and budget.png')
+                        help='folder to write budget.json and budget.png to')
 
 
 def run(args: argparse.Namespace) -> None:

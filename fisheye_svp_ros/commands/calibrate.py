@@ -47,34 +47,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     parser.add_argument('--model', default='kannala_brandt', choices=IMAGE_HEIGHTS,
                         metavar='MODEL', help='image-height curve: ' + ', '.join(IMAGE_HEIGHTS)
-                        + '; kannala_brandt by default')
+                        + '; default: kannala_brandt')
     parser.add_argument('--image-size', type=image_sizes, metavar='WxH',
-                        help='width and height of the image, px, for cameras whose images differ '
-                        'left=1280x960,right=640x480; photographs bring their own, and so do '
-                        'observations from `detect`')
+                        help='image size, px; if the cameras differ, left=1280x960,right=640x480; '
+                        'not needed for photographs and for observations from `detect`')
     parser.add_argument('--free', type=_names, metavar='NAME,...',
                         help='parameters to fit: f (or fx,fy), cx, cy, the coefficients of the '
-                        'model, those of a viewpoint shift (e0,e1,e2 or '
-                        'thickness,refractive_index), those of a port (port_medium_index, ...); '
-                        'all but the shift, and the place of the port, by default')
+                        'model, of a viewpoint shift (e0,e1,e2 or '
+                        'thickness,refractive_index), of a port (port_medium_index, ...); '
+                        'default: all except the viewpoint shift; of a port, only its place')
     add_port_arguments(parser)
     parser.add_argument('--lens', metavar='AIR.yaml', type=Path,
-                        help='the same camera calibrated in air: with --medium or --port the '
-                        'place of the port alone is fitted')
+                        help='the same camera calibrated in air; with --medium or --port, only '
+                        'the place of the port is fitted')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help='poses of the flange of a robot that carried the camera, in its '
-                        'base: where the camera sits in the flange is fitted too')
+                        help='poses of the robot flange that carries the camera, in the robot '
+                        'base; also fits the pose of the camera in the flange')
     parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
-                        help='lens file to write; covariances go beside it as .calibrate.json, '
-                        'the report as calibration.html; for several cameras a folder, for a lens '
-                        'of each, rig.yaml, rig.json, rig.urdf, tf_static.yaml and camchain.yaml')
+                        help='lens file to write; covariances are written next to it as '
+                        '.calibrate.json, the report as calibration.html; for a rig, a '
+                        'folder: one lens per camera, rig.yaml, rig.json, rig.urdf, '
+                        'tf_static.yaml and camchain.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
     """Calibrate, print the parameters, write the lens, or two lenses and the rig."""
     if args.lens and not (args.medium or args.port):
-        raise ParameterError(f'--lens {args.lens}: what did the camera look through? Add --medium '
-                             'water, or --port')
+        raise ParameterError(f'--lens {args.lens} needs --medium (for example water) or --port: '
+                             'what the camera looked through')
     observations, sizes = read_input(args.observations, args)
     sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
     if args.lens:
@@ -84,12 +84,12 @@ def run(args: argparse.Namespace) -> None:
     unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
     if unknown:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
-        raise ParameterError(f'{args.observations}: the size of the images is not known; add '
-                             f'--image-size {head}1280x800')
+        raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
+                             f'{head}1280x800')
     if args.output and args.output.suffix in ('.yaml', '.yml') and len(observations.cameras) > 1:
         raise ParameterError(f'-o {args.output}: the lenses of {", ".join(observations.cameras)} '
-                             f'and their rig go into a folder, as in '
-                             f'-o {args.output.with_suffix("")}')
+                             'and their rig are written to a folder; use -o '
+                             f'{args.output.with_suffix("")}')
     found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
@@ -163,8 +163,8 @@ def _calibrate_camera(
         with stages(_fit_line(result)):  # the lens is there in a second, its errors take longer
             trusted = assess_lens(kept, result.adjusted.lens, result.adjusted.names)
     except np.linalg.LinAlgError as cause:
-        raise GeometryError(f'{table.source}: the lens found has no rays to points that were seen '
-                            f'({cause}); is what the camera looked through another?') from cause
+        raise GeometryError(f'{table.source}: the fitted lens has no rays to some of the observed '
+                            f'points ({cause}); check --port and --medium') from cause
     lens = with_covariance(result.adjusted.lens, trusted)
     return CalibratedCamera(lens, result, trusted, kept, args.model, hand_eye)
 
@@ -173,7 +173,7 @@ def _fit_line(result: Calibration) -> str:
     """Return the intrinsics as they were fitted, in a line."""
     known = list(result.adjusted.lens.parameters.items())[:4]
     values = ', '.join(f'{name} {value:.6g}' for name, value in known)
-    return f'{values}; finding their standard errors'
+    return f'{values}; computing their standard errors'
 
 
 def _write(found: CalibratedCamera, path: Path) -> None:
@@ -192,8 +192,7 @@ def _print(found: CalibratedCamera) -> None:
          for name, value, error, range_, unit in found.parameter_rows()],
     )
     if open_ones:
-        print('  with any target: 95 %, its shape, scale and boards as the data have them and as '
-              'they are said to be')
+        print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
           f'{np.degrees(found.result.reached):.2f}; {noise_text(found.result.sigma)}')
     if found.hand_eye:

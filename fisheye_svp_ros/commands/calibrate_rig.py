@@ -41,9 +41,9 @@ def calibrate_cameras(
         largest = max(groups, key=len)
         for group in groups:
             if group != largest:
-                say(f'rig: nothing holds {" and ".join(group)} to {", ".join(largest)}: no frame '
-                    'shows the target to both at once; photograph it where two cameras see it, '
-                    'and give photographs of one moment one frame number')
+                say(f'rig: {" and ".join(group)} cannot be related to {", ".join(largest)}: no '
+                    'frame shows the target in both; photograph it where two cameras see it, and '
+                    'give simultaneous photographs the same frame number')
         if len(largest) < 2:
             return
         pair = rig_cameras(largest)
@@ -69,14 +69,14 @@ def _warnings(
         yield found.reason
     own = max((lenses[name].calibration or {}).get('rms_px', np.inf) for name in found.cameras)
     if found.total_rms_px > MAX_RIG_RATIO * own:
-        yield (f'with it {found.total_rms_px:.2f} px are left, where the cameras alone leave '
-               f'{own:.2f} px at most: they moved, were not photographed at the same moments, or '
-               'a lens is wrong')
+        yield (f'rms {found.total_rms_px:.2f} px with a rigid rig, at most {own:.2f} px for each '
+               'camera alone: the cameras moved, their photographs were not simultaneous, or a '
+               'lens is wrong')
     for name, shared in zip(found.cameras, found.shared.tolist(), strict=True):
         if shared < MIN_SHARED_FRAMES:
-            what = 'it' if len(found.cameras) == 2 else name
-            yield (f'{shared} of the frames alone show {what}; photograph the target with two '
-                   'cameras at once more often')
+            what = 'are shared' if len(found.cameras) == 2 else f'relate {name} to the others'
+            yield (f'only {shared} frames {what}; take more photographs of the target with two '
+                   'cameras at once')
             if len(found.cameras) == 2:
                 return
 
@@ -90,7 +90,7 @@ def _write(found: RigCalibration, lenses: Sequence[Lens], folder: Path) -> None:
     try:
         write_text(folder / 'camchain.yaml', kalibr.write_chain(lenses, found.steps()))
     except FisheyeSvpError as cause:
-        say(f'no camchain of Kalibr: {cause}')
+        say(f'camchain.yaml of Kalibr is not written: {cause}')
 
 
 def _document(found: RigCalibration) -> dict[str, Any]:
@@ -121,5 +121,5 @@ def _print(found: RigCalibration) -> None:
                  ) if i else ('', '')
         rows.append((name, *place, *error, str(found.shared[i]), f'{found.rms_px[i]:.4f}'))
     print_table(f'rig: cameras in {found.cameras[0]}, from {len(found.frame)} frames that several '
-                'of them saw', ('camera', 'x, mm', 'y, mm', 'z, mm', '±, mm', '±, deg', 'frames',
+                'cameras see', ('camera', 'x, mm', 'y, mm', 'z, mm', '±, mm', '±, deg', 'frames',
                                 'rms, px'), rows)

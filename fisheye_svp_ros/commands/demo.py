@@ -53,8 +53,8 @@ _PATIENCE = 900.0  # s; only a hang takes this long
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('-o', '--output', type=Path, default=Path('demo'), metavar='DIR',
-                        help='folder for the recording (an earlier one is replaced), demo.json, '
-                        'table.csv, table.parquet and pictures; default: demo')
+                        help='folder to write the recording (replaces an earlier one), demo.json, '
+                        'table.csv, table.parquet and pictures to; default: demo')
     parser.add_argument('--lenses', nargs='+', default=list(LENSES), choices=LENSES,
                         metavar='LENS', help=f"the paper's lenses to run: {' '.join(LENSES)}")
     parser.add_argument('--radii', nargs='+', type=float, default=list(RADII), choices=RADII,
@@ -69,7 +69,8 @@ def run(args: argparse.Namespace) -> None:
     """
     bag: Path | None = args.output / _RECORDING
     if reason := missing_rclpy():
-        print(f'  Without ROS 2 ({reason}): the same scenarios in one process, no node graph.')
+        print(f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without '
+              'nodes.')
         bag = None
         columns, fields = compute_demo(args.lenses, args.radii)
     else:
@@ -108,7 +109,7 @@ def record(bag: Path, logs: Path, lenses: Sequence[str], radii: Sequence[float])
     """Run the node graph through its scenarios, in lock-step, into a recording."""
     mark = logs.parent / _MARK
     if bag.exists() and not mark.exists():
-        raise OutputError(f'{bag}: it is there, and no demo has made it; choose another -o')
+        raise OutputError(f'{bag}: it exists and is not from an earlier demo; choose another -o')
     write_text(mark, 'fisheye-svp demo made `recording`, and replaces it.\n')
     shutil.rmtree(bag, ignore_errors=True)
     cameras = []

@@ -19,14 +19,15 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('photographs', nargs='+', metavar='PHOTOS',
-                        help='image files, folders of them (left/ and right/ for a rig), videos, '
+                        help='image files or folders (left/ and right/ for a rig), videos, '
                         'rosbag2 recordings with Image or CompressedImage')
     add_board_arguments(parser, required=True)
     parser.add_argument('-o', '--output', type=Path, metavar='OBS.csv',
-                        help='observations to write; what was found where goes beside them as '
-                        '.detect.json')
+                        help='observations to write; the details by photograph are written next '
+                        'to them as .detect.json')
     parser.add_argument('--overlays', type=Path, metavar='DIR',
-                        help='folder for each photograph with its corners, and a coverage map')
+                        help='folder to write each photograph with its corners to, and a map of '
+                        'the coverage')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -56,15 +57,16 @@ def _print(detection: Detection, board: str) -> None:
     if len(cameras) > 1:
         both = len({one.key for i, one in enumerate(detection.searched) if i not in pairing.alone})
         apart = f', {1e3 * pairing.apart:.3g} ms apart at most' if pairing.way == 'stamp' else ''
-        print(f'  cameras {", ".join(cameras)}: {both} moments shared, paired by {pairing.way}'
-              f'{apart}; {len(pairing.alone)} photographs without a partner')
+        print(f'  cameras {", ".join(cameras)}: {both} simultaneous pairs, matched by '
+              f'{pairing.way}{apart}; {len(pairing.alone)} photographs without a partner')
     sure = detection.certainty[[one.points is not None for one in detection.searched]]
     if np.isnan(sure).any():
-        print('  the board looks the same when turned; too few photographs determine its turn')
+        print('  the board looks the same when turned; too few photographs to determine its '
+              'orientation')
     elif (sure < 1).any():
-        print('  the board looks the same when turned; photographs were turned until their '
-              f'residuals agree: {100 * sure.mean():.1f} % sure on average, '
-              f'{100 * sure.min():.0f} % at worst')
+        print('  the board looks the same when turned; orientations were chosen by their '
+              f'residuals: {100 * sure.mean():.1f} % sure on average, {100 * sure.min():.0f} % at '
+              'worst')
 
 
 def _document(detection: Detection, board: str) -> dict[str, Any]:

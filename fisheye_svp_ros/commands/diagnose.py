@@ -40,39 +40,39 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser, 'the simulation: ')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help='poses of the camera (of a rig: its right one) or of the flange of a '
-                        'robot that carries it, which the data separate; unknown and fitted by '
-                        'default')
+                        help='poses of the camera (of a rig: the right one), or of the robot '
+                        'flange that carries it; the data tell which; default: unknown, and '
+                        'fitted')
     parser.add_argument('--free', choices=['intrinsics'],
-                        help='fit the intrinsics too; always so for a lens from `calibrate`')
+                        help='fit the intrinsics too; a lens from `calibrate` always does')
     parser.add_argument('--held-out', metavar='TEST',
-                        help='other observations of the same camera and target to measure the '
-                        'gain on; by default cross-validation on OBS')
+                        help='other observations of the same camera and target, to measure the '
+                        'gain on; default: cross-validation on OBS')
     parser.add_argument('--against', metavar='OTHER',
-                        help='other observations of the same camera, of another target or another '
-                        'day: what moves with the lens must hold there too')
+                        help='other observations of the same camera, with another target or of '
+                        'another day; causes in the lens must hold there too')
     parser.add_argument('--with', dest='included', action='append', default=[], metavar='NAME',
-                        help='a cause that is known to be there: it is fitted without a test')
+                        help='an effect that is known to be present: fit it without a test')
     parser.add_argument('--without', dest='left_out', action='append', default=[], metavar='NAME',
-                        help='an effect that is known not to be there: it is not tried')
+                        help='an effect that is known to be absent: do not test it')
     parser.add_argument('--quick', action='store_true',
-                        help='a first answer in seconds: one round on 1500 to 3000 of the points, '
-                        'without held-out frames in the choice')
+                        help='a first answer in seconds: one round on 1500 to 3000 points, '
+                        'selection without held-out frames')
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
-                        help='distance, m, at which the ray errors of the lenses are stated as '
-                        'well, besides 0.3, 1 and 5 m')
+                        help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 '
+                        'm')
     parser.add_argument('--next', type=int, default=0, metavar='N', dest='count',
-                        help='say which N photographs to take next: those that settle what the '
-                        'cause may be mistaken for')
+                        help='list the N photographs to take next: those that separate the '
+                        'confounded causes best')
     parser.add_argument('--for', dest='number', metavar='NAME',
                         help='with --next: minimize the error of one number (e0, fx, ...)')
     parser.add_argument('--room', type=float, nargs=2, metavar='M',
                         help='with --next: nearest and furthest distance at which the board is '
-                        'sharp; by default a little beyond those that there are')
+                        'sharp; default: slightly beyond the distances in OBS')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for report.html and its pictures, diagnosis.json, '
-                        'extended_lens.yaml, residuals.csv; of a rig a folder in it for the lens '
-                        'of each camera, and rig.yaml')
+                        help='folder to write report.html and its pictures, diagnosis.json, '
+                        'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
+                        'and a subfolder for the lens of each camera')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.study.known_errors import known_errors
 
     if (args.number or args.room) and not args.count:
-        raise ParameterError('--for and --room go with --next N')
+        raise ParameterError('--for and --room need --next N')
     given = load_lenses(args.lens)
     if args.count and len(given) > 1:
         raise ParameterError('--next plans the photographs of one camera; give one lens')
@@ -111,12 +111,13 @@ def run(args: argparse.Namespace) -> None:
             progress('errors where the truth is known', 0.88)
             known = known_errors(diagnosis.simulation, diagnosis.model, names)
         except (GeometryError, np.linalg.LinAlgError) as cause:
-            poses_too = (f' Or are the poses of {args.poses} not those of the camera in the world?'
+            poses_too = (f' Check that the poses of {args.poses} are those of the camera in the '
+                         'world.'
                          if args.poses else '')
             raise GeometryError(
-                f'{args.observations}: its views cannot be fitted with this lens: {cause}; is it '
-                'that of another camera, or of another image size? `localize` says how far each '
-                f'is off.{poses_too}'
+                f'{args.observations}: its views cannot be fitted with this lens: {cause}; check '
+                'camera and image size of the lens; `localize` lists the residual of each '
+                f'view.{poses_too}'
             ) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:

@@ -34,7 +34,7 @@ fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
-                        help='folder for the photographs, the truth and a README')
+                        help='folder to write the photographs, the truth and a README to')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -50,4 +50,4 @@ def run(args: argparse.Namespace) -> None:
                           args.output / 'photographs', truth)
         save_lens(lens, truth / 'lens.yaml')
         write_text(args.output / 'README.md', _README)
-    print(f'{args.output}: README.md says which three commands explain them')
+    print(f'{args.output}: photographs and README.md, which lists three commands to try on them')

@@ -42,8 +42,8 @@ def process_pool(count: int) -> Iterator[Workers]:
         try:
             yield Workers(executor, _TASKS_PER_WORKER * count)
         except BrokenExecutor as cause:
-            raise SweepError('a worker process died (out of memory?); what is done is kept, '
-                             '--resume goes on with fewer --workers') from cause
+            raise SweepError('a worker process died (out of memory?); finished parts are kept; '
+                             'continue with --resume and fewer --workers') from cause
         except (KeyboardInterrupt, SystemExit):
             # Nobody waits any longer for what they are at.
             for process in multiprocessing.active_children():
@@ -116,8 +116,8 @@ def dask(address: str) -> Iterator[Workers]:
         try:
             yield Workers(client.get_executor(pure=False), ahead)
         except (distributed.KilledWorker, CommClosedError) as cause:
-            raise SweepError(f'the Dask cluster gave up ({cause}); what is done is kept, --resume '
-                             'goes on') from cause
+            raise SweepError(f'the Dask cluster gave up ({cause}); finished parts are kept; '
+                             'continue with --resume') from cause
 
 
 def _end_with_parent() -> None:

@@ -31,22 +31,22 @@ _VISIBLE_PX = 5e-4  # px
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('lens', metavar='LENS',
-                        help='a lens file of this package or of another tool (FILE#cam1 for '
-                        'another camera than the first), or the name of one that comes with it')
+                        help='lens file of this package or of another tool (FILE#cam1: another '
+                        'camera than the first), or the name of a lens of this package')
     parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
-                        help='form of the file to write; by default a lens file of this package')
+                        help='format of the file to write; default: a lens file of this package')
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
-                        help='of a lens whose viewpoint moves: fit the curve of the form, which '
-                        'has one viewpoint, to points at this range, m, or inf')
+                        help='range, m or inf, at which a format with a single viewpoint is '
+                        'fitted to a lens whose viewpoint moves')
 
 
 def run(args: argparse.Namespace) -> None:
     """Show the lens, write it, say what the form cannot hold."""
     if args.format and not args.output:
-        raise ParameterError(f'--format {args.format}: name the file to write, -o FILE')
+        raise ParameterError(f'--format {args.format} needs -o FILE')
     if args.range_m is not None and not args.format:
-        raise ParameterError(f'--range {args.range_m:g}: name the form to write, --format ros')
+        raise ParameterError(f'--range {args.range_m:g} needs --format, for example ros')
     path = lens_path(args.lens)
     foreign = read_lens_file(path)
     if foreign is not None and not foreign.lenses and not args.format:
@@ -56,8 +56,8 @@ def run(args: argparse.Namespace) -> None:
         return
     lens = load_with_notes(path)
     if several := cameras_in(path):
-        say(f'{path}: it holds {", ".join(several)}; this is the first, {path}#{several[1]} is '
-            'another')
+        say(f'{path}: it holds {", ".join(several)}; the first is shown; use {path}#{several[1]} '
+            'for another')
     print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
           ' deg')
     for name, value in lens.parameters.items():
@@ -71,8 +71,8 @@ def run(args: argparse.Namespace) -> None:
     if foreign is not None:
         for camera, worst in foreign.worst_px.items():
             if worst > 0:
-                print(f'  {camera}: a fit of kannala_brandt to {foreign.form}, {worst:.2g} px off '
-                      'at worst')
+                print(f'  {camera}: kannala_brandt fitted to {foreign.form}, at most {worst:.2g} '
+                      'px off')
         _rigs(foreign)
     if args.output and args.format:
         _convert(lens, args)
@@ -86,8 +86,8 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
     if args.range_m is not None:
         given, worst = nearest_svp_lens(lens, args.range_m)
         ranges = tuple(sorted({*_RANGES, args.range_m}))
-        print(f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off at '
-              'worst there')
+        print(f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off there '
+              'at most')
     text = write_foreign(given, args.format)
     write_text(args.output, text)
     written = read_foreign(args.output, text)
@@ -121,9 +121,9 @@ def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands
     off = np.linalg.norm(project(lens, points).uv - project(written, points).uv, axis=-1)
     worst = np.fmax.reduce(off, axis=-1)
     if np.fmax.reduce(worst, axis=None) > _VISIBLE_PX:
-        print_table('without it image points are off by up to, px',
+        print_table('largest error of image points without it, px',
                     ('deg', *map(range_text, ranges)),
                     [(str(angle), *('-' if np.isnan(value) else f'{value:.3f}' for value in row))
                      for angle, row in zip(angles, worst, strict=True)])
         if as_it_stands and 'the viewpoint shift' in named:
-            print('  --range M fits the curve to points at a range, and leaves nothing there')
+            print('  --range M fits the curve at one range, without error there')

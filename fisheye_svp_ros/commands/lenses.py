@@ -18,9 +18,9 @@ LARGE_DEVIATION = 0.5  # px, of a lens from what another tool's file says
 def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> None:
     """Declare --lens, which may be given once a camera."""
     parser.add_argument('--lens', required=True, action='append', metavar='[CAMERA=]LENS',
-                        help=f'{purpose}a lens file, also of other tools, or the name of one that '
-                        'comes with the package; left=LENS and right=LENS for a rig, or a file '
-                        'or folder that holds both')
+                        help=f'{purpose}lens file, also of other tools, or the name of a lens of '
+                        'this package; for a rig, left=LENS and right=LENS, or a file or '
+                        'folder that holds both')
 
 
 def load_with_notes(path: str | Path) -> Lens:
@@ -39,8 +39,8 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
         say(f'{path}: the principal point ({lens.cx:.1f}, {lens.cy:.1f}) lies outside the image '
             f'of {lens.width}x{lens.height} px; check cx, cy and the image size')
     if worst > LARGE_DEVIATION:
-        say(f'{path}: no lens here comes nearer than {worst:.2g} px to the model of this file; '
-            'calibrate again from its photographs')
+        say(f'{path}: the nearest lens is {worst:.2g} px off the model of this file; calibrate '
+            'again from its photographs')
 
 
 class Lenses(dict[str, 'Lens']):
@@ -64,7 +64,9 @@ def load_lenses(given: Sequence[str]) -> Lenses:
         if not equals or is_there(Path(without_camera(text)[0])):
             camera, path = '', text
         if camera in lenses:
-            raise LensError(f'--lens {text}: there is one {camera or "without a camera"} already')
+            raise LensError(f'--lens {text}: a lens '
+                            f'{"of camera " + camera if camera else "without a camera"} is '
+                            'already given')
         file = lens_path(path)
         lenses[camera] = load_with_notes(file)
         if not camera:
@@ -98,6 +100,6 @@ def _in_order(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
         return {camera: named[camera] for camera in cameras}
     if len(cameras) != len(named):
         raise LensError(f'the lens file holds {", ".join(named)}, the observations '
-                        f'{", ".join(cameras)}; say which is whose: --lens {cameras[0]}='
-                        f'FILE#{lenses.names[0]} ...')
+                        f'{", ".join(cameras)}; assign them: --lens '
+                        f'{cameras[0]}=FILE#{lenses.names[0]} ...')
     return dict(zip(sorted(cameras), lenses.in_file, strict=True))

@@ -32,21 +32,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_observation_arguments(parser)
     add_lens_argument(parser)
     parser.add_argument('--model-error', action='store_true',
-                        help='covariances with the errors that the lens file states: its '
-                        'parameters, and its unexplained error (an extended_lens.yaml)')
+                        help='include in the covariances the errors stated in the lens file: of '
+                        'its parameters, and unexplained (extended_lens.yaml)')
     parser.add_argument('--rig', metavar='RIG',
-                        help='where the cameras of a rig stand: rig.yaml from `calibrate`, the '
-                        'folder that holds it, a camchain; one pose per frame from all cameras, '
-                        'of the first of them')
+                        help='poses of the cameras of a rig: rig.yaml from `calibrate`, its '
+                        'folder, or a camchain; gives one pose per frame from all cameras, '
+                        'that of the first camera')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for localize.json, poses.csv, residuals.csv, covariance.csv; '
-                        'of cameras without --rig, a folder in it for each')
+                        help='folder to write localize.json, poses.csv, residuals.csv and '
+                        'covariance.csv to; for several cameras without --rig, one subfolder '
+                        'each')
 
 
 def run(args: argparse.Namespace) -> None:
     """Localize every frame, print the poses, write the results."""
     if args.rig and args.model_error:
-        raise ParameterError('--model-error is for one camera at a time; leave --rig out')
+        raise ParameterError('--model-error works for one camera at a time; leave --rig out')
     given = load_lenses(args.lens)
     observations, sizes = read(args.observations, args)
     lenses = lenses_of(observations.cameras, given)
@@ -91,7 +92,8 @@ def _print(
             f'{rms_px(measured.inlier_residual[i]):.4f}', *place,
             f'{1000 * worst[0][i]:.3f}', f'{np.degrees(worst[1][i]):.4f}',
         ))
-    header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm', 'and deg')
+    header = ('frame', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm',
+              'std. error deg')
     print_table(
         f'{source}: {int(views.used.sum())} points in {len(views.frame)} frames, '
         f'rms {rms_px(measured.inlier_residual):.4f} px',
@@ -100,7 +102,7 @@ def _print(
     if len(views.frame) > MAX_TABLE_ROWS:
         print(f'  and {len(views.frame) - MAX_TABLE_ROWS} more frames')
     said = noise_text(measured.sigma) if uncertainty is None else _parts_text(uncertainty)
-    print(f'  {said}, in the worst direction')
+    print(f'  {said}, largest over all directions')
 
 
 def _frame_label(table: Observations, frame: int) -> str:

@@ -57,14 +57,14 @@ def _print(table: Observations, cameras: tuple[str, ...], found: RigLocalization
             *(f'{1000 * value:.3f}' for value in found.pose.position[i]),
             f'{1000 * worst[0]:.3f}', f'{np.degrees(worst[1]):.4f}'))
     print_table(
-        f'{table.source}: {cameras[0]} in the world, by {int(data.views.used.sum())} points of '
-        f'{len(found.table.cameras)} cameras in {len(found.frame)} frames, '
-        f'rms {rms_px(found.residual):.4f} px',
+        f'{table.source}: {cameras[0]} in the world, from {int(data.views.used.sum())} points of '
+        f'{len(found.table.cameras)} cameras in {len(found.frame)} frames, rms '
+        f'{rms_px(found.residual):.4f} px',
         ('frame', 'cameras', 'points', 'rms px', 'x mm', 'y mm', 'z mm', 'std. error mm',
-         'and deg'), rows, words=('cameras',))
+         'std. error deg'), rows, words=('cameras',))
     if len(found.frame) > MAX_TABLE_ROWS:
         print(f'  and {len(found.frame) - MAX_TABLE_ROWS} more frames')
-    print(f'  {noise_text(found.sigma)}, in the worst direction')
+    print(f'  {noise_text(found.sigma)}, largest over all directions')
 
 
 def _write(folder: Path, cameras: tuple[str, ...], found: RigLocalization) -> None:

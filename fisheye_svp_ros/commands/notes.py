@@ -53,14 +53,14 @@ def _first_today(name: str) -> bool:
 def note_left_out(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that could not be posed, if there are any."""
     if frames:
-        say(f'left out, since their points do not fix a pose (all near one line, or of '
-            f'another lens?): {list_frames(table, frames)}')
+        say('left out, their points do not determine a pose (all near one line, or of another '
+            f'lens?): {list_frames(table, frames)}')
 
 
 def note_copies(table: Observations, frames: Sequence[int]) -> None:
     """Name the frames of a table that are other frames once more, if there are any."""
     if frames:
-        say('left out, since their image points are those of an earlier frame: '
+        say('left out, their image points repeat those of an earlier frame: '
             f'{list_frames(table, frames)}')
 
 
@@ -68,7 +68,7 @@ def note_huge(table: Observations) -> None:
     """Ask for the unit of a target that is larger than targets are."""
     across = float((table.xyz.max(axis=0) - table.xyz.min(axis=0)).max())
     if across > _MAX_TARGET_SIZE:
-        say(f'the target is {across:.0f} m across; x, y, z must be in m: are these mm?')
+        say(f'the target is {across:.0f} m across; x, y, z must be in m, not in mm')
 
 
 def note_gross_errors(table: Observations, gross: Outliers) -> None:
@@ -81,7 +81,8 @@ def note_gross_errors(table: Observations, gross: Outliers) -> None:
         frames = table.frame[gross.rows]
         whole = [frame for frame in dict.fromkeys(frames.tolist())
                  if (frames == frame).sum() == (table.frame == frame).sum()]
-        views = f'; all points of {list_frames(table, whole)}: in another order?' if whole else ''
+        views = (f'; all points of {list_frames(table, whole)} are outliers: check their order'
+                 if whole else '')
         say(f'{len(gross.rows)} of {len(table)} points are outliers and are rejected, '
             f'furthest {worst}{views}')
 

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('-o', '--output', type=Path, default=Path('paper'), metavar='DIR',
-                        help='folder for paper.json, paper.md, paper.html and the pictures; '
-                        'default: paper')
+                        help='folder to write paper.json, paper.md, paper.html and the pictures '
+                        'to; default: paper')
 
 
 def run(args: argparse.Namespace) -> None:

@@ -33,16 +33,17 @@ _UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False) -> None:
     """Declare what a search for a board in photographs needs."""
     parser.add_argument('--board', required=required, metavar='SPEC',
-                        help='what the photographs show: chessboard:9x6:24.23mm (inner corners), '
-                        'charuco:7x5:30mm:22mm:DICT_5X5_100, aprilgrid:target.yaml, '
-                        'circles:7x5:20mm[:asymmetric], squares:3x4:30mm:30mm (side, gap)')
+                        help='the board in the photographs: chessboard:9x6:24.23mm (inner '
+                        'corners), charuco:7x5:30mm:22mm:DICT_5X5_100, '
+                        'aprilgrid:target.yaml, circles:7x5:20mm[:asymmetric], '
+                        'squares:3x4:30mm:30mm (side, gap)')
     parser.add_argument('--detector', choices=DETECTORS, default='',
-                        help='what finds the points; by default the best for the board')
+                        help='detector; default: the most accurate one for the board')
     parser.add_argument('--every', type=_count, default=1, metavar='N',
-                        help='take one of N photographs or video frames')
+                        help='use every Nth photograph or video frame')
     parser.add_argument('--sync', type=_seconds, metavar='TIME',
-                        help='largest difference of the stamps (of messages, or in the names of '
-                        'files) of one moment of a rig (5ms)')
+                        help='for a rig: largest difference between the stamps of simultaneous '
+                        'images (of messages, or in file names); default: 5ms')
 
 
 def search_options(args: argparse.Namespace) -> tuple[str, ...]:
@@ -56,7 +57,7 @@ def search_options(args: argparse.Namespace) -> tuple[str, ...]:
 def add_observation_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare OBS, and what a search needs where these are photographs."""
     parser.add_argument('observations', metavar='OBS',
-                        help='observations: a CSV file, a folder of ORPC files, a recording; or '
+                        help='observations (CSV file, folder of ORPC files, recording), or '
                         'photographs, with --board')
     add_board_arguments(parser)
 
@@ -74,7 +75,7 @@ def read_input(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes
         detection = search([path], args)
         return detection.observations, detection.image_sizes
     if is_photographs(Path(path)):
-        raise ParameterError(f'{path}: these are photographs; say what they show, for example '
+        raise ParameterError(f'{path}: these are photographs; name their board, for example '
                              '--board chessboard:9x6:24mm')
     table = read_observations(path)
     return replace(table, photographs=_photographs_beside(Path(path), table.cameras)), {}
@@ -91,7 +92,7 @@ def _photographs_beside(
         entries = [(int(one['frame']), str(one['camera']), str(one['name']))
                    for one in read_json(beside, ObservationError).get('photographs', ())]
     except (KeyError, TypeError, ValueError) as cause:
-        raise ObservationError(f'{beside}: photographs are no list of name, camera and frame '
+        raise ObservationError(f'{beside}: photographs is not a list of name, camera and frame '
                                f'({cause}); run `fisheye-svp detect` again') from cause
     return tuple(one for one in entries if one[0] >= 0 and one[1] in cameras)
 
@@ -109,7 +110,7 @@ def sizes_beside(path: Path) -> Sizes:
             case [int(width), int(height)] if width > 0 < height:
                 sizes[camera] = width, height
     if not sizes:
-        raise ObservationError(f'{beside}: image_sizes are no whole numbers; give --image-size')
+        raise ObservationError(f'{beside}: image_sizes must be whole numbers; give --image-size')
     return sizes
 
 
@@ -119,7 +120,7 @@ def image_sizes(text: str) -> Sizes:
     sizes = {camera.strip(): image_size(size) for camera, _, size in parts}
     if len(sizes) < len(parts):
         raise argparse.ArgumentTypeError(
-            f'{text!r} has two sizes for one camera; left=1280x960,right=640x480 says whose')
+            f'{text!r} has two sizes for one camera; use left=1280x960,right=640x480')
     return sizes
 
 
@@ -179,11 +180,11 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     found = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
     if larger and larger >= _MIN_LARGER_SHARE * found:
-        say(f'{larger} of {found} boards look larger than {args.board}, which counts inner '
-            'corners: count them again, or corners are not the same ones in all photographs')
+        say(f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
+            'again, otherwise photographs may number different corners alike')
     if 2 * found < len(detection.searched):
-        say(f'most photographs show no {args.board}: check kind and size of the board'
-            + (', which counts inner corners' if pattern.kind == 'chessboard' else ''))
+        counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
+        say(f'no {args.board} in most photographs; check kind and size{counted} of the board')
     return detection
 
 
@@ -191,13 +192,13 @@ def _note_alone(detection: Detection) -> None:
     """Say which photographs of a rig have no partner of the same moment."""
     alone = [detection.searched[i].name for i in detection.pairing.alone]
     if len(alone) == len(detection.searched):
-        say('no photograph of one camera has a partner of the same moment, by '
-            f'{detection.pairing.way}: name those of a moment alike, number them alike, or name '
-            'them by their stamps and give a larger --sync')
+        say(f'no photographs of two cameras are simultaneous, by {detection.pairing.way}; give '
+            'simultaneous ones the same name or number, or name them by their stamps and raise '
+            '--sync')
     elif alone:
         more = f' and {len(alone) - _MAX_LISTED} more' if len(alone) > _MAX_LISTED else ''
-        say(f'{len(alone)} of {len(detection.searched)} photographs have no partner of the same '
-            f'moment, by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}')
+        say(f'{len(alone)} of {len(detection.searched)} photographs have no simultaneous partner, '
+            f'by {detection.pairing.way}: {", ".join(alone[:_MAX_LISTED])}{more}')
 
 
 def _seconds(text: str) -> float:
@@ -207,7 +208,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         value = 0.0
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r} is not a time with its unit, as in 5ms')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a time with a unit, such as 5ms')
     return value
 
 

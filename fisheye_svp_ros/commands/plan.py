@@ -29,26 +29,27 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('--lens', metavar='LENS',
-                        help='a lens of the same type: a file, or the name of one that comes with '
-                        'the package')
+                        help='a lens of the same type: lens file, or the name of a lens of this '
+                        'package')
     parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='in place of a lens: its field of view, over the width of the image; '
-                        'corners beyond it are left alone')
+                        help='in place of --lens: field of view over the width of the image; no '
+                        'corner is planned beyond it')
     parser.add_argument('--image-size', metavar='WxH', help='with --fov: 1280x800')
     parser.add_argument('--board', required=True, metavar='SPEC',
                         help='the board: chessboard:9x6:25mm, charuco:..., aprilgrid:FILE, ...')
     parser.add_argument('--room', type=float, nargs=2, required=True, metavar='M',
-                        help='nearest and furthest distance of the board: where it is sharp, and '
-                        'inside the room')
+                        help='nearest and furthest distance at which the board is sharp and fits '
+                        'into the room')
     parser.add_argument('--count', type=int, default=12, metavar='N',
-                        help='how many photographs (12)')
+                        help='number of photographs; default: 12')
     parser.add_argument('--for', dest='number', metavar='NAME',
-                        help='the number that matters most: e0, fx, cx, k1, ...; by default the '
-                        'lens as a whole')
+                        help='parameter to determine best: e0, fx, cx, k1, ...; default: the '
+                        'whole lens')
     parser.add_argument('--noise', type=float, default=0.1, metavar='PX',
-                        help='noise of u and of v of a corner (0.1)')
+                        help='standard deviation of u and of v of a corner; default: 0.1')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for plan.pdf to print, plan.json, poses.csv (for `render`)')
+                        help='folder to write plan.pdf (to print), plan.json and poses.csv (for '
+                        '`render`) to')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -71,7 +72,7 @@ def run(args: argparse.Namespace) -> None:
                        {'photographs': wanted.to_list(), 'stderr': planned.stderr})
     print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
                 shot_list.HEADER, shot_list.rows(wanted), words=shot_list.TEXT_COLUMNS)
-    print('  standard errors to expect: '
+    print('  expected standard errors: '
           + ', '.join(f'{name} {error:.2g} {UNITS.get(name, "")}'.rstrip()
                       for name, error in planned.stderr.items()))
     _note_guessed(lens, wanted)
@@ -85,8 +86,8 @@ def view_limits(given: Sequence[float]) -> ViewLimits:
 
     near, far = given
     if not 0 < near < far < float('inf'):
-        raise ParameterError(f'--room {near:g} {far:g}: two distances above 0 are needed, m, the '
-                             'nearer first')
+        raise ParameterError(f'--room {near:g} {far:g}: give two distances above 0, m, the nearer '
+                             'first')
     return ViewLimits(near, far)
 
 
@@ -99,21 +100,20 @@ def _note_guessed(lens: Lens, wanted: NextViews) -> None:
     further = [str(i + 1) for i in np.flatnonzero(angle > lens.calibrated_angle)]
     if further:
         edge = np.degrees(lens.calibrated_angle)
-        say(f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; '
-            f'views {", ".join(further)} reach further, up to '
-            f'{np.degrees(angle.max()):.0f}, where the board may be seen elsewhere than drawn, or '
-            'not at all')
+        say(f'lens {lens.name!r} was calibrated up to {edge:.0f} degrees off the axis; views '
+            f'{", ".join(further)} reach up to {np.degrees(angle.max()):.0f}, where the drawn '
+            'place of the board may be wrong')
 
 
 def _lens(args: argparse.Namespace) -> Lens:
     from fisheye_svp_ros.planning.plan import nominal_lens
 
     if (args.lens is None) == (args.fov is None) or bool(args.fov) != bool(args.image_size):
-        raise ParameterError('which lens is it? Give --lens LENS, or --fov and --image-size')
+        raise ParameterError('give --lens LENS, or --fov and --image-size')
     if args.lens is not None:
         return load_with_notes(lens_path(args.lens))
     if not 0 < args.fov < 360:
-        raise ParameterError(f'--fov {args.fov:g}: an angle between 0 and 360 degrees is needed')
+        raise ParameterError(f'--fov {args.fov:g}: it must be between 0 and 360 degrees')
     try:
         size = image_size(args.image_size)
     except argparse.ArgumentTypeError as cause:

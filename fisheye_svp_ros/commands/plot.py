@@ -28,10 +28,9 @@ _TABLES = ('.csv', '.parquet')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('source', type=Path, metavar='SOURCE',
-                        help='a rosbag2 recording, a table (.csv or .parquet), or the folder of a '
-                        'sweep')
+                        help='rosbag2 recording, table (.csv or .parquet), or folder of a sweep')
     parser.add_argument('-o', '--output', type=Path, default=Path('plots'), metavar='DIR',
-                        help='folder for the pictures (PNG); default: plots')
+                        help='folder to write the pictures (PNG) to; default: plots')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -40,8 +39,8 @@ def run(args: argparse.Namespace) -> None:
     with write_together():
         files = _of_table(table, args.output) if table else _of_bag(args)
     if not files:
-        raise OutputError(f'{args.source}: nothing in it to draw; results of scenarios that '
-                          'differ are needed, or residuals')
+        raise OutputError(f'{args.source}: nothing to draw; it needs residuals, or results of '
+                          'different scenarios')
     for path in files:
         print(path)
 

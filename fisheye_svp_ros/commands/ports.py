@@ -13,11 +13,11 @@ _FORMS = 'flat, flat:5mm:1.49 (glass and its index), dome:60mm, dome:60mm:4mm:1.
 def add_port_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --medium and --port."""
     parser.add_argument('--medium', metavar='MEDIUM',
-                        help='what was between port and target: ' + ', '.join(MEDIA)
+                        help='medium between port and target: ' + ', '.join(MEDIA)
                         + ' or a refractive index')
     parser.add_argument('--port', metavar='SPEC',
-                        help=f'what the camera looked through: {_FORMS}; flat by default, its '
-                        'glass counted as air')
+                        help=f'what the camera looked through: {_FORMS}; default: flat, its glass '
+                        'counted as air')
 
 
 def port_of(args: argparse.Namespace) -> Port | None:

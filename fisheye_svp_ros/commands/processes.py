@@ -99,7 +99,7 @@ class Processes:
 
     def _last_line(self, name: str) -> str:
         lines = self.log_tail(name).splitlines()
-        return f'{lines[-1] if lines else "it said nothing"} ({self._log(name)})'
+        return f'{lines[-1] if lines else "it logged nothing"} ({self._log(name)})'
 
 
 def _end_with_parent() -> None:
@@ -121,4 +121,4 @@ def domain() -> str:
             except OSError:
                 continue
         return str(number)
-    raise GraphError('all ROS domains from 1 to 101 are taken; set ROS_DOMAIN_ID')
+    raise GraphError('all ROS domains from 1 to 101 are in use; set ROS_DOMAIN_ID')

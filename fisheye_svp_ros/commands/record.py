@@ -18,13 +18,13 @@ TOPICS = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='BAG',
-                        help='folder to make; it must not exist')
+                        help='folder to create; it must not exist')
     parser.add_argument('--topics', type=_pattern, default=TOPICS, metavar='REGEX',
-                        help='full names of the topics; by default all that the nodes publish, '
-                        'but for markers and diagnostics')
+                        help='pattern of full topic names; default: all topics of the nodes '
+                        'except markers and diagnostics')
     parser.add_argument('--sweep', metavar='FILE',
-                        help='run the node graph through a sweep file, in lock-step, and end with '
-                        'it: a file, or the name of one in config/sweeps')
+                        help='sweep file, or the name of one in config/sweeps: start the nodes, '
+                        'record them in lock-step through the sweep, and end')
     parser.add_argument('--ros-args', nargs=argparse.REMAINDER, default=[], metavar='...',
                         help='as for `ros2 run`')
 
@@ -50,7 +50,7 @@ def _sweep(name: str, bag: Path) -> None:
     path = sweep_path(name)
     plan = read_sweep(path)
     if bag.exists():
-        raise BagError(f'{bag}: it exists; a recording needs a new folder')
+        raise BagError(f'{bag}: it exists; choose a new folder')
     prepare_ros()
     logs = bag.with_name(f'{bag.name}_logs')
     with progress('sweeping', len(plan.sweep)) as advance:
@@ -79,8 +79,8 @@ def _record(args: argparse.Namespace) -> None:
         recorder.destroy_node()
     if not bag.count:
         rmtree(args.output)
-        raise BagError(f'{args.output}: no message came on a topic that is recorded, and nothing '
-                       'is kept; `ros2 topic list` says what there is, --topics what is recorded')
+        raise BagError(f'{args.output}: no message arrived on a recorded topic, so nothing is '
+                       'kept; compare `ros2 topic list` with --topics')
     say(f'{bag.count} messages on {len(recorder.topics)} topics are in {args.output}')
 
 
@@ -88,4 +88,5 @@ def _pattern(text: str) -> re.Pattern[str]:
     try:
         return re.compile(text)
     except re.error as cause:
-        raise argparse.ArgumentTypeError(f'{text!r} is no regular expression: {cause}') from cause
+        raise argparse.ArgumentTypeError(f'{text!r} is not a regular expression: '
+                                         f'{cause}') from cause

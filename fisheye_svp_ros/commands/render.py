@@ -32,39 +32,41 @@ Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('--lens', required=True, metavar='LENS',
-                        help='a lens file, or the name of one that comes with the package; a '
-                        'folder or file with the lenses of a rig and where they stand')
+                        help='lens file, or the name of a lens of this package; for a rig, a '
+                        'folder or file with its lenses and their relative poses')
     parser.add_argument('--board', required=True, metavar='SPEC',
                         help='the board: chessboard:9x6:25mm (inner corners)')
     parser.add_argument('--target', choices=('board', 'cube', 'room'), default='board',
-                        help='one board, or six: on the faces of a cube, on the walls of a room')
+                        help='one board, or six boards: on the faces of a cube, or on the walls '
+                        'of a room')
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
-                        help='folder for the photographs (of a rig a folder for each camera), '
-                        'observations.csv (the true corners) and poses.csv')
+                        help='folder to write the photographs (of a rig, one subfolder per '
+                        'camera), observations.csv (the true corners) and poses.csv to')
     parser.add_argument('--poses', metavar='POSES.csv',
-                        help="poses of the camera, of a rig the first one, in the frame of the "
-                        "board, or of the target's middle; at random by default")
+                        help='poses of the camera (of a rig, the first one) in the frame of the '
+                        'board or target; default: random')
     parser.add_argument('--count', type=int, default=30, metavar='N',
-                        help='how many photographs from random poses (30)')
+                        help='number of photographs from random poses; default: 30')
     parser.add_argument('--ranges', type=float, nargs=2, default=(0.12, 0.35), metavar='M',
-                        help='nearest and furthest, m, of random poses (0.12 0.35), to the middle '
-                        'of a cube')
+                        help='nearest and furthest distance of random poses, m; of a cube, to its '
+                        'center; default: 0.12 0.35')
     parser.add_argument('--bow', type=float, default=0.0, metavar='MM',
-                        help='how far the middle of the board stands out from its ends, mm')
+                        help='height of the middle of the board above its ends, mm')
     parser.add_argument('--blur', type=float, default=0.6, metavar='PX',
-                        help='blur of the lens, px (0.6)')
+                        help='blur of the lens, px; default: 0.6')
     parser.add_argument('--noise', type=float, default=1.5, metavar='LEVELS',
-                        help='noise of a pixel, gray levels of 255 (1.5)')
-    parser.add_argument('--seed', type=int, default=0, help='of poses and noise (0)')
+                        help='noise of a pixel, gray levels of 255; default: 1.5')
+    parser.add_argument('--seed', type=int, default=0, help='seed of poses and noise; default: 0')
 
 
 def run(args: argparse.Namespace) -> None:
     """Render the photographs, write them and the truth."""
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
-        raise ParameterError(f'--board {args.board}: chessboards alone can be rendered')
+        raise ParameterError(f'--board {args.board}: only chessboards can be rendered')
     if args.count < 1 or not 0 < args.ranges[0] <= args.ranges[1] < np.inf:
-        raise ParameterError('--count must be above 0, --ranges two distances above 0 in order')
+        raise ParameterError('--count must be above 0, --ranges two distances above 0, the nearer '
+                             'first')
     if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
         raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
                              'finite')
@@ -84,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
                                   args.output, args.output)
     others = sum(len(list((args.output / name).glob('*.png'))) for name in cameras) - count
     if others:
-        say(f'{args.output}: {others} other photographs are in it, too; `detect` takes them all')
+        say(f'{args.output}: {others} other photographs are in it too; `detect` takes them all')
     print(f'{args.output}: {count} photographs, observations.csv with their true corners, '
           'poses.csv')
 

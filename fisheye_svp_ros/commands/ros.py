@@ -33,6 +33,7 @@ def prepare_ros() -> None:
     """
     if reason := missing_rclpy():
         version = '.'.join(map(str, sys.version_info[:2]))
-        raise GraphError(f'Python {version} has no ROS 2 for nodes ({reason}); {WAYS}')
+        raise GraphError(f'nodes need ROS 2, which Python {version} does not have ({reason}); '
+                         f'{WAYS}')
     if not _ENVIRONMENT & os.environ.keys():
         os.environ[RANGE] = LOCALHOST

@@ -15,9 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('node', choices=NODES, metavar='NODE', help=', '.join(NODES))
     parser.add_argument(
         'arguments', nargs=argparse.REMAINDER, metavar='[NODE ...] --ros-args ...',
-        help='more nodes, for the same process and executor; then as for `ros2 run`: '
-        '-p NAME:=VALUE, --params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE; or --help: the '
-        'parameters of the nodes'
+        help='more nodes for the same process; then arguments as for `ros2 run`: -p NAME:=VALUE, '
+        '--params-file FILE, -r FROM:=TO, -r __ns:=/NAMESPACE; --help lists the parameters '
+        'of the nodes'
     )
 
 
@@ -33,9 +33,9 @@ def run(args: argparse.Namespace) -> None:
         return
     first, names = next(iter(arguments), '--ros-args'), ' '.join(nodes)
     if first != '--ros-args':
-        raise ParameterError(f'run {names}: {first!r} stands before --ros-args; ROS arguments '
-                             f'come after it: fisheye-svp run {names} --ros-args ...')
+        raise ParameterError(f'run {names}: {first!r} comes before --ros-args; ROS arguments '
+                             f'follow it: fisheye-svp run {names} --ros-args ...')
     if len({*nodes}) < len(nodes):
-        raise ParameterError(f'run {names}: a node is listed twice, and its topics would be '
-                             'those of both; start one process for each namespace')
+        raise ParameterError(f'run {names}: a node is listed twice, and both would share their '
+                             'topics; start one process for each namespace')
     raise SystemExit(executables.run(*nodes, args=arguments))

@@ -28,17 +28,18 @@ _MARK = 'sweep.txt'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('file', type=Path, metavar='FILE',
-                        help='ROS parameter file in which sweep.PARAMETER holds a list, or the '
-                        'name of one in config/sweeps')
+                        help='ROS parameter file in which sweep.PARAMETER is a list, or the name '
+                        'of one in config/sweeps')
     parser.add_argument('-o', '--output', type=Path, default=Path('sweep'), metavar='DIR',
-                        help='folder for sweep.parquet, sweep.csv and sweep.json; default: sweep')
+                        help='folder to write sweep.parquet, sweep.csv and sweep.json to; '
+                        'default: sweep')
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--workers', type=_count, default=0, metavar='N',
-                       help='processes to work in; default: this one')
+                       help='number of worker processes; default: none, all in this one')
     where.add_argument('--dask', metavar='ADDRESS',
-                       help='work on a Dask cluster: the address of its scheduler')
+                       help='address of a Dask scheduler: run on its cluster')
     parser.add_argument('--resume', action='store_true',
-                        help='go on with what an interrupted run has left in DIR, if anything')
+                        help='continue an interrupted run in DIR')
     parser.add_argument('--large', action='store_true',
                         help=f'allow more than {_MAX_SCENARIOS} scenarios')
 
@@ -49,18 +50,18 @@ def run(args: argparse.Namespace) -> None:
     plan = read_sweep(path)
     if len(plan.sweep) > _MAX_SCENARIOS and not args.large:
         lengths = ' x '.join(f'{len(v)} {name}' for name, v in plan.sweep.lists.items())
-        raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); --large if that '
-                             'is meant')
+        raise ParameterError(f'{path}: {len(plan.sweep)} scenarios ({lengths}); add --large to '
+                             'run them all')
     parts = TableParts(args.output / _PARTS, column_types(plan))
     mine = fingerprint(plan)
     if args.resume and _is_complete(args.output, mine):
-        say(f'{args.output} holds this sweep already')
+        say(f'{args.output} already holds this sweep')
     else:
         engine = _claim(parts, mine, args.resume, work(plan))
         _solve(args, plan, parts, engine)
         if missing := {numbers.start for numbers in tasks(plan)} - parts.numbers():
-            raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are gone; '
-                              '--resume computes them again')
+            raise OutputError(f'{parts.folder}: {len(missing)} parts of the sweep are missing; '
+                              'compute them again with --resume')
         with write_together():
             parts.join(args.output / 'sweep')
             _report(path, args.output, plan, mine)
@@ -85,12 +86,12 @@ def _claim(parts: TableParts, mine: str, resume: bool, points: int) -> str:
         write_text(mark, f'{mine} {engine}')
         return engine
     if not resume:
-        raise OutputError(f'{parts.folder}: an interrupted sweep is there; --resume goes on with '
-                          'it, or remove that folder')
+        raise OutputError(f'{parts.folder}: it holds an interrupted sweep; continue with '
+                          '--resume, or remove the folder')
     theirs, _, engine = read_text(mark, OutputError).partition(' ')
     if theirs != mine:
-        raise OutputError(f'{parts.folder}: another sweep was interrupted there; choose another '
-                          '-o, or remove that folder')
+        raise OutputError(f'{parts.folder}: it holds another, interrupted sweep; choose another '
+                          '-o, or remove the folder')
     return engine
 
 
@@ -99,7 +100,7 @@ def _solve(args: argparse.Namespace, plan: Plan, parts: TableParts, engine: str)
     remaining = [numbers for numbers in tasks(plan) if numbers.start not in done]
     count = sum(map(len, remaining))
     if count < len(plan.sweep):
-        say(f'{len(plan.sweep) - count} of {len(plan.sweep)} scenarios are done already')
+        say(f'{len(plan.sweep) - count} of {len(plan.sweep)} scenarios are already done')
     with (
         dask(args.dask) if args.dask else process_pool(args.workers) as workers,
         progress('sweeping', count) as advance,
@@ -130,5 +131,5 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
 
 def _count(text: str) -> int:
     if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f'{text!r} is no number of processes')
+        raise argparse.ArgumentTypeError(f'{text!r} is not a number of processes')
     return int(text)

@@ -40,10 +40,10 @@ def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
     """Refuse what means nothing to any node; the nodes themselves would only warn."""
     nodes = [node for node in TABLES if parameters_of(f'/{node}', {pattern: values})]
     if values and not nodes:
-        raise ParameterError(f'{pattern} is no node of a sweep; those are {", ".join(TABLES)}')
+        raise ParameterError(f'{pattern} is not a node of a sweep; known are {", ".join(TABLES)}')
     known = {row.name for node in nodes for row in rows(TABLES[node])}
     for name in values:
         swept = name.startswith(SWEEP) and CAMERA in nodes  # the camera's own table says more
         if name not in known and not swept:
-            raise ParameterError(f'{name} is no parameter of {", ".join(nodes)}; known are '
+            raise ParameterError(f'{name} is not a parameter of {", ".join(nodes)}; known are '
                                  + ', '.join(sorted(known)))

@@ -23,9 +23,9 @@ _MAX_ROWS = 40  # rows for people
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('bag', metavar='BAG',
-                        help='a rosbag2 recording: its folder, or its .mcap or .db3 file')
+                        help='rosbag2 recording: its folder, or its .mcap or .db3 file')
     parser.add_argument('-o', '--output', type=Path, metavar='DIR',
-                        help='folder for table.csv, table.parquet and table.json')
+                        help='folder to write table.csv, table.parquet and table.json to')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> None:
     if bag.damage:
         say(f'{args.bag}: {bag.damage}')
     if not rows:
-        raise BagError(f'{args.bag}: neither scenarios nor results in it; record them with '
+        raise BagError(f'{args.bag}: it holds neither scenarios nor results; record them with '
                        '`fisheye-svp record` or `ros2 bag record`')
     _print(args.bag, columns)
     if args.output:

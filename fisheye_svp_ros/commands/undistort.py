@@ -50,29 +50,33 @@ _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('inputs', nargs='+', metavar='LENS PHOTOS',
-                        help='a lens file, also of other tools, or the name of one that comes '
-                        'with the package; a file or folder with both lenses and the rig of a '
-                        'stereo pair; then photographs: files, folders (left/ and right/ for a '
-                        'rig), videos, recordings; none: maps alone')
+                        help='lens file, also of other tools, or the name of a lens of this '
+                        'package; for a stereo pair, a file or folder with both lenses and '
+                        'the rig; then photographs: files, folders (left/ and right/ for a '
+                        'rig), videos, recordings; without photographs, only the maps are '
+                        'written')
     parser.add_argument('--lens', action='append', metavar='CAMERA=LENS',
-                        help='left=LENS and right=LENS, in place of LENS')
+                        help='left=LENS and right=LENS, in place of the argument LENS')
     parser.add_argument('--rig', metavar='FILE',
-                        help='the rig, where the lens files do not hold it: the left camera in '
-                        'the right one')
+                        help='pose of the left camera in the right one, if the lens files do not '
+                        'hold it')
     parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
-                        help='folder for the photographs, maps.npz and maps.yml (map1 and map2 '
-                        'for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, pictures of '
-                        'what is left, undistort.json; of a rig one for each camera in it')
+                        help='folder to write the photographs, maps.npz and maps.yml (map1 and '
+                        'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
+                        'pictures of the remaining errors and undistort.json to; for a rig, '
+                        'one subfolder per camera')
     parser.add_argument('--as', choices=PROJECTIONS, default=PROJECTIONS[0], dest='projection',
-                        help='the rectified camera (pinhole); fisheye: equidistant')
+                        help='projection of the rectified camera; fisheye: equidistant; default: '
+                        'pinhole')
     parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='its field of view over the width; default: 90 of a pinhole, '
+                        help='its field of view over the width; default: 90 for a pinhole, '
                         'otherwise that of the lens')
     parser.add_argument('--size', type=image_size, metavar='WxH',
                         help='size of the rectified images, px; default: that of the photographs')
     parser.add_argument('--range', type=float, default=RANGE, metavar='M', dest='range_m',
-                        help='range at which the maps are exact where the viewpoint of the lens '
-                        f'moves, m, or inf ({RANGE:g}); of a pair from the middle of the baseline')
+                        help='range at which the maps of a lens with a moving viewpoint are '
+                        'exact, m or inf; of a pair, from the middle of the baseline; '
+                        f'default: {RANGE:g}')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -139,8 +143,8 @@ def _by_camera(photographed: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
 def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
     if args.rig:
         if len(lenses) != 2:
-            raise ParameterError(f'--rig {args.rig}: it is of two cameras, and there are lenses '
-                                 f'of {len(lenses)}; give --lens left=LENS --lens right=LENS')
+            raise ParameterError(f'--rig {args.rig}: a rig of two cameras needs two lenses, got '
+                                 f'{len(lenses)}; give --lens left=LENS --lens right=LENS')
         return load_rig(args.rig)
     if args.lens or len(lenses) != 2:
         return None
@@ -164,8 +168,8 @@ def _write_photographs(
         image = _remap(sides[photograph.camera], photograph, pixels)
         path = folder / photograph.camera / f'{photograph.key}.png'
         if path in written:
-            raise ParameterError(f'{photograph.name}: another photograph is called '
-                                 f'{photograph.key}, too; give one folder at a time')
+            raise ParameterError(f'{photograph.name}: another photograph is also called '
+                                 f'{photograph.key}; give one folder at a time')
         written.add(path)
         write_bytes(path, cv2.imencode('.png', image)[1].tobytes())
         counts[photograph.camera] += 1
@@ -209,9 +213,9 @@ def _write_camera(
 
 def _print_camera(side: Rectification, name: str, left: Remaining | None) -> None:
     camera = side.camera
-    print(f'{name or side.lens.name}: {camera.projection} {camera.width}x{camera.height} px, '
-          f'f {camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
-          f'{100 * side.maps.mask.mean():.1f} % of the pixels are reached')
+    print(f'{name or side.lens.name}: {camera.projection} {camera.width}x{camera.height} px, f '
+          f'{camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
+          f'{100 * side.maps.mask.mean():.1f} % of the pixels lie in its field of view')
     if left is None:
         print('  the lens has one viewpoint: the maps hold at every range')
         return

@@ -56,7 +56,7 @@ def _result_table(watcher: Watcher, width: int) -> RenderableType:
     from rich.table import Table
 
     if width < _MIN_COLUMNS:
-        return f'a terminal {_MIN_COLUMNS} columns wide is needed; this one has {width}'
+        return f'the terminal must be {_MIN_COLUMNS} columns wide; this one has {width}'
     table = Table(box=box.SIMPLE_HEAD)
     for name in ('node', 'metric'):
         table.add_column(name, overflow='fold')

@@ -33,9 +33,9 @@ _BLUR_LIMITS = 1.5  # times the median blur, and px
 _STANDSTILL_PX = 0.3  # px
 _MIN_RIG_FRAMES = 3  # frames of two cameras that say how they stand
 _FREE = ('fx', 'fy', 'cx', 'cy', 'k1', 'k2', 'k3', 'k4', 'e0')
-_ROTATION_NOTE = 'asks to be shown turned; taken as the sensor lay'
-LARGER_BOARD = 'the board looks larger: its squares go on beyond the corners looked for'
-_DAMAGE_NOTE = 'damaged: the JPEG decodes in part; fetch it again'
+_ROTATION_NOTE = 'its orientation tag asks for a rotation; the pixels are used as stored'
+LARGER_BOARD = 'the board is larger: its squares continue beyond the given corners'
+_DAMAGE_NOTE = 'damaged: the JPEG decodes only in part; copy it again'
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, 
                 one = replace(one, points=None, reason=f'a copy of {other.name}')
                 break
             if _is_same_moment(one, other):
-                notes.append(f'from the same place as {Path(other.name).name}')
+                notes.append(f'from the same viewpoint as {Path(other.name).name}')
                 break
         done.append(replace(one, notes=tuple(notes)))
     return tuple(done)

@@ -145,7 +145,7 @@ def explain_failure(image: Grey, pattern: Pattern) -> str:
     """Return why a board was not found, as far as the image tells."""
     if pattern.kind == 'aprilgrid' and _tags(image, pattern, 1):
         return ('no board found: its tags have a border of one cell; print the target of Kalibr, '
-                'whose tags have two')
+                'whose border is two cells')
     return 'no board found'
 
 

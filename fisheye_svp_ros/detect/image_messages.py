@@ -87,7 +87,7 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
     data, height, step = bytes(message.data), message.height, message.step
     width = message.width * encoding.channels * dtype.itemsize
     if not 0 < width <= step or not 0 < step * height * (1 + encoding.planes) <= len(data):
-        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
+        raise ObservationError(f'{name}: {len(data)} bytes are too few for an image of '
                                f'{message.width}x{height} {message.encoding}')
     rows = np.frombuffer(data, np.uint8)[:step * height]
     rows = np.ascontiguousarray(rows.reshape(height, step)[:, :width])
@@ -100,6 +100,6 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
 def _encoding_error(encoding: str) -> str:
     reason = 'unknown'
     if encoding.rstrip('0123456789') in _NO_BRIGHTNESS:
-        reason = 'not of brightness: depth, vectors or signed numbers, say'
+        reason = 'not one of brightness'
     return f'{encoding[:40]!r} is {reason}; have the driver send mono8, bgr8 or another of ' \
            f'{", ".join(_ENCODINGS)}'

@@ -76,7 +76,7 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
             if number % every == 0:
                 yield photograph
         if number < 0:
-            raise ObservationError(f'{path}: no photograph in it or a folder in it; images are '
+            raise ObservationError(f'{path}: it and its folders hold no photograph; images are '
                                    f'{" ".join(IMAGES)}')
 
 
@@ -104,14 +104,13 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
         for above in [folder] if files else _folders(folder):
             for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
                 if count := sum(len(_images(one)) for one in (sub, *_folders(sub))):
-                    yield (f'{sub}: images in it are passed over ({count}), since the folder '
-                           'above has some, too; give it by itself, or move those into a '
-                           'subfolder')
+                    yield (f'{sub}: its {count} images are skipped, since the folder above holds '
+                           'images too; give it alone, or move the others into a subfolder')
         named = {p.name: match[1].lower() for p in files if (match := _PREFIX.fullmatch(p.stem))}
         other = next((p.name for p in files if p.name not in named), '')
         if other and len({*named.values()}) > 1:
-            yield (f'{folder}: all images are taken for those of one camera, since {other} is not '
-                   f'called after one as {next(iter(named))} is; rename or remove it')
+            yield (f'{folder}: all images count as those of one camera, since {other} names none, '
+                   f'unlike {next(iter(named))}; rename or remove it')
 
 
 def is_photographs(path: Path) -> bool:
@@ -131,11 +130,11 @@ def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
     kind = cv2.IMREAD_ANYCOLOR if color else cv2.IMREAD_GRAYSCALE
     flags = kind | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     if data[:2] == b'\xff\xd8' and data.rfind(b'\xff\xd9') < data.rfind(b'\xff\xda'):
-        raise ObservationError(f'{name}: the JPEG ends before its image does; fetch it again')
+        raise ObservationError(f'{name}: the JPEG is incomplete; copy it again')
     if data[:2] == b'\xff\xd8' and data.count(b'\xff\xda') > _MOST_SCANS:
         raise ObservationError(f'{name}: a JPEG of more than {_MOST_SCANS} scans')
     if data[:8] == _PNG and not _whole_chunks(data):
-        raise ObservationError(f'{name}: the PNG ends before its image does; fetch it again')
+        raise ObservationError(f'{name}: the PNG is incomplete; copy it again')
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
     except cv2.error as cause:
@@ -143,7 +142,7 @@ def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
         raise ObservationError(
             f'{name}: larger than {most:.0f} megapixels, or broken; make it smaller') from cause
     if pixels is None:
-        raise ObservationError(f'{name}: not an image that can be read; check the file')
+        raise ObservationError(f'{name}: the image cannot be read; check the file')
     if pixels.dtype not in (np.uint8, np.uint16):
         raise ObservationError(f'{name}: pixels are {pixels.dtype}; 8 or 16 bit are needed')
     return np.asarray(pixels)
@@ -195,7 +194,7 @@ def message_pixels(message: Any, typename: str, name: str) -> Pixels:
 
 def _source(path: Path) -> Iterator[Photograph]:
     if not path.exists():
-        raise ObservationError(f'{path}: there is no such file or folder; check the path')
+        raise ObservationError(f'{path}: no such file or folder; check the path')
     if is_recording(path):
         return _recording(path)
     if path.is_dir():
@@ -235,7 +234,7 @@ def _natural(path: Path) -> list[tuple[int, str]]:
 
 def _video(path: Path) -> Iterator[Photograph]:
     if not path.is_file():
-        raise ObservationError(f'{path}: not a regular file; give one')
+        raise ObservationError(f'{path}: it must be a regular file')
     video = cv2.VideoCapture(str(path))
     rate = video.get(cv2.CAP_PROP_FPS) or 30.0
     number = 0

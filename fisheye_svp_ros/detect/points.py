@@ -275,7 +275,7 @@ def _order_points(index: Index, corners: Corners, pattern: Pattern, reach: Array
     """Turn the points into the pattern's order; leave out those that are not what they must be."""
     ok, tint = corners.ok, np.sign(corners.contrast) * pattern.tint[index]
     if ok.sum() < max(_MIN_POINTS, _MIN_SHARE * len(ok)):
-        return f'{int(ok.sum())} of {len(ok)} points are corners that can be fitted'
+        return f'{int(ok.sum())} of {len(ok)} points can be fitted as corners'
     if np.isfinite(corners.sigma).all():
         # One by the edge of the field, or half hidden, is not as its neighbours.
         ok &= corners.sigma < _OUTLIER_SIGMAS * np.median(corners.sigma[ok])
@@ -283,12 +283,12 @@ def _order_points(index: Index, corners: Corners, pattern: Pattern, reach: Array
         agreed = np.sign(tint[ok].sum())
         ok &= tint == agreed
         if ok.sum() < max(_MIN_POINTS, _MIN_SHARE * len(ok)):
-            return 'bright and dark squares do not take turns; check the size of the board'
+            return 'bright and dark squares do not alternate; check the size of the board'
     if not pattern.marker and len(index) == len(pattern.points):
         grid = ok.reshape(-1, pattern.columns)
         sides = grid[0], grid[-1], grid[:, 0], grid[:, -1]
         if pattern.kind == 'chessboard' and not all(side.any() for side in sides):
-            return 'the grid that was found has a side without corners: it may lie a square off'
+            return 'the grid may be shifted by one square: one of its sides has no corners'
         keep = pattern.kind != 'chessboard' or agreed > 0
         turns = [turn for turn in pattern.turns if turn.same == keep] or list(pattern.symmetries)
         # Of turns that look the same, the one that begins at the upper left of the image.

@@ -18,8 +18,8 @@ from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_names
 from fisheye_svp_ros.solve.outliers import FRAME, VIEW, Outliers
 
-DIAGNOSE_AIR = ('diagnose the photographs in air, too, and these anew with the extended lens of '
-                'that: the lens was off in air')
+DIAGNOSE_AIR = ('diagnose the photographs in air first, then these with the extended lens of that '
+                'run: the lens already has errors in air')
 USE_EXTENDED = 'solve with the extended lens file'
 RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
@@ -69,8 +69,8 @@ def advise(
 
 def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
     """Return what to do about photographs whose board is numbered from another end."""
-    words = ((True, 'are', 'diagnosed in the order of the others; number them so'),
-             (False, 'may be', 'diagnosed as they are; look at them'))
+    words = ((True, 'are', 'they were reordered like the others; number them so'),
+             (False, 'may be', 'they were not reordered; check them'))
     advice = []
     for corrected, are, what in words:
         mine = [one for one in turned if one.corrected == corrected]
@@ -111,22 +111,21 @@ def _check_held_out(evaluation: Evaluation) -> list[Advice]:
         alone = _frame_numbers(evaluation)[~evaluation.counted_frames]
         return [_about_frames(
             evaluation.null.linear.data.observations,
-            'take more photographs like these: the others do not predict them; they alone '
-            'show a part of the image, or they are wrong; the held-out rms excludes them',
+            'take more photographs like these: the others do not predict them. Either only they '
+            'cover a part of the image, or they are wrong; the held-out rms excludes them',
             alone.tolist(), UNLIKE)] if len(alone) else []
     table = test.data.observations
     advice = _check_photographs(table, test.outliers, 'held-out ')
     if test.another_target:
         advice.append(Advice(
-            'hold out photographs of the same target: these have landmarks of the same '
-            'numbers in other places, so that nothing of what stays with the target is '
-            'predicted there'))
+            'hold out photographs of the same target: in these, landmarks of the same numbers '
+            'have other coordinates, so errors of the target are not predicted there'))
     if test.rig_differs:
         advice.append(_about_frames(
-            table, 'look at these held-out photographs: their cameras do not stand as in the '
-            'others, so each view has a pose of its own; was the rig touched, are the '
-            'cameras exchanged, are photographs of one moment numbered alike, and the points '
-            'from the same end?', _shared_frames(table)))
+            table, 'check these held-out photographs: their relative camera poses differ from the '
+                   'others, so each view has its own pose. Check that the rig was not touched, '
+                   'the cameras are not exchanged, simultaneous photographs have one number, and '
+                   'points are numbered from the same end', _shared_frames(table)))
     return advice
 
 
@@ -139,8 +138,8 @@ def _calibrate_in_air(medium: Medium, causes: Sequence[Cause]) -> list[Advice]:
         advice.append(Advice(DIAGNOSE_AIR))
     if medium.moved:
         advice.append(Advice(
-            'the lens was moved within what its calibration in air leaves open: take photographs '
-            'in air that fill the image, or of a target that is better known'))
+            'the lens was adjusted within the errors of its calibration in air: take photographs '
+            'in air that fill the image, or measure the target better'))
     return advice
 
 
@@ -162,7 +161,7 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     order = np.argsort(-far)[:_MAX_LISTED]
     chosen = [int(evaluation.offsets.landmark[i]) for i in order
               if far[i] > _OUTSTANDING_RATIO * typical]
-    what = 'measure single landmarks: they are displaced more than the others'
+    what = 'measure these landmarks: they are displaced more than the others'
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
 
@@ -170,9 +169,9 @@ def _vary_views(views: RepeatedErrors) -> Advice:
     """Return what to do where landmarks err alike in similar views."""
     soon = f' and taken within {views.lasting:.0f} s' if np.isfinite(views.lasting) else ''
     return Advice(
-        f'take photographs that differ from each other: errors of landmarks repeat in similar '
-        f'ones{soon} and do not average out; is the paper flat, does light reflect, is something '
-        'printed near the corners?')
+        'take photographs from more different poses: errors of landmarks repeat in similar '
+        f'ones{soon} and do not average out. Check that the paper is flat, nothing reflects, and '
+        'nothing is printed near the corners')
 
 
 def _retake_frames(evaluation: Evaluation) -> list[Advice]:
@@ -204,7 +203,7 @@ def _check_photographs(table: Observations, outliers: Outliers, where: str = '')
     off = {reason: sorted({int(table.frame[row]) for row, why in
                            zip(outliers.rows, outliers.why, strict=True) if why == reason})
            for reason in (VIEW, FRAME)}
-    return [_about_frames(table, f'look at these {where}photographs: {reason}', frames,
+    return [_about_frames(table, f'check these {where}photographs: {reason}', frames,
                           '' if where else RETAKE)
             for reason, frames in off.items() if frames]
 

@@ -163,10 +163,10 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         return f'board {one.board} is bent by {1e3 * one.peak_to_valley:.2g} mm'
     if worst.effect == 'landmark_survey':
         count = len({name.partition('.')[0] for name in worst.parameters})
-        return f'{count} landmark{"s are" if count > 1 else " is"} off'
+        return f'{count} landmark{"s are" if count > 1 else " is"} displaced'
     if worst.effect == 'landmark_scale':
         most = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)
         return f'the scale of the board is off by {100 * most:.2g} %'
     if worst.effect == 'board_pose':
-        return 'its boards have other relative poses than stated'
+        return 'the relative poses of its boards are wrong'
     return f'{worst.effect} is confirmed'

@@ -19,7 +19,7 @@ from fisheye_svp_ros.effects.base import Effect
 _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by more
 REFUTED_BY_FRAMES = 'held-out frames refute it'
 REFUTED_BY_FILE = 'the held-out file refutes it'
-NO_GAIN = 'it gains nothing on held-out frames beyond its error'
+NO_GAIN = 'its gain on held-out frames is not significant'
 
 
 @dataclass(frozen=True)
@@ -107,17 +107,17 @@ def find_confounder(
         # One with as many parameters as both causes explains nothing more simply than they do.
         for twin in tests.likeliest_forms(rest, names, len(theirs) + len(columns) - 1):
             beside = np.concatenate([rest, null.form_columns(twin.form)])
-            place = f'with {twin.effect.name} in place of {other}'
+            place = f'if {twin.effect.name} replaces {other}'
             if tests.score_beside(beside, columns).p_value * tests.effect_count > SIGNIFICANCE:
-                return f'{place} it is not needed'
+                return f'not significant {place}'
             if not tests.held_out_gain(beside, columns, effect).sufficient:
-                return f'{place} it gains nothing on held-out frames beyond its error'
+                return f'no significant gain on held-out frames {place}'
     return ''
 
 
 def _implausible(effect: Effect, values: Array) -> str:
     if effect.name == 'viewpoint_shift' and abs(values[0]) > _FAR_SHIFT:
-        return f'a shift of {1e3 * abs(values[0]):.0f} mm is more than a lens can have'
+        return f'a shift of {1e3 * abs(values[0]):.0f} mm is larger than in any real lens'
     return ''
 
 

@@ -124,11 +124,11 @@ def decide_lens(facts: LensFacts) -> Decision:
     gained = Figure('file_gain', file.gain, '1')
     if not facts.falling:
         return Decision('undecided', 'the error on the fitted frames rises with the causes in the '
-                        'model, so that nothing is recommended', gained, 0.0, bounds)
+                                     'model, so nothing is recommended', gained, 0.0, bounds)
     if (off := facts.offset) is not None and off.matters(facts.noise_px):
         return Decision(
             'recalibrate', f'the lens as given is off by {off.mrad:.2g} mrad ({off.px:.2g} px), '
-            f'{off.ratio:.1f} times what the errors of both fits allow',
+                           f'{off.ratio:.1f} times the combined standard error',
             Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
     if facts.refitted:
         names = ', '.join(facts.refitted)
@@ -136,32 +136,34 @@ def decide_lens(facts: LensFacts) -> Decision:
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
-            'use_extended', f'on held-out frames it leaves {file.extended_px:.3g} px, the lens as '
-            f'given {file.given_px:.3g} px, on the same target', gained, file.sure)
+            'use_extended', f'held-out error {file.extended_px:.3g} px instead of '
+                            f'{file.given_px:.3g} px with the lens as given, both on the '
+                            'corrected target', gained, file.sure)
     hint = max((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
                key=lambda one: one.edge_px, default=None)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
-        why = ('all causes together predict held-out frames better, the extended lens alone worse '
-               f'({file.extended_px:.3g} px, as given {file.given_px:.3g} px)')
+        why = (f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
+               f'{file.given_px:.3g} px with the lens as given; only all causes together reduce '
+               'it')
         return Decision('undecided', why, gained, 1 - file.sure, bounds)
     if facts.lens_causes:
         names = ', '.join(facts.lens_causes)
         return Decision(
-            'undecided', f'{names} is confirmed, but the extended lens does not '
-            f'predict held-out frames significantly better ({file.extended_px:.3g} px, as '
-            f'given {file.given_px:.3g} px)', gained, file.sure, bounds)
+            'undecided', f'{names} is confirmed, but the held-out error of the extended lens '
+                         f'({file.extended_px:.3g} px) is not significantly smaller than that of '
+                         f'the lens as given ({file.given_px:.3g} px)', gained, file.sure, bounds)
     if hint is not None:
         sure = erf(hint.z / 2**0.5)
         return Decision(
-            'undecided', f'{hint.effect} is likely but not confirmed: it may cost up to '
-            f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
+            'undecided', f'{hint.effect} is likely but not confirmed: it may cause up to '
+                         f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
     return Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
 
 
 def _keep_text(bounds: Sequence[Bound], off: LensOffset | None) -> str:
     worst = max(bounds, key=lambda one: one.edge_px, default=None)
     cost = '' if worst is None else (
-        f'; what these data do not exclude costs at most {worst.edge_px:.2g} px '
+        f'; effects that these data do not exclude cause at most {worst.edge_px:.2g} px '
         f'({worst.edge_mrad:.2g} mrad) at the edge')
     fit = '' if off is None else ' and its parameters agree with these data within their errors'
     return f'no cause in the lens is confirmed{fit}{cost}'
@@ -191,26 +193,26 @@ class TargetFacts(NamedTuple):
 def decide_target(facts: TargetFacts) -> Decision:
     """Return what to do about the target."""
     gain, low, sure = facts.gain
-    local = (f'landmarks are off by {1e3 * facts.local_m:.2g} mm rms, which costs '
+    local = (f'landmarks are displaced by {1e3 * facts.local_m:.2g} mm rms, which causes '
              f'{facts.local_px:.2g} px' if facts.local_m else
-             f'local offsets cost {facts.local_px:.2g} px')
+             f'local offsets cause {facts.local_px:.2g} px')
     if facts.contradicted:
         return Decision('measure_again', 'the cameras contradict each other about its shape',
                         Figure('local_offsets', facts.local_px, 'px'), None)
     if facts.causes:
         figure = Figure('gain', gain, '1')
         if low > 0 and facts.local_px <= facts.named_px:
-            return Decision('correct', f'{facts.size}; the correction takes away '
-                            f'{100 * gain:.0f} % of the held-out error', figure, sure)
-        return Decision('measure_again', f'{facts.size}; beyond that {local}', figure, sure)
+            return Decision('correct', f'{facts.size}; the correction removes {100 * gain:.0f} % '
+                                       'of the held-out error', figure, sure)
+        return Decision('measure_again', f'{facts.size}; in addition, {local}', figure, sure)
     figure = Figure('local_offsets', facts.local_px, 'px')
     if facts.local_px > facts.noise_px:
         return Decision('measure_again', f'{local}, more than the noise of '
                         f'{facts.noise_px:.2g} px', figure, 1 - facts.local_p)
     if facts.local_px > 0:
-        return Decision('keep', f'it is imperfect but does no harm: {local}', figure,
+        return Decision('keep', f'{local}, less than the noise', figure,
                         1 - facts.local_p)
-    return Decision('keep', 'no error of it shows beyond the noise', figure, 0.95)
+    return Decision('keep', 'its errors are below the noise', figure, 0.95)
 
 
 class PhotographsFacts(NamedTuple):
@@ -235,15 +237,16 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     figure = Figure('held_out_over_noise', times, '1')
     if facts.bad and len(facts.bad) >= _MAX_REJECTED_SHARE * facts.frames:
         return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
-                        'others or are wrong as a whole', figure, None)
+                                  'others or are outliers as a whole', figure, None)
     if facts.frames < _MIN_FRAMES:
-        return Decision('more', f'{facts.frames} frames are few; take {_MIN_FRAMES} or more',
+        return Decision('more', f'{facts.frames} frames are too few; take {_MIN_FRAMES} or more',
                         figure, None)
     if facts.lens == 'undecided':
         return Decision('more', 'the lens is undecided; --next 6 lists the views that decide it',
                         figure, None)
     if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
-        return Decision('more', f'{len(facts.unlike)} of {facts.frames} show what no other does',
+        return Decision('more', f'{len(facts.unlike)} of {facts.frames} are not predicted by the '
+                                'others',
                         figure, None)
     return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times the noise',
                     figure, None)

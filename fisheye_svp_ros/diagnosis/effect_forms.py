@@ -113,7 +113,7 @@ def _forms(kind: type[Effect], linear: Linearization) -> list[Sequence[Effect]]:
     if not scene.cameras or not of_lens:
         return [_catalogue_forms(kind, scene, linear.free)]
     found: list[Sequence[Effect]] = []
-    reason = Untestable('no camera sees anything')
+    reason = Untestable('no camera has any image point')
     for _, camera, own in scene.cameras:
         try:
             forms = _catalogue_forms(kind, own, linear.free)

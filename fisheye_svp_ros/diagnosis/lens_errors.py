@@ -124,8 +124,8 @@ class LensErrors:
         """Return what a lens carries; raise LensError for one that carries nothing, or half."""
         entry = lens.uncertainty
         if entry is None:
-            raise LensError(f'lens {lens.name!r} has no uncertainty; the extended_lens.yaml that '
-                            '`diagnose -o` writes has')
+            raise LensError(f'lens {lens.name!r} has no uncertainty; use the extended_lens.yaml '
+                            'that `diagnose -o` writes')
         try:
             size = np.array([float(entry['components'].get(name, 0.0)) for name in NAMES])
             lam = np.where(size > 0, 1 / np.maximum(size, 1e-30) ** 2, LAMBDA_ABSENT)

@@ -82,8 +82,8 @@ class DiagnosisOptions:
                 raise ParameterError(f'effect {name!r} is unknown; known are {known}')
         for name in self.included:
             if not can_be_included(name):
-                raise ParameterError(f'effect {name} cannot be included without a test; leave it '
-                                     'to the diagnosis')
+                raise ParameterError(f'effect {name} cannot be fitted without a test; leave it '
+                                     'out of --with')
 
 
 @dataclass(frozen=True)

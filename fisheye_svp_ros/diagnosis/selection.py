@@ -122,7 +122,7 @@ def select_causes(problem: Problem, progress: Progress) -> Selection:
                      1 if problem.options.quick else _MAX_ROUNDS)
     first: NullModel | None = None
     for turn in range(_MAX_ROUNDS):
-        progress(f'weighing {len(CATALOGUE)} effects beside local errors, round {turn + 1}',
+        progress(f'testing {len(CATALOGUE)} effects, round {turn + 1}',
                  0.8 - 0.75 * _PROGRESS_DECAY**turn)
         null = search.estimate_null_model(problem)
         first, before = first or null, replace(search, variances=null.variances)

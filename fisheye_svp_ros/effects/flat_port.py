@@ -30,7 +30,7 @@ class FlatPortEffect(Effect):
         'residuals along the radius that grow with the angle and with 1 / range, bounded by the '
         'thickness'
     )
-    to_separate = 'views beyond 60 degrees at clearly different ranges; look at the housing'
+    to_separate = 'views beyond 60 degrees at clearly different ranges; inspect the housing'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

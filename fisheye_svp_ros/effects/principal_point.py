@@ -17,7 +17,7 @@ class PrincipalPointEffect(Effect):
 
     name = 'principal_point'
     stage = 'image'
-    signature = 'residuals with a constant part over the image that no turn of the camera takes up'
+    signature = 'residuals with a constant part that no rotation of the camera absorbs'
     to_separate = 'landmarks over the whole field of view; views turned about the axis'
 
     parameters = (Parameter('cx', 'px', 10.0), Parameter('cy', 'px', 10.0))

@@ -20,7 +20,7 @@ class StereoTimeOffsetEffect(Effect):
     of_motion = True
     of_frames = True
     signature = 'residuals of one camera against the other that grow with the speed of the rig'
-    to_separate = 'the same scene with the rig at rest; a flash of light seen by both cameras'
+    to_separate = 'the same scene with the rig at rest; a flash of light visible to both cameras'
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:

@@ -30,8 +30,7 @@ class TargetShapeEffect(Effect):
     stage = 'target'
     target_map = 'smooth'
     signature = (
-        'residuals that keep to the board: the same place is off by the same height in every '
-        'view'
+        'residuals fixed to the board: the same place has the same height error in every view'
     )
     to_separate = (
         'turn the board about its normal and tilt it between views; measure its flatness with a '

@@ -16,7 +16,7 @@ class WrongIdsEffect(NoiseEffect):
 
     name = 'wrong_ids'
     signature = 'a few huge residuals that end where another landmark is predicted'
-    to_separate = 'look at the named image points; match the ids again'
+    to_separate = 'check the named image points; match the ids again'
 
     parameters = (Parameter('fraction', '1', 0.02),)
 

@@ -161,7 +161,7 @@ class Bag:
         self.path = Path(path)
         self.damage = ''
         if not self.path.exists():
-            raise BagError(f'{path}: there is no such recording; check the path')
+            raise BagError(f'{path}: no such recording; check the path')
         if self.path.is_dir() and not self._files():
             raise BagError(f'{path}: no .mcap or .db3 file in this folder')
         if odd := [file for file in self._files() if not file.is_file()]:
@@ -195,7 +195,7 @@ class Bag:
             yield Record(topic, typename, when, message)
         if notes:
             more = f' and {len(notes) - _MAX_LISTED} more' if len(notes) > _MAX_LISTED else ''
-            self.damage = ('it is damaged: only what is whole is read; '
+            self.damage = ('it is damaged, and only its intact parts are read; '
                            + '; '.join(notes[:_MAX_LISTED]) + more)
 
     def topics(self) -> set[tuple[str, str]]:
@@ -230,7 +230,7 @@ class Bag:
             if plain != file:
                 passed(file.stat().st_size)
         if problems and not count:
-            raise BagError(f'{self.path}: not a recording, or nothing in it is whole '
+            raise BagError(f'{self.path}: not a recording, or no part of it is intact '
                            f'({"; ".join(problems[:_MAX_LISTED])})')
 
 

@@ -42,7 +42,7 @@ def arrow() -> tuple[Any, str]:
         if int(pyarrow.__version__.partition('.')[0]) < _MIN_PYARROW:
             raise ImportError(f'{pyarrow.__version__} is older than {_MIN_PYARROW}')
     except Exception as cause:  # beside an older NumPy it ends in more than one way
-        return None, f'no Parquet file, the CSV file has it all: pyarrow is not usable ({cause})'
+        return None, f'only CSV, no Parquet file: pyarrow is not usable ({cause})'
     return pyarrow, ''
 
 
@@ -87,7 +87,7 @@ class TableParts:
         try:
             part: dict[str, list[Any]] = read_json(path, OutputError)
             if {*part} != {*self._types} or len({*map(len, part.values())}) != 1:
-                raise ValueError('its columns are others')
+                raise ValueError('its columns differ')
             for name, kind in self._types.items():
                 if not all(type(cell) in (kind, type(None)) for cell in part[name]):
                     raise ValueError(f'{name} holds other values than {kind.__name__}')
@@ -95,7 +95,7 @@ class TableParts:
                     raise ValueError(f'{name} holds a number above {_MAX_INTEGER}')
         except (OutputError, ValueError, TypeError) as cause:
             raise OutputError(f'{path}: a part of the table is damaged ({cause}); remove it and '
-                              'compute it anew') from cause
+                              'compute it again') from cause
         return part
 
     def _path(self, number: int) -> Path:
@@ -136,7 +136,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
         columns = {name: _to_python(pyarrow, file.read([name]).column(name)) for name in names}
         rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
         if {about.num_rows, rows, *map(len, columns.values())} != {rows}:
-            raise ValueError('its columns do not have the rows that were written')
+            raise ValueError('its columns differ in length from what was written')
         return columns
     except Exception as cause:  # whatever pyarrow makes of what is damaged
         raise OutputError(f'{path}: not a table ({cause or type(cause).__name__})') from cause

@@ -86,7 +86,7 @@ def parse_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> di
 def compose_yaml(text: str, where: str | Path, error: type[FisheyeSvpError]) -> yaml.Node | None:
     """Return the nodes of a YAML text, None for an empty one; raise `error` as `parse_yaml`."""
     if len(text) > LARGEST_YAML:
-        raise error(f'{where}: above {LARGEST_YAML >> 20} MB, which is more than is read as YAML')
+        raise error(f'{where}: above {LARGEST_YAML >> 20} MB, the largest YAML file that is read')
     depth = values = 0
     with _convert_errors(where, error):
         for event in yaml.parse(text, _Loader):

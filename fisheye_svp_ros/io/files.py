@@ -30,7 +30,7 @@ def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_B
         with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), 'rb') as stream:
             found = os.fstat(stream.fileno())
             if not stat.S_ISREG(found.st_mode):
-                raise error(f'{path}: not a regular file; give one')
+                raise error(f'{path}: it must be a regular file')
             size, data = found.st_size, bytearray()
             while size <= most and (piece := stream.read(_BLOCK_BYTES)):
                 data += piece
@@ -39,7 +39,7 @@ def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_B
         reason = getattr(cause, 'strerror', None) or cause
         raise error(f'{path}: cannot be read ({reason}); check the path') from cause
     if size > most:
-        raise error(f'{path}: above {most / (1 << 20):g} MB, which is more than is read')
+        raise error(f'{path}: above {most / (1 << 20):g} MB, the largest size that is read')
     return bytes(data)
 
 
@@ -60,7 +60,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     """
     target, waiting = Path(path), _waiting.get()
     if target.exists() and not target.is_file():
-        raise OutputError(f'{path}: it is there and not a regular file; choose another name')
+        raise OutputError(f'{path}: it exists and is not a regular file; choose another name')
     temporary = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -56,12 +56,12 @@ def load_lens(path: str | Path) -> Lens:
     foreign = read_foreign(path, text)
     if foreign is None and not camera:
         if not OWN_SECTIONS.search(text):
-            raise LensError(f'{path}: no lens file: it has no projection, and is none of '
+            raise LensError(f'{path}: not a lens file: it has no projection, and no format of '
                             f'{READABLE}')
         return lens_from_dict(parse_yaml(text, path, LensError), str(path))
     lenses = foreign.lenses if foreign else {}
     if foreign and not lenses:
-        raise LensError(f'{path}: it holds a rig and no lens')
+        raise LensError(f'{path}: it holds a rig, but no lens')
     camera = camera or next(iter(lenses), '')
     if camera not in lenses:
         raise LensError(f'{path}: no camera {camera!r} in it; it has '

@@ -114,7 +114,7 @@ def _groups(stream: IO[bytes], size: int, note: _Note) -> Iterator[list[Any]]:
         elif opcode == Opcode.STATISTICS or data:
             yield _parse_record(opcode, body, f'the record at byte {place}', note)
         place = stream.tell()
-    note(f'from byte {place} on it cannot be followed')
+    note(f'it cannot be read from byte {place} on')
     summary = _summary(stream)
     chunks = summary.chunk_indexes if summary else ()
     for start in sorted(chunk.chunk_start_offset for chunk in chunks):
@@ -172,7 +172,7 @@ def _decompress(chunk: Chunk) -> bytes:
     else:
         raise ValueError(f'compression {chunk.compression!r} is unknown')
     if len(data) != size:
-        raise ValueError('its size is another than announced')
+        raise ValueError('its size is not the announced one')
     return data
 
 

@@ -55,7 +55,7 @@ def _topics_present(bag: Bag, worlds: set[str]) -> str:
     """Return what a recording has in place of one world's observations, and what to do."""
     images = {topic for topic, kind in bag.topics() if kind in _IMAGES}
     if images and not worlds:
-        return f'it has images, on {min(images)}: say what they show, --board chessboard:9x6:24mm'
+        return f'it has images, on {min(images)}: add --board, for example chessboard:9x6:24mm'
     found = ', '.join(world or '/' for world in sorted(worlds)) or 'none'
     wanted = f'{max(worlds)}/.*' if len(worlds) > 1 else '.*/(landmarks|image_points)'
     return f"landmarks are in: {found}; record with --topics '{wanted}'"

@@ -59,6 +59,6 @@ def read_observations(path: str | Path) -> Observations:
             read: Callable[[Path], Observations] = import_module(reader.module).read
             return read(given)
     if not given.exists():
-        raise ObservationError(f'{path}: there is no such file or folder; check the path')
+        raise ObservationError(f'{path}: no such file or folder; check the path')
     forms = ', '.join(reader.form for reader in READERS.values())
     raise ObservationError(f'{path}: not observations in a known form; these are {forms}')

@@ -51,10 +51,10 @@ def _given_or_named(name: str, folder: str, error: type[FisheyeSvpError]) -> Pat
         return given
     if not is_there(named, Path.is_file):
         if given.is_dir():
-            raise error(f'{name!r} is a folder and not among the {folder} of this package; with a '
-                        f'slash, {name}/, it is one of files')
+            raise error(f'{name!r} is a folder, and not one of the {folder} of this package; '
+                        f'write {name}/ for the folder')
         known = ', '.join(sorted(path.stem for path in config_path(folder).glob('*.yaml')))
-        raise error(f'{name!r} is neither a file nor among the {folder} of this package: {known}')
+        raise error(f'{name!r} is neither a file nor one of the {folder} of this package: {known}')
     return named
 
 

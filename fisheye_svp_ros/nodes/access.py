@@ -19,8 +19,8 @@ def check_access(name: str, folder: str, what: str) -> str:
     if _NAME.fullmatch(name) and not Path(name).is_file():
         return name
     if not folder:
-        raise ParameterError(f'{what}: {name[:100]!r} is a file, and only names in config/ are '
-                             'taken while the node runs; start it with folder:=DIR')
+        raise ParameterError(f'{what}: {name[:100]!r} is a file, but a running node takes only '
+                             'names in config/; start it with folder:=DIR')
     try:
         path = Path(name).resolve()
         inside = path.is_relative_to(Path(folder).resolve())

@@ -63,10 +63,10 @@ def report(
         'sets: taken': counts.taken, 'sets: solved': counts.solved,
         'sets: not solved': counts.unsolved, 'sets: dropped': counts.dropped,
         'sets: incomplete': counts.incomplete, 'sets: waiting': waiting,
-        'sets: come per second': round(came, 1), 'sets: done per second': round(done, 1),
+        'sets: received per second': round(came, 1), 'sets: solved per second': round(done, 1),
         'sets: latency_s': round(latency, 4),
     }
     if counts.dropped == before.dropped:
         return told, ''
-    return told, (f'cannot keep up: {came:.0f} sets come in a second and {done:.0f} are solved, '
+    return told, (f'too slow: {came:.0f} sets per second are received and {done:.0f} are solved, '
                   f'{latency:.2f} s late; {waiting} wait, {counts.dropped} are dropped')

@@ -167,7 +167,7 @@ class CameraNode(BaseNode):
         elif time.monotonic() - self._sent > _REPUBLISH_TIMEOUT:
             # Who answers may not have known of this node yet when it did.
             waiting = ' '.join(sorted(self._unanswered))
-            self.get_logger().warning(f'no answer on {waiting}; publishing the set once more')
+            self.get_logger().warning(f'no answer on {waiting}; the set is published again')
             self._send()
 
     def _advance(self) -> None:

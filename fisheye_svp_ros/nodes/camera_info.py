@@ -53,7 +53,7 @@ class CameraInfos:
     def _model(self, topic: str, stamp: int) -> CameraModel:
         heard = self._heard.get(topic)
         if not heard:
-            raise ParameterError(f'{topic}: none has come; set the parameter lens')
+            raise ParameterError(f'{topic}: no message received; set the parameter lens')
         key = stamp if stamp in heard else next(reversed(heard))
         if not isinstance(heard[key], CameraModel):
             heard[key] = heard[key].read()

@@ -50,26 +50,27 @@ class DetectorSettings(Settings):
     )
     board_frame: str = parameter('board', 'Frame id of the landmarks')
     longest_search: float = parameter(
-        1.0, 'How long an image may be searched; then it has no board', 's', (0.05, 60.0)
+        1.0, 'Longest search in one image; after it, the image counts as without '
+        'board', 's', (0.05, 60.0)
     )
     detections: bool = parameter(
-        False, 'Take AprilTags that others found, on `detections`, in place of images; these must '
-        'have been raw, not rectified; apriltag_msgs must be installed', fixed=True
+        False, 'Use AprilTags found by another node in raw (not rectified) images, from the topic '
+        '`detections`, in place of images; needs apriltag_msgs', fixed=True
     )
     guide: str = parameter(
-        '', 'Number of the lens that the live guide is to settle (e0: the viewpoint shift); '
+        '', 'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
         'empty: no guide', choices=('', *NUMBERS), fixed=True
     )
     goal: float = parameter(
-        0.0002, 'Standard error of that number at which it is settled, m of e0, px of fx, fy, cx '
-        'and cy', span=(1e-9, 1e3), fixed=True
+        0.0002, 'Standard error at which that parameter is determined, m for e0, px for fx, fy, '
+        'cx and cy', span=(1e-9, 1e3), fixed=True
     )
     lens: str = parameter(
-        '', 'Lens that the guide begins with: a file, or a name in config/lenses; `camera_info`: '
-        'what that topic says; empty: one of this `field_of_view`', fixed=True, file=True
+        '', 'Initial lens of the guide: a file, or a name in config/lenses; `camera_info`: from '
+        'that topic; empty: one with the parameter `field_of_view`', fixed=True, file=True
     )
     field_of_view: float = parameter(
-        3.1, 'Field of view over the width of the image, as the data sheet has it', 'rad',
+        3.1, 'Field of view over the width of the image, from the data sheet', 'rad',
         (0.3, 6.0), fixed=True
     )
     near: float = parameter(0.15, 'Nearest distance at which the board is sharp', 'm',
@@ -107,7 +108,7 @@ class Detector(BaseNode):
         self._searched: tuple[int, str, Pixels] | None = None
         self._infos = CameraInfos(self.get_logger().info)
         self._misfit = ''
-        self._counts = {'images overtaken': 0, 'images without board': 0, 'searches broken off': 0}
+        self._counts = {'images overtaken': 0, 'images without board': 0, 'searches ended': 0}
         if self.settings.detections:
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
             self.start()
@@ -151,9 +152,9 @@ class Detector(BaseNode):
         if settings.guide and settings.detections:
             raise ParameterError('guide needs images; it cannot be used with detections')
         if settings.guide and settings.board != self.settings.board:
-            raise ParameterError('board cannot be changed while the guide is at work')
+            raise ParameterError('board cannot be changed while the guide runs')
         if settings.near >= settings.far:
-            raise ParameterError('near is not below far; the board would have no room')
+            raise ParameterError('near must be below far')
         return parse_pattern(settings.board)
 
     def configure(self, pattern: Pattern) -> None:
@@ -229,7 +230,7 @@ class Detector(BaseNode):
         else:
             self._near = None
             self._counts['images without board'] += 1
-            self._counts['searches broken off'] += isinstance(found, TimedOut)
+            self._counts['searches ended'] += isinstance(found, TimedOut)
             if isinstance(found, Exception):
                 self.unforeseen(found)
         if self._guiding is not None:
@@ -243,7 +244,8 @@ class Detector(BaseNode):
         tags = [tag for tag in message.detections
                 if 0 <= tag.id < self._pattern.columns * self._pattern.rows]
         if not tags:
-            raise ObservationError(f'{topic}: no tag of the board among {len(message.detections)}')
+            raise ObservationError(f'{topic}: none of {len(message.detections)} tags belongs to '
+                                   'the board')
         # Both go round a tag from its lower left, against the clock.
         ids = np.concatenate([4 * tag.id + np.arange(4) for tag in tags])
         uv = np.array([[corner.x, corner.y] for tag in tags for corner in tag.corners]) - 0.5
@@ -266,8 +268,8 @@ class Detector(BaseNode):
         """Take note where the camera_info is not of these images: the solvers cannot know."""
         height, width = pixels.shape
         self._misfit = '' if told in (None, (width, height)) else (
-            f'image: {width}x{height} px, but {CAMERA_INFO} is of {told[0]}x{told[1]} px, and no '
-            'lens fits both: have the driver send the calibration of the images it sends')
+            f'image: {width}x{height} px, but {CAMERA_INFO} is for {told[0]}x{told[1]} px; have '
+            'the driver send the calibration of its images')
         if self._misfit:
             self.get_logger().warning(self._misfit, throttle_duration_sec=10.0)
 

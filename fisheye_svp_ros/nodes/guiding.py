@@ -63,8 +63,8 @@ class Guiding:
             self._folder.mkdir(parents=True, exist_ok=True)
         if not (self._folder.is_dir() and os.access(self._folder, os.W_OK)) or any(
                 self._folder.iterdir()):
-            raise ParameterError(f'guide_output: {self._folder} is not an empty folder that can '
-                                 'be written; choose another for these photographs')
+            raise ParameterError(f'guide_output: {self._folder} is not an empty, writable folder; '
+                                 'choose another one')
         self._infos = infos
         self._lens: Lens | None = None
         if settings.lens not in ('', CAMERA_INFO):
@@ -91,10 +91,10 @@ class Guiding:
     def report(self) -> tuple[dict[str, object], str]:
         """Return how far it is, for /diagnostics, and what is wrong."""
         if self._guide is None:
-            return {'guide': 'waits for the first image'}, self._trouble
+            return {'guide': 'waiting for the first image'}, self._trouble
         do, where, known = guide_words(self._guide)
         return {'guide': f'{do}; {where}', 'guide: taken': known,
-                'guide: not to be had': len(self._guide.session.room.taken),
+                'guide: unreachable views': len(self._guide.session.room.taken),
                 'guide: failures': self._failures}, self._trouble
 
     def look(self, stamp: int, frame: str, pixels: Pixels, found: Any) -> None:
@@ -162,7 +162,7 @@ class Guiding:
         """Go on without the last photograph; without any there is nothing to go on with."""
         self._failures += 1
         late = isinstance(result, TimedOut)
-        self._trouble = f'guide: {f"nothing within {_PLANNING_TIMEOUT:g} s" if late else result}'
+        self._trouble = f'guide: {f"no plan within {_PLANNING_TIMEOUT:g} s" if late else result}'
         if not (late or isinstance(result, FisheyeSvpError)):
             self._node.unforeseen(result)
         self._node.get_logger().warning(self._trouble, throttle_duration_sec=1.0)

@@ -39,7 +39,7 @@ class Unread:
         """The stamp of its header, which every message starts with that a node listens to, ns."""
         try:
             if len(self._data) < _MIN_BYTES:
-                raise ObservationError(f'{self.topic}: {len(self._data)} bytes are no message')
+                raise ObservationError(f'{self.topic}: {len(self._data)} bytes are not a message')
             order = '<' if self._data[1] & 1 else '>'
             sec, nanosec = struct.unpack_from(f'{order}iI', self._data, 4)
             return nanoseconds(sec, nanosec, self.topic)

@@ -27,20 +27,20 @@ _OF_TF = ('synthetic_camera', 'measured_camera', 'localizer', 'stereo_calibrator
 
 # By name: what it is for, the default, and the choices if there are any.
 COMMON: Mapping[str, tuple[str, str, Sequence[str]]] = {
-    'lens': ('lens file, or name in config/lenses; empty: as the parameter files have it', '', ()),
-    'svp': ('solve without the viewpoint shift of the lens; empty: as the parameter files have it',
+    'lens': ('lens file, or name in config/lenses; empty: from the parameter files', '', ()),
+    'svp': ('solve without the viewpoint shift of the lens; empty: from the parameter files',
             '', ('', 'auto', *_FLAG)),
     'namespace': ('namespace of the nodes', '', ()),
     'params': ('parameter file for all nodes, after their own; empty: none', '', ()),
-    'publish_tf': ('tell tf2 the cameras, as estimated and as true, and the rig; empty: as the '
-                   'parameter files have it', '', ('', *_FLAG)),
-    'world_frame': ('frame of the landmarks; empty: as the parameter files have it', '', ()),
-    'camera_frame': ('frame of the camera, of a rig without left_ and right_; empty: as the '
-                     'parameter files have it', '', ()),
-    'use_sim_time': ('take the time from /clock; empty: as the parameter files have it', '',
+    'publish_tf': ('publish estimated and true cameras and the rig on tf2; empty: from the '
+                   'parameter files', '', ('', *_FLAG)),
+    'world_frame': ('frame of the landmarks; empty: from the parameter files', '', ()),
+    'camera_frame': ('frame of the camera, for a rig without left_ and right_; empty: from the '
+                     'parameter files', '', ()),
+    'use_sim_time': ('take the time from /clock; empty: from the parameter files', '',
                      ('', *_FLAG)),
-    'log_level': ('what the nodes log from', 'info', _LEVELS),
-    'respawn': ('start a node again when it ends', 'false', _FLAG),
+    'log_level': ('lowest severity that the nodes log', 'info', _LEVELS),
+    'respawn': ('restart a node when it ends', 'false', _FLAG),
 }
 
 
@@ -57,7 +57,7 @@ def arguments(names: Iterable[str] = COMMON) -> list[Any]:
 def style_argument() -> Any:
     """Return the declaration of the style of a rig."""
     return DeclareLaunchArgument('style', default_value=STYLES[0], choices=list(STYLES),
-                                 description='how the cameras of the rig stand')
+                                 description='arrangement of the cameras of the rig')
 
 
 def file_arguments(names: Iterable[str]) -> list[Any]:
@@ -126,7 +126,7 @@ def _files(context: Any, name: str) -> list[str]:
     files = {word: value(context, word) for word in (f'{name}_params', 'params')}
     for word, file in files.items():
         if file and not Path(file).is_file():
-            raise ParameterError(f'{word}: {file!r} is no file; name a parameter file')
+            raise ParameterError(f'{word}: no file {file!r}; name a parameter file')
     return [*filter(None, files.values())]
 
 

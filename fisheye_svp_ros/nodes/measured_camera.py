@@ -74,7 +74,7 @@ class MeasuredCamera(CameraNode):
         table = read_observations(settings.observations)
         for name in table.cameras:
             if name and not _NAMESPACE.fullmatch(name):
-                raise ObservationError(f'camera {name!r} cannot be the name of a namespace')
+                raise ObservationError(f'camera {name!r} cannot name a namespace')
         lens = load_lens(lens_path(settings.lens)) if settings.lens else None
         return Recording(
             observations=table,

@@ -50,17 +50,20 @@ class ModelCriticSettings(RigSettings):
     """Parameters of the model critic."""
 
     sigma_px: float = parameter(
-        0.0, 'Standard deviation of an image point; 0: unknown, to be estimated', 'px', (0.0, 1e3)
+        0.0, 'Standard deviation of an image point; 0: estimate it', 'px', (0.0, 1e3)
     )
     stereo: bool = parameter(
-        False, 'Judge the cameras left and right of a rig together', fixed=True
+        False, 'Diagnose the cameras left and right of a rig together', fixed=True
     )
     free_intrinsics: bool = parameter(
-        False, 'Fit the intrinsics too; always so for a lens that was calibrated'
+        False, 'Fit the intrinsics too; always done for a lens from `calibrate`'
     )
-    min_frames: int = parameter(20, 'Frames before the first diagnosis', span=(5, 100_000))
-    every_frames: int = parameter(20, 'Further frames before the next one', span=(1, 100_000))
-    max_frames: int = parameter(100, 'Judge at most so many of the last frames', span=(5, 100_000))
+    min_frames: int = parameter(
+        20, 'Number of frames before the first diagnosis', span=(5, 100_000))
+    every_frames: int = parameter(
+        20, 'Number of further frames before the next one', span=(1, 100_000))
+    max_frames: int = parameter(
+        100, 'Largest number of frames to diagnose: the latest', span=(5, 100_000))
     output: str = parameter(
         'extended_lens.yaml', 'File that the service write_extended_lens writes', fixed=True
     )
@@ -112,10 +115,10 @@ class ModelCritic(SolverNode):
     def prepare(self, settings: Any) -> Any:
         """Refuse settings that cannot be used."""
         if settings.min_frames > settings.max_frames:
-            raise ParameterError('min_frames is above max_frames; no diagnosis would ever start')
+            raise ParameterError('min_frames is above max_frames, so no diagnosis would start')
         if settings.stereo and settings.lens == CAMERA_INFO:
-            raise ParameterError('lens is camera_info, of each camera its own; a rig is judged '
-                                 'with one lens for both, named by its file')
+            raise ParameterError('with rig, lens cannot be camera_info; name one lens file for '
+                                 'both cameras')
         return super().prepare(settings)
 
     def configure(self, settings: Any) -> None:

@@ -43,15 +43,15 @@ class RectifierSettings(Settings):
     """Parameters of the rectifier."""
 
     lens: str = parameter(
-        CAMERA_INFO, 'Lens: a file, or a name in config/lenses; of a rig a file or folder with '
-        'both; `camera_info`: what `image/camera_info` says', file=True
+        CAMERA_INFO, 'Lens: a file, or a name in config/lenses; for a rig, a file or folder with '
+        'both; `camera_info`: from the topic `image/camera_info`', file=True
     )
     stereo: bool = parameter(
         False, 'Rectify a stereo pair, the cameras in the namespaces left and right', fixed=True
     )
     rig: str = parameter(
-        '', 'Rig of the stereo pair: a file of `calibrate`, Kalibr, Basalt, OpenCV, a URDF; '
-        'empty: that in the file or folder of the lenses', file=True
+        '', 'Rig of the stereo pair: a file of `calibrate`, Kalibr, Basalt, OpenCV, or a URDF; '
+        'empty: the rig in the file or folder of the lenses', file=True
     )
     field_of_view: float = parameter(
         1.5708, 'Field of view of the rectified images over their width', 'rad', (0.01, 3.05)
@@ -61,8 +61,8 @@ class RectifierSettings(Settings):
     height: int = parameter(
         0, 'Height of the rectified images; 0: that of the images', 'px', (0, 8192))
     range: float = parameter(
-        RANGE, 'Range at which the images are exact where the viewpoint of the lens moves, of a '
-        'pair from the middle of the baseline', 'm', (0.01, 1e6)
+        RANGE, 'Range at which images of a lens with a moving viewpoint are exact; for a pair, '
+        'from the middle of the baseline', 'm', (0.01, 1e6)
     )
 
 
@@ -102,8 +102,8 @@ class Rectifier(BaseNode):
         own, raw = (self.resolve_topic_name(camera + name) for name in (CAMERA_INFO, _INFO))
         if own == raw:
             raise ParameterError(
-                f'{raw} would be heard and published; publish in another namespace, for example '
-                '-r __ns:=/rectified')
+                f'the node would subscribe to its own output {raw}; choose another namespace, for '
+                'example -r __ns:=/rectified')
         self._outputs[camera] = (
             self.announce(Image, f'{camera}image_rect', SENSOR, wait=True),
             self.announce(CameraInfo, f'{camera}{CAMERA_INFO}', SENSOR))
@@ -178,8 +178,8 @@ class Rectifier(BaseNode):
         height, width = pixels.shape[:2]
         if (width, height) != (side.lens.width, side.lens.height):
             raise ObservationError(
-                f'{image.topic}: {width}x{height} px, and the lens is of {side.lens.width}x'
-                f'{side.lens.height} px; give the lens of these images')
+                f'{image.topic}: {width}x{height} px, but the lens is for '
+                f'{side.lens.width}x{side.lens.height} px; give the lens of these images')
         taken.append((stamp, image.topic))
         if rectified.get_subscription_count():
             rectified.publish(

@@ -35,32 +35,32 @@ def explain_silence(node: Any, inputs: Sequence[Input]) -> tuple[str, str]:
     one = next((one for one, found in publishers.items() if found), inputs[0])
     one = next((known for known in inputs if known.has_messages), one)
     since = f' for {one.silent_for():.0f} s' if one.has_messages else ''
-    return (f'nothing has come on {one.resolved}{since}',
+    return (f'no message on {one.resolved}{since}',
             _reason(node, inputs, one, publishers[one]))
 
 
 def _reason(node: Any, inputs: Sequence[Input], one: Input, publishers: Sequence[Any]) -> str:
     if not publishers:
         if one.has_messages:
-            return 'nobody publishes it any more; start its publisher again'
-        return 'nobody publishes it; ' + _proposal(node, inputs)
+            return 'its publisher is gone; start it again'
+        return 'it has no publisher; ' + _proposal(node, inputs)
     right = [info for info in publishers if info.topic_type == one.typename]
     if not right:
         kinds = ', '.join(sorted({info.topic_type for info in publishers}))
-        return (f'it is published as {kinds}, and {one.typename} is needed; '
+        return (f'its type is {kinds}, but {one.typename} is needed; '
                 + _proposal(node, inputs))
     names = ', '.join(sorted({info.node_name for info in right}))
     if one.has_messages:
-        return (f'{names} is still connected; see whether it still gets data of its own, with '
-                f'ros2 topic hz {one.resolved}')
+        return (f'{names} is still connected; check its own input, and run ros2 topic hz '
+                f'{one.resolved}')
     offers = [info.qos_profile for info in right]
     if not any(_is_compatible(offered, asked) for offered in offers for asked in one.profiles):
-        return (f'{names} offers {qos_words(offers[0])}, and this node asks for '
-                f'{qos_words(one.profiles[0])}; take back {PREFIX}{one.resolved}.subscription.*')
+        return (f'{names} offers {qos_words(offers[0])}, but this node requests '
+                f'{qos_words(one.profiles[0])}; remove {PREFIX}{one.resolved}.subscription.*')
     lossy = all(asked.reliability == ReliabilityPolicy.BEST_EFFORT for asked in one.profiles)
     large = (' (best effort loses large messages: raise net.core.rmem_max, or set '
              f'{PREFIX}{one.resolved}.subscription.reliability:=reliable)' if lossy else '')
-    return f'{names} is connected and has sent nothing that arrived{large}'
+    return f'{names} is connected, but no message has arrived{large}'
 
 
 def _is_compatible(offered: Any, asked: Any) -> bool:
@@ -80,9 +80,9 @@ def _proposal(node: Any, inputs: Sequence[Input]) -> str:
     found = [topic for topic, kinds in node.get_topic_names_and_types()
              if known & {*kinds} and topic not in own and _comes_from_elsewhere(node, topic)]
     if not found:
-        return (f'no topic here carries {wanted.typename}: start what publishes it, with the same '
+        return (f'no topic here has type {wanted.typename}; start its publisher with the same '
                 'ROS_DOMAIN_ID')
     found.sort(key=lambda topic: -SequenceMatcher(None, topic, wanted.resolved).ratio())
     topic = found[0].removesuffix('/compressed') if len(inputs) > 1 else found[0]
-    return (f'{wanted.typename} is on {", ".join(found[:_MAX_PROPOSALS])}: listen there with '
+    return (f'{wanted.typename} is on {", ".join(found[:_MAX_PROPOSALS])}; subscribe to it with '
             f'-r {wanted.name}:={topic}')

@@ -120,7 +120,7 @@ class SolverNode(ManagedNode):
             self._join.expect_no_more('scenario')
         lens = (f'lens {settings.lens}' if not told else
                 f'lens of {CAMERA_INFO}' if settings.lens else 'lens that scenario names')
-        how = 'without its viewpoint shift' if settings.solves_svp else 'as it stands'
+        how = 'without its viewpoint shift' if settings.solves_svp else 'with its viewpoint shift'
         text = f'solving with the {lens} {how} (svp: {settings.svp})'
         if text != self._said:
             self.get_logger().info(text)
@@ -157,8 +157,8 @@ class SolverNode(ManagedNode):
         """
         if self._lenses:
             if camera not in self._lenses:
-                raise ParameterError(f'lens {self.settings.lens}: it holds several cameras, and '
-                                     'one lens is needed; add # and the name of one')
+                raise ParameterError(f'lens {self.settings.lens}: it holds several cameras; add # '
+                                     'and the name of one')
             return self._lenses[camera]
         if self.settings.lens == CAMERA_INFO:
             return self._infos.lens(f'{camera}{CAMERA_INFO}', stamp)
@@ -270,8 +270,8 @@ class SolverNode(ManagedNode):
             off = self._join.distance(topic, one.stamps[points])
             if topic not in one.items and off is not None:
                 self.warn(f'{topic}: the nearest stamp is {1e-6 * off:.1f} ms from that of the '
-                          f'image points; between true poses that are up to true_pose_gap '
-                          f'({self.settings.true_pose_gap:g} s) apart a set is interpolated')
+                          'image points; true poses are interpolated only over gaps up to '
+                          f'true_pose_gap ({self.settings.true_pose_gap:g} s)')
 
     def _look_at(self, stamp: int, topic: str) -> None:
         """Decode what waits for the rest of its set, so that bad input is told of at once."""
@@ -328,9 +328,9 @@ class SolverNode(ManagedNode):
     def _reason(self, missing: str, stamp: int) -> str:
         off = self._join.distance(missing, stamp)
         if off is None:
-            return f'nothing has come on {missing}'
+            return f'no message on {missing}'
         return (f'the nearest stamp on {missing} is {1e-6 * off:.1f} ms off; with '
-                'approximate_sync:=true approximate_sync_tolerance_seconds is allowed')
+                'approximate_sync:=true, up to approximate_sync_tolerance_seconds is allowed')
 
 
 def _interpolated_pose(poses: NeighborPair) -> Pose:
@@ -343,7 +343,7 @@ def known_points(landmarks: LandmarkSet, seen: ImagePoints) -> Array:
     points, known = landmarks.landmarks.lookup(seen.landmark)
     if not known.all():
         unknown = seen.landmark[~known][0]
-        raise ObservationError(f'image_points: landmark {unknown} is not among the landmarks')
+        raise ObservationError(f'image_points: landmark {unknown} is not one of the landmarks')
     return points
 
 

@@ -40,8 +40,8 @@ class StandingLandmarks:
         if self._is_series:
             raise ObservationError(
                 f'no landmarks of its stamp, the nearest is {1e-6 * (distance or 0):.1f} ms off: '
-                'they were late, lost because too much comes at once, or never sent; give '
-                'landmarks that hold for all sets the stamp 0')
+                'they were late, lost, or never sent; publish landmarks that hold for all sets '
+                'with stamp 0')
         if self._latest is None:
             raise ObservationError('no landmarks; publish them on `landmarks`')
         return self._latest

@@ -57,9 +57,9 @@ class Transforms:
             child = transform.child_frame_id
             if child in self._children and transform not in self._sent:
                 self._node.warn(
-                    f'/tf: another node publishes {child!r} as well, in '
-                    f'{transform.header.frame_id!r}, and a frame has one parent: give one of them '
-                    'another camera_frame, or publish_tf:=false')
+                    f'/tf: another node also publishes {child!r}, with parent '
+                    f'{transform.header.frame_id!r}; set another camera_frame in one of them, or '
+                    'publish_tf:=false')
 
 
 def _message_class() -> Any:
@@ -69,5 +69,5 @@ def _message_class() -> Any:
     except ImportError as cause:
         raise ParameterError(
             'publish_tf: tf2_msgs is not installed; source a ROS 2 that has it (apt install '
-            'ros-jazzy-tf2-msgs; it has no wheel), or leave publish_tf at false') from cause
+            'ros-jazzy-tf2-msgs; it has no wheel), or set publish_tf:=false') from cause
     return TFMessage

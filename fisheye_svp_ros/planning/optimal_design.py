@@ -122,7 +122,7 @@ class FlatBoard:
         if extent[2] > _MAX_THICKNESS * extent[0]:
             raise GeometryError(
                 f'{observations.source}: the target is not one flat board; the next photographs '
-                'can be planned for a flat one only'
+                'can be planned only for one'
             )
         normal = axes[2] * np.sign(((middle - pose.position) @ axes[2]).sum() or 1.0)
         across = np.eye(3)[0] - normal[0] * normal
@@ -218,7 +218,7 @@ class Design:
         found = [i for i, names in enumerate(parts) if name in names]
         if found:
             return np.array(found)
-        raise ParameterError(f'{name!r} is no number of this lens and its causes; there are '
+        raise ParameterError(f'{name!r} is not a parameter of this lens and its causes; known are '
                              + ', '.join(self.names))
 
     def question(self, name: str, others: Sequence[str] = ()) -> Criterion:

@@ -158,7 +158,7 @@ def _holding(after: Linearization, number: str) -> Effect:
         for form in forms:
             if number in (name, *(parameter.name for parameter in form.parameters)):
                 return form
-    raise ParameterError(f'--for {number}: no number of the lens or of an effect has this name')
+    raise ParameterError(f'--for {number}: no parameter of the lens or of an effect has this name')
 
 
 class PhotographPlan(NamedTuple):

@@ -155,7 +155,7 @@ def _field_over_width(lens: Lens) -> float:
 def _widest_field(projection: str, along_baseline: bool) -> float:
     widest = _WIDEST_STEREO if along_baseline else _WIDEST
     if projection not in widest:
-        reason = 'has no epipolar rows' if projection in _WIDEST else 'is unknown'
+        reason = 'has no straight epipolar rows' if projection in _WIDEST else 'is unknown'
         raise ParameterError(f'projection {projection!r} {reason}; take one of '
                              + ', '.join(widest))
     return widest[projection]

@@ -109,7 +109,7 @@ class Rectification:
         height, width = pixels.shape[:2]
         if (width, height) != (self.lens.width, self.lens.height):
             raise ParameterError(
-                f'image of {width}x{height} px, and lens {self.lens.name!r} is of '
+                f'the image is {width}x{height} px, lens {self.lens.name!r} is for '
                 f'{self.lens.width}x{self.lens.height} px; give the lens of this camera at this '
                 'size')
         found = cv2.remap(pixels, self.maps.u, self.maps.v, interpolation)

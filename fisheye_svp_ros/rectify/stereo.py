@@ -54,8 +54,8 @@ def rectify_pair(
     along = half @ rig.position
     if not length > 0 or abs(along[0]) < 0.5 * length:
         raise GeometryError(
-            'the cameras of the rig do not stand side by side: the baseline is '
-            + ', '.join(f'{value:.4g}' for value in -along) + ' m; rows cannot agree')
+            'the cameras of the rig have no usable baseline: it is '
+            + ', '.join(f'{value:.4g}' for value in -along) + ' m, and rows cannot be aligned')
     axis = np.cross(along, [np.sign(along[0]), 0.0, 0.0])
     if (size := np.linalg.norm(axis)) > 0:
         axis *= np.arccos(min(abs(along[0]) / length, 1.0)) / size

@@ -88,11 +88,11 @@ def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
                 f'{len(judged)} limits; {untold}.')
     worst = max(broken, key=lambda point: point.error / point.limit)
     unit, factor = _DISPLAY_UNITS[UNITS[worst.quantity]]
-    limit = 'what you allow' if asked.given else 'what noise causes'
+    limit = 'your limit' if asked.given else 'the effect of noise'
     needed = max(point.nearest_range for point in (*broken, *unknown))
-    neglected = 'will do' if asked.port else 'may be neglected'
+    neglected = 'suffices' if asked.port else 'may be neglected'
     remedy = (f'it {neglected} from {needed:.2f} m on' if np.isfinite(needed)
-              else 'no range within the budget helps')
+              else 'it fails at every range up to the largest computed one')
     return (
         f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits, worst the '
         f'{_LABELS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
@@ -176,9 +176,8 @@ def _explain(axis: Any, model: str) -> None:
     axis.axis('off')
     axis.text(
         0.02, 0.95,
-        f'Color: what {model} causes.\nHatched: more than the limit; {model} will not do.\n'
-        'Line: the limit is just met.\nStar: where you work.\n'
-        'Limits that you do not state are what noise causes.\n\n'
-        'Spread: largest incidence angle of the\nlandmarks, which fill a cap about the axis.',
+        f'Color: error caused by {model}.\nHatched: above the limit.\nLine: at the limit.\nStar: '
+        'your range and spread.\nDefault limits: the errors caused by noise.\n\nSpread: largest '
+        'incidence angle of the\nlandmarks, which surround the axis.',
         va='top', transform=axis.transAxes, linespacing=1.5, in_layout=False,
     )

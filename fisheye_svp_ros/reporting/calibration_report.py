@@ -82,13 +82,13 @@ def _coverage(figure: Any, one: CalibratedCamera) -> None:
     views = one.result.views
     image.plot(*views.uv[views.used].T, '.', color=OURS, ms=2)
     _image(image, one.lens)
-    image.set_title('where image points are')
+    image.set_title('image points')
     points = one.result.adjusted.pose.into_body(views.points)[views.used]
     distance = np.linalg.norm(points, axis=-1)
     field.plot(np.degrees(np.arccos(points[:, 2] / distance)), distance, '.', color=OURS, ms=2)
     field.axvline(np.degrees(one.lens.max_incidence), color=PUBLISHED, lw=1)
     field.set(xlabel='incidence angle / deg', ylabel='distance / m', xlim=(0, None),
-              ylim=(0, None), title='angles and distances (line: limit of the lens)')
+              ylim=(0, None), title='angles and distances (line: max_incidence_deg)')
 
 
 def _residuals(figure: Any, one: CalibratedCamera) -> None:

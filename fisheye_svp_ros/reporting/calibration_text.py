@@ -58,30 +58,29 @@ class CalibratedCamera:
 
     def _shift_warnings(self) -> list[str]:
         return [
-            f'{name} is undecided: from {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm '
-            'over all targets that these data admit, whose shape can explain it; ask '
-            '`fisheye-svp diagnose`'
+            f'{name} is undetermined: {1e3 * range_.low:.2f} to {1e3 * range_.high:.2f} mm, since '
+            'the shape of the target is confounded with it; run `fisheye-svp diagnose`'
             for name, range_ in self.trust.doubtful_shift.items()]
 
     def _fit_warnings(self) -> list[str]:
         found, result = [], self.result
         if result.left_out:
-            found.append('left out, since their points do not fix a pose (all near one line, or '
+            found.append('left out, their points do not determine a pose (all near one line, or '
                          f'of another lens?): {list_frames(self.table, result.left_out)}')
         if not result.adjusted.converged:
-            found.append('the adjustment has not converged; take the lens for a rough one')
+            found.append('the adjustment has not converged, so the lens is inaccurate; take more '
+                         'photographs, or check these')
         rms, sigma = (self.lens.calibration or {})['rms_px'], float(np.median(self.table.sigma))
         if rms > max(_LOST, _POOR * sigma if np.isfinite(sigma) else 0.0):
-            found.append(f'{self.model} leaves {rms:.1f} px: it does not fit this lens, or image '
-                         'points and landmarks do not belong together (order, units, axes, image '
-                         'size)')
+            found.append(f'{self.model} leaves {rms:.1f} px: the model does not fit this lens, or '
+                         'image points and landmarks do not match (check order, units, axes, '
+                         'image size)')
         elif np.isfinite(sigma) and rms > _MODEL_ERROR_RATIO * 2**0.5 * sigma:
-            found.append(f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of '
-                         'image points: lens or target has a model error; ask '
-                         '`fisheye-svp diagnose`')
+            found.append(f'{rms:.2g} px are {rms / sigma / 2**0.5:.1f} times the noise of image '
+                         'points: lens or target has a model error; run `fisheye-svp diagnose`')
         if result.beyond:
             found.append(f'{result.beyond} observations lie beyond max_incidence_deg, where the '
-                         'fitted curve turns back; another model may suit this lens')
+                         'fitted curve stops growing; try another --model')
         return found
 
     def _image_warnings(self) -> list[str]:
@@ -92,12 +91,12 @@ class CalibratedCamera:
                 or abs(off[1]) > _MAX_CENTER_OFFSET * lens.height):
             found.append(
                 f'the principal point lies {off[0]:.0f}, {off[1]:.0f} px off the center of the '
-                'image: was it cropped, or is the image size another one?')
+                'image; check the image size, and that images are not cropped')
         out = float(np.linalg.norm(views.uv[views.used] - (lens.cx, lens.cy), axis=-1).max())
         edge = min(lens.cx, lens.width - lens.cx, lens.cy, lens.height - lens.cy)
         if out < _MIN_COVERED_RADIUS * edge:
             found.append(
-                f'image points lie within {out:.0f} px of the center, the nearest edge is at '
-                f'{edge:.0f} px: past {np.degrees(self.result.reached):.0f} deg the curve is '
-                'extrapolated; photograph the target near the edges of the image, too')
+                f'the curve is extrapolated beyond {np.degrees(self.result.reached):.0f} deg: '
+                f'image points reach {out:.0f} px from the center, the nearest edge is at '
+                f'{edge:.0f} px; photograph the target near the edges too')
         return found

@@ -111,7 +111,7 @@ def draw_phase(path: Path, shown: PlotData) -> None:
         (f'{name} residual / px', phase[:, i],
          {side: getattr(shown.points, side)[:, i] for side, _ in _SIDES})
         for i, name in enumerate('uv')
-    ], 'place of u (above) and v (below) in its pixel / px', False)
+    ], 'fractional part of u (above) and v (below) / px', False)
 
 
 def draw_histogram(path: Path, shown: PlotData) -> None:
@@ -125,7 +125,7 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
             expected = z.size * np.diff(bins)[0] * np.exp(-middle**2 / 2) / np.sqrt(2 * np.pi)
             axis.hist(np.clip(z, -6, 6), bins, color=colour, alpha=0.55, label='u and v')
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
-            axis.set(yscale='log', ylim=(0.5, None), xlabel='residual over the noise')
+            axis.set(yscale='log', ylim=(0.5, None), xlabel='residual / noise')
             axis.set_title(side, color=colour)
             axis.legend(loc='upper right')
         axes[0].set_ylabel('image coordinates')
@@ -166,7 +166,7 @@ def _plot_bins(axis: Axes, x: Array, y: Array, noise: float, colour: str) -> flo
     ]).T
     band = 2 * noise / np.sqrt(count)
     axis.fill_between(centre, -band, band, color=NOISE, alpha=0.6, lw=0, zorder=2,
-                      label='where noise alone keeps 95 % of the means')
+                      label='95 % of the means if there is only noise')
     axis.errorbar(centre, mean, error, fmt='o-', ms=4, lw=1.3, color=colour, zorder=3,
                   mec='white', mew=0.5, label='mean of a bin and its standard error')
     for sign in (-1, 1):
@@ -199,7 +199,7 @@ def draw_groups(
     with picture(path, _WIDTH, 3.6 if ticks else 2.8) as figure:
         axis = figure.subplots()
         axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
-                          step='mid', label='where noise alone keeps 95 %')
+                          step='mid', label='95 % if there is only noise')
         for side, colour in _SIDES:
             squares = (getattr(shown.points, side) ** 2).sum(axis=1)
             rms = np.sqrt(np.bincount(label_of, weights=squares) / count)

@@ -29,19 +29,19 @@ from fisheye_svp_ros.reporting.outlier_rows import outlier_rows
 from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
 _CAPTIONS = {
-    'field': 'Residual vectors over the image, with their scale above each panel; dotted: equal '
-             'incidence angle. Above: single points. Below: means over cells of the image; what '
-             'is alike in all frames shows there.',
+    'field': 'Residual vectors over the image; the scale is above each panel; dotted: equal '
+             'incidence angle. Above: single points. Below: means over cells of the image, which '
+             'show errors common to all frames.',
     'theta': 'Residuals against the incidence angle, along the radius from the principal point '
              '(above) and across it (below).',
-    'range': 'Residuals against the distance of the landmark. A lens without a single viewpoint '
-             'shows here: its radial residuals change with the distance.',
+    'range': 'Residuals against the distance of the landmark. If the viewpoint of the lens moves, '
+             'the radial residuals change with the distance.',
     'landmark': 'Residuals of each landmark. One that stands out is displaced.',
-    'frame': 'Residuals of each frame. A step or a drift is a change of the camera.',
-    'phase': 'Residuals against the place within a pixel. Waves come from the detector of image '
-             'points.',
-    'histogram': 'Residuals over the noise; beyond 6 at the ends. Wide flanks are outliers or '
-                 'noise that differs from place to place.',
+    'frame': 'Residuals of each frame. A step or a drift indicates a change of the camera.',
+    'phase': 'Residuals against the fractional part of the image point. Waves come from the '
+             'detector.',
+    'histogram': 'Residuals divided by the noise; the end bins include all beyond 6. Wide tails '
+                 'are outliers, or noise that varies.',
 }
 _PICTURE_OF = {
     'image': 'field', 'theta': 'theta', 'range': 'range', 'landmark': 'landmark',

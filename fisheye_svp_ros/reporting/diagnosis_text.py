@@ -24,26 +24,26 @@ LENS_FILE = 'extended_lens.yaml'
 LENS = {
     'keep': 'Keep the lens',
     'use_extended': f'Use {LENS_FILE}',
-    'recalibrate': f'Do not use the lens as given: calibrate again, or use {LENS_FILE}',
-    'undecided': 'Do not decide on the lens yet',
+    'recalibrate': f'Do not use the lens as given; calibrate again, or use {LENS_FILE}',
+    'undecided': 'Undecided; take more photographs',
 }
-_OF_RIG = {'keep': 'Keep the lenses', 'undecided': 'Do not decide on the lenses yet',
-           'recalibrate': 'Do not use these lenses as given: calibrate again, or use the extended '
+_OF_RIG = {'keep': 'Keep the lenses', 'undecided': 'Undecided; take more photographs',
+           'recalibrate': 'Do not use these lenses as given; calibrate again, or use the extended '
            'lenses', 'use_extended': 'Use the extended lenses'}
 VARIABLES = {
-    'image': 'the place in the image',
+    'image': 'the position in the image',
     'theta': 'the incidence angle',
     'range': 'the distance of the landmark',
     'landmark': 'the landmark',
     'frame': 'the frame',
     'time': 'the time',
-    'pixel_phase': 'the place within a pixel',
+    'pixel_phase': 'the fractional part of the image point',
 }
 _STRUCTURE_TEXTS = {
     'outliers': 'a few points are outliers',
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
-    'size': 'the residuals are not of the size that sigma states',
+    'size': 'the residuals do not match the stated sigma',
 }
 _HUMAN = {
     'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
@@ -70,7 +70,7 @@ COMPONENTS = {
     'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
     'board_stretch': 'stretch of the board', 'board_in_plane': 'board field along it',
     'board_normal': 'board field off it',
-    'frame_focal': 'focal length of each frame', 'frame_centre': 'centre of each frame',
+    'frame_focal': 'focal length of each frame', 'frame_centre': 'principal point of each frame',
     'frame_linear': 'linear field of each frame',
     'frame_quadratic': 'quadratic field of each frame',
     'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
@@ -97,7 +97,7 @@ def refusal_reason(d: Diagnosis) -> str:
     """Return why the extended lens is not to be used, '' where it is."""
     if d.offers_extended:
         return ''
-    return f'Not better than the lens as given, as far as is known: {d.decision["lens"].why}'
+    return f'It is not known to be better than the lens as given: {d.decision["lens"].why}'
 
 
 def only_gross(d: Diagnosis) -> bool:
@@ -125,7 +125,7 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
         maps = diagnosis.board_maps((cause.effect,))
         return '; '.join(
             (f'board {m.board}: ' if len(maps) > 1 else '')
-            + f'{1e3 * m.peak_to_valley:.2f} mm from the lowest to the highest place'
+            + f'{1e3 * m.peak_to_valley:.2f} mm peak to valley'
             for m in maps if m.peak_to_valley > 0
         )
     if shown == 'single':
@@ -182,7 +182,7 @@ def remaining_text(diagnosis: Diagnosis, variable: str) -> str:
         worst, count = diagnosis.gross[0], len(diagnosis.gross)
         where = worst.get('photograph') or f'frame {worst["frame"]}'
         which = f'{where} landmark {worst["landmark"]} ({worst["px"]:.3g} px)'
-        return (f'{count} points are outliers, furthest {which}' if count > 1 else
+        return (f'{count} points are outliers, the largest {which}' if count > 1 else
                 f'one point is an outlier, {which}')
     if variable == 'size':
         ratio = math.sqrt(diagnosis.figures.extended.chi2_per_dof or math.nan)
@@ -205,10 +205,10 @@ def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if d.verdict == 'adequate':
         but = [what for what, told in (('the intrinsics as given', _is_off(d)),
-                                       ('where the cameras stand', _rig_advice(d))) if told]
+                                       ('the rig', _rig_advice(d))) if told]
         nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
-        return (f'{nothing} is wrong in these data: in {d.observations} points of '
-                f'{d.frames} frames the simulation leaves {noise} and no pattern.')
+        return (f'{nothing} is wrong in these data: in {d.observations} points of {d.frames} '
+                f'frames the residuals are {noise}, without a pattern.')
     if not d.causes:
         return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
                 'effect of the catalogue explains them: '
@@ -218,7 +218,7 @@ def _wrong(d: Diagnosis) -> str:
         for c in d.causes[:_MAX_CAUSES]
     )
     more = len(d.causes) - _MAX_CAUSES
-    rest = f'; and for {more} more reason{"s" * (more > 1)} in the table' if more > 0 else ''
+    rest = f'; the table lists {more} more cause{"s" * (more > 1)}' if more > 0 else ''
     return f'Beyond {noise} the simulation is wrong because {causes}{rest}.'
 
 
@@ -227,8 +227,9 @@ def _almost(d: Diagnosis) -> str:
     for step in d.trace:
         if not step.accepted and step.why.endswith('does not predict better'):
             name = step.effect.partition('(')[0]
-            return (f'; {name} would ({probability(step.corrected)}), but with it frames left out '
-                    'one by one are not predicted significantly better: take more photographs')
+            return (f'; {name} is significant ({probability(step.corrected)}), but does not '
+                    'improve the prediction of left-out frames significantly: take more '
+                    'photographs')
     return ''
 
 
@@ -243,10 +244,10 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
     moving = [c for c in d.causes if c.effect_class.stage != 'noise']
     local = ''
     if best < 0.99 * named:
-        local = f'; with the random effects of single landmarks and of the image to {best:.3g} px'
+        local = f'; with the random effects of single landmarks and of the image, to {best:.3g} px'
     elif best > 1.01 * named:
-        local = (f'; the random effects of single landmarks and of the image do not hold there: '
-                 f'with them {best:.3g} px')
+        local = ('; the random effects of single landmarks and of the image do not transfer to '
+                 f'it: with them {best:.3g} px')
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
         if d.verdict == 'adequate':
@@ -254,18 +255,18 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
                 f'{times:.1f} times the noise: these frames constrain the lens poorly; --next N '
                 'lists the photographs to take')
         if d.causes:
-            why = 'the cause is in the table of image points, not in the lens'
+            why = 'the cause is in the image points, not in the lens'
         which = 'The lens, fitted to these data,' if _is_off(d) else 'The lens as it is'
         return f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}.'
     if named >= before:
-        return (f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; '
-                f'the causes are no correction{local}.')
+        return (f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; do '
+                f'not correct for the causes{local}.')
     text = (f'Corrected, held-out data are predicted to {named:.3g} px rms instead of '
             f'{before:.3g}{local}')
     if d.figures.gain.value > 0:
         value, low, high = map(percent, d.figures.gain.interval.values())
-        text += (f', which takes away {value} (95 % interval {low} to {high}) of the error above '
-                 'the noise')
+        text += (f'; this removes {value} (95 % interval {low} to {high}) of the error above the '
+                 'noise')
     if 'target' in {c.effect_class.budget_stage() for c in moving}:
         text += (f'; on the same corrected target the extended lens leaves '
                  f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
@@ -285,8 +286,8 @@ def _is_off(d: Diagnosis) -> bool:
 
 def _rig_advice(d: Diagnosis) -> list[str]:
     """Return what to find out of cameras that no rig holds together."""
-    return [f'find out why no rig holds {join_names(pair.cameras)} (frame numbers of other '
-            'moments, points numbered from the other end, exchanged cameras, a loose mount)'
+    return [f'find out why {join_names(pair.cameras)} have no constant relative pose (check frame '
+            'numbers, the end from which points are numbered, exchanged cameras, the mount)'
             for pair in d.cameras if pair.posed_alone and pair.rig]
 
 
@@ -298,9 +299,9 @@ def _next_step(d: Diagnosis) -> str:
         return '; '.join([lens, *_rig_advice(d), *turned]) + f'{blind}.'
     steps = [lens, *_rig_advice(d)]
     steps += [
-        f'find out why {join_names(pair.cameras)} contradict each other about the target: was it '
-        'bent or exchanged in between, do they number its landmarks alike? Trust no correction of '
-        'it until then' for pair in d.cameras if pair.verdict == 'contradict'
+        f'find out why {join_names(pair.cameras)} contradict each other about the target: check '
+        'that it was not bent or exchanged in between, and that both number its landmarks alike. '
+        'Use no correction of it until then' for pair in d.cameras if pair.verdict == 'contradict'
     ]
     steps += [advice_text(one) for one in d.advice if one.frames]
     steps += [advice_text(one) for one in d.advice
@@ -309,7 +310,7 @@ def _next_step(d: Diagnosis) -> str:
     held = [c.effect for c in d.causes
             if c.effect_class.budget_stage() == 'frame' and c.effect in d.lens.corrections]
     if held and d.decision['lens'].say == 'use_extended':
-        steps.append(f'it holds {join_names(held)}')
+        steps.append(f'it includes {join_names(held)}')
     steps += [f'to confirm {c.effect}: {_remedy(c)}' for c in d.causes
               if c.effect_class.budget_stage() == 'frame' and not c.indistinguishable_from]
     steps += [
@@ -387,7 +388,7 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
         rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
         same = ', '.join(c.indistinguishable_from) or '-'
         p_value = bare_probability(c.p_value)
-        same += '' if c.survives else ' (not needed with another cause out)'
+        same += '' if c.survives else ' (not significant without one of the other causes)'
         share = percent(c.share) if c.share else '-'
         yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
 

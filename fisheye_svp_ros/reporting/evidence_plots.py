@@ -32,7 +32,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
             [step.effect[:40] for step in steps], [step.statistic for step in steps],
             color=[AFTER if step.accepted else _REJECTED_COLOR for step in steps],
         )
-        left.set(xlabel='score statistic', title='steps of the search', xscale='log')
+        left.set(xlabel='score statistic', title='steps of the selection', xscale='log')
         if steps:  # bars begin at a power of ten, whose names alone have room below them
             least = min(step.statistic for step in steps)
             left.set_xlim(left=10.0 ** math.ceil(math.log10(least) - 1))

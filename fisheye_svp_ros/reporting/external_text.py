@@ -19,8 +19,8 @@ from fisheye_svp_ros.solve.hand_eye import HandEye
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
 _SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
 _NO_RIG_NOTE = (
-    '; they do not keep their places, or were not photographed at the same moments, so each view '
-    'has a pose of its own and no result depends on their rig')
+    '; their relative pose is not constant, or the photographs are not simultaneous, so each view '
+    'has its own pose and no result depends on the rig')
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'Cross-camera validation'
@@ -53,8 +53,9 @@ def carried_row(one: Transfer, what: str) -> tuple[str, ...]:
 
 def _of_robot(found: HandEye) -> Section:
     x, y, z = 1e3 * found.camera.position
-    sentence = (f'The given poses are not those of the camera, which sits at {x:.2f}, {y:.2f}, '
-                f'{z:.2f} mm in the flange. They were not held: {hand_eye_sentence(found)}.')
+    sentence = ('The given poses are those of the flange, not of the camera, which is at '
+                f'{x:.2f}, {y:.2f}, {z:.2f} mm in the flange. They were not used as camera poses: '
+                f'{hand_eye_sentence(found)}.')
     warnings = [f' {one[0].upper()}{one[1:]}.' for one in hand_eye_warnings(found)]
     return Section(ROBOT_TITLE, sentence + ''.join(warnings), [], HEADER, hand_eye_rows(found))
 
@@ -64,10 +65,10 @@ def _of_cameras(pair: TwoCameras) -> Section:
     if pair.maps is not None:
         first, second = (f'{1e3 * rms:.3f} mm rms' for rms in pair.maps.rms_m)
         rows += [
-            (f'height of {pair.maps.landmarks} landmarks, by {pair.cameras[0]} and by '
+            (f'height of {pair.maps.landmarks} landmarks, from {pair.cameras[0]} alone and from '
              f'{pair.cameras[1]} alone', first, second,
              f'correlation {pair.maps.correlation:.2f}'),
-            ('their places along the board', '', '',
+            ('their positions along the board', '', '',
              f'correlation {pair.maps.correlation_along:.2f}'),
         ]
     return Section(
@@ -80,11 +81,11 @@ def _of_cameras(pair: TwoCameras) -> Section:
 def _agreement(pair: TwoCameras) -> str:
     both = join_names(pair.cameras)
     if pair.verdict == 'nothing':
-        return f'Neither {join_names(pair.cameras, "nor")} calls for another shape of the target'
+        return f'Neither {join_names(pair.cameras, "nor")} needs another shape of the target'
     tried = join_names([
         f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
     ])
-    carried = f'the shape of the target found by one alone takes held-out frames of {tried}'
+    carried = f'the shape estimated from one camera changes the held-out error of {tried}'
     alike = '' if pair.maps is None else f'; their maps correlate by {pair.maps.correlation:.2f}'
     if pair.verdict == 'agree':
         return f'{both} agree: {carried}{alike}'
@@ -96,14 +97,14 @@ def _agreement(pair: TwoCameras) -> str:
 
 def _rig(pair: TwoCameras) -> str:
     if not pair.rig:
-        return '; too few frames were seen by both to estimate the scatter of their rig'
+        return '; too few frames are shared to estimate the scatter of the rig'
     if pair.posed_alone:
         return _NO_RIG_NOTE
     if pair.verdict in ('nothing', 'contradict'):
         return ''
     said = []
     for label, before, after, less in _rig_rows(pair.rig):
-        said.append(f'{label} {before} before and {after} after ({less} less)')
+        said.append(f'{label} {before} before, {after} after (reduced by {less})')
     return '; estimated view by view, the rig scatters: ' + join_names(said)
 
 
@@ -115,7 +116,7 @@ def _of_sets(against: TwoDatasets) -> Section:
     carried = []
     for tried in filter(None, against.tried):
         carried.append(carried_row(tried.lens, 'causes of the lens'))
-        carried += [carried_row(one, f'{name}, beside the others')
+        carried += [carried_row(one, f'{name}, added to the others')
                     for name, one in tried.causes.items()]
         carried.append(carried_row(tried.whole, 'the whole lens, intrinsics too'))
         if tried.target is not None:
@@ -133,18 +134,18 @@ def _of_sets(against: TwoDatasets) -> Section:
 
 def _lens_holds(against: TwoDatasets) -> str:
     if against.verdict == 'nothing':
-        return f'Neither these data nor {against.source} call for a cause that moves with the lens'
+        return f'Neither these data nor {against.source} need a cause in the lens'
     tried = join_names([
         f'{one.lens.to} from {one.lens.without_px:.3g} to {one.lens.with_px:.3g} px'
         for one in against.tried if one is not None
     ])
     said = {
-        'agree': 'What moves with the lens holds in both sets',
-        'undecided': 'Whether what moves with the lens holds in both sets is undecided',
+        'agree': 'The causes in the lens hold in both sets',
+        'undecided': 'It is undecided whether the causes in the lens hold in both sets',
         'contradict': 'The two sets contradict each other about the lens',
     }[against.verdict]
     gone = f'; {join_names(against.withdrawn)} is withdrawn' if against.withdrawn else ''
-    return f'{said}: found in one, it takes held-out frames of {tried}{gone}'
+    return f'{said}: estimated from one set, they change the held-out error of {tried}{gone}'
 
 
 def _difference_text(against: TwoDatasets) -> str:
@@ -152,10 +153,10 @@ def _difference_text(against: TwoDatasets) -> str:
         return ''
     said = ''
     for of_causes, meaning in (
-        (False, 'the intrinsics are not those of the other set ({}): focus or mount changed in '
-                'between, or they absorb an unexplained error'),
-        (True, 'sizes of causes do not agree within their errors ({}): the errors that '
-               'one set states are too small'),
+        (False, 'the intrinsics of the two sets differ ({}): focus or mount changed in between, '
+                'or they absorb an unexplained error'),
+        (True, 'sizes of causes differ by more than their errors ({}): one set states too small '
+               'errors'),
     ):
         sizes = [(abs(one.standardized_difference), name)
                  for name, one in against.parameters.items() if ('.' in name) == of_causes]
@@ -170,6 +171,6 @@ def _follows(against: TwoDatasets) -> str:
     if not there:
         return ''
     if any(one.improves for one in there):
-        return ('; the correction of the target holds in the other set too: it is the same one, '
-                'or an error of the lens')
-    return '; the correction of the target does not transfer to the other one, as expected'
+        return ('; the correction of the target also holds in the other set: the target is the '
+                'same, or the error belongs to the lens')
+    return '; the correction of the target does not transfer to the other target, as expected'

@@ -89,8 +89,8 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
     for one in screen.actions:
         names = ', '.join(photo.name for photo in one.photographs)
         names += f' and {one.more} more' if one.more else ''
-        lines.append(f'{one.about}: {one.do}. {one.why}{one.sure and f" ({one.sure})"}.'
-                     + (f' {names}.' if names else ''))
+        lines.append(f'{one.about}: {one.do}. {one.why}{one.sure and f" ({one.sure})"}'
+                     f'{names and f": {names}"}.')
     lines += [f'Causes: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
     lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
@@ -135,7 +135,7 @@ def _confidence(decision: Decision) -> str:
     if decision.confidence > _CERTAIN:
         sure = f'more than {100 * _CERTAIN:.0f} % sure'
     if decision.say == 'use_extended':
-        return f'takes away {100 * decision.figure.value:.0f} % of the error, {sure}'
+        return f'removes {100 * decision.figure.value:.0f} % of the error, {sure}'
     return sure
 
 
@@ -147,9 +147,9 @@ def _causes(d: Diagnosis) -> str:
 
 
 def _candidates(d: Diagnosis) -> str:
-    words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (by its evidence '
-             f'{100 * one.weight:.0f} % likely: e0 = {1e3 * one.e0:.2g} ± {1e3 * one.stderr:.2g} '
-             'mm is in the extended lens)' for one in d.averaged_model.shifts]
+    words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
+             f'{100 * one.weight:.0f} %: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
+             f'{1e3 * one.stderr:.2g} mm)' for one in d.averaged_model.shifts]
     words += [f'{one.effect} ({one.why})' for one in d.candidates[:_MAX_NAMES]]
     more = len(d.candidates) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')

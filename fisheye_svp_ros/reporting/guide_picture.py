@@ -34,7 +34,7 @@ def guide_words(guide: Guide) -> tuple[str, str, str]:
             names += f', or {" or ".join(stand.alike)}: photographs cannot separate them'
         return 'settled', f'diagnosis: {names}', taken
     if guide.is_finished:
-        return 'not settled', 'these photographs do not decide it', taken
+        return 'not settled', 'these photographs do not determine it', taken
     if guide.thinking:
         return 'one moment', 'choosing the next photograph', taken
     ready = guide.score >= MIN_SCORE
@@ -51,7 +51,7 @@ def _score_text(guide: Guide) -> str:
     elif session.number == 'e0':
         factor, unit = 1e3, ' mm'
     value = f'{factor * (stand.value or 0.0):.4g} +- {factor * stand.stderr:.2g}{unit}'
-    return f'{session.number} {value}, wanted +- {factor * session.goal:.2g}'
+    return f'{session.number} {value}, goal +- {factor * session.goal:.2g}'
 
 
 def draw_guide(pixels: Pixels, guide: Guide, seen: DetectedBoard | None) -> NDArray[np.uint8]:

@@ -36,7 +36,7 @@ def hand_eye_warnings(found: HandEye) -> list[str]:
         return []
     off, turn = np.linalg.norm(found.residual[worst].reshape(2, 3), axis=1)
     return [f'the pose of frame {found.frame[worst]} is {1e3 * off:.1f} mm and '
-            f'{np.degrees(turn):.2f} deg off the others: correct it, or take it out of the poses']
+            f'{np.degrees(turn):.2f} deg off the others: correct it, or remove it from the poses']
 
 
 def _rows(name: str, pose: Pose, stderr: Array) -> list[tuple[str, ...]]:

@@ -15,11 +15,11 @@ VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
     'explained': 'Explained: the model error is identified',
     'partly_explained': 'Partly explained: some of the residual error is unexplained',
-    'unexplained': 'Unexplained: no effect of the catalogue accounts for the residual error',
+    'unexplained': 'Unexplained: no effect of the catalog explains the residual error',
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Correct it by {LENS_FILE} (this target alone), or flatten or replace it',
+    'correct': f'Correct it by {LENS_FILE} (valid for this target only), or flatten or replace it',
     'measure_again': 'Measure the board, flatten or replace it',
 }
 PHOTOGRAPHS = {
@@ -28,7 +28,7 @@ PHOTOGRAPHS = {
 }
 _HEADLINES = {
     'viewpoint_shift': 'The viewpoint of the lens moves',
-    'radial_profile': 'The image-height curve of the lens is another one',
+    'radial_profile': 'The image-height curve of the lens is wrong',
     'focal_length': 'The focal length is wrong',
     'principal_point': 'The principal point is wrong',
     'aspect': 'The aspect of the pixels is wrong',
@@ -40,7 +40,7 @@ _HEADLINES = {
     'session_step': 'The intrinsics jump between groups of frames',
     'landmark_survey': 'Single landmarks are displaced',
     'landmark_scale': 'The target is stretched or of another size',
-    'board_pose': 'The boards have other relative poses than stated',
+    'board_pose': 'The relative poses of the boards are wrong',
     'rolling_shutter': 'Rows are exposed one after the other',
     'rig_flex': 'The rig bends',
 }
@@ -69,11 +69,11 @@ def largest_cause(d: Diagnosis) -> str:
                 'An image point is an outlier; nothing else is wrong')
     if d.decision['target'].say == 'measure_again' or (
             d.verdict == 'adequate' and d.decision['target'].figure.value > 0):
-        sound = 'Lens sound, target imperfect' if d.verdict == 'adequate' else 'Target imperfect'
-        return f'{sound}: {d.decision["target"].why}'
+        which = 'Only the target' if d.verdict == 'adequate' else 'The target'
+        return f'{which} is imperfect: {d.decision["target"].why}'
     if d.verdict == 'adequate':
         return 'No model error shows in these data'
-    return 'The residual error has no cause that the catalogue holds'
+    return 'No effect of the catalog explains the residual error'
 
 
 def _sentence(d: Diagnosis, cause: Cause) -> str:

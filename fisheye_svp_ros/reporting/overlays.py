@@ -68,7 +68,7 @@ def write_coverage(detection: Detection, path: Path) -> None:
         for camera, name in enumerate(table.cameras):
             _angles(field, detection, camera, name)
         field.set(xlabel='incidence angle, deg', ylabel='range, m',
-                  title='angles and ranges, by a first calibration')
+                  title='angles and ranges from a first calibration')
 
 
 def _angles(axes: object, detection: Detection, camera: int, name: str) -> None:

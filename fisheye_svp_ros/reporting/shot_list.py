@@ -58,7 +58,7 @@ def purpose(wanted: NextViews) -> str:
     """Return what the photographs are for, and where matters stand."""
     if wanted.others:
         known = '' if wanted.answers[-1] > MIN_PROBABILITY else (
-            '; photographs hardly separate them: exclude what is absent by '
+            '; photographs hardly separate them: exclude an absent one with '
             + ' '.join(f'--without {name}' for name in wanted.others))
         return (f'to separate {wanted.asked} from {" and ".join(wanted.others)}; now '
                 f'{expected_error(wanted, 0)}{known}')

@@ -46,7 +46,7 @@ class Scenario:
 
     lens: str = parameter('fish214', 'Lens: a file, or a name in config/lenses', file=True)
     shift_scale: float = parameter(
-        1.0, 'Factor on the viewpoint shift of the lens; 0 makes it an SVP lens', span=(0.0, 100.0)
+        1.0, 'Factor on the viewpoint shift of the lens; 0: an SVP lens', span=(0.0, 100.0)
     )
     environment: str = parameter(
         'whole', 'Landmarks: whole, inner or outer, or a CSV with landmark, x, y, z', file=True
@@ -58,7 +58,7 @@ class Scenario:
         MONO, 'One camera, or a stereo rig with the cameras left and right',
         choices=(MONO, *STYLES)
     )
-    baseline: float = parameter(BASELINE, 'Distance of the two cameras', 'm', (1e-6, 1e3))
+    baseline: float = parameter(BASELINE, 'Distance between the two cameras', 'm', (1e-6, 1e3))
     vergence: float = parameter(
         0.0, 'Further inward turn of the left camera, beyond that of the style', 'rad',
         (-1.6, 1.6)
@@ -73,7 +73,7 @@ class Scenario:
         file=True
     )
     trajectory_steps: int = parameter(
-        0, '0: jump from pose to pose; n: move smoothly, in n steps from each pose to the next',
+        0, '0: jump from pose to pose; n: move smoothly from each pose to the next in n steps',
         span=(0, 1_000_000)
     )
     noise_px: float = parameter(
@@ -81,8 +81,9 @@ class Scenario:
     )
     seed: int = parameter(0, 'Seed of the noise', span=(0, 2**31 - 1))
     rig_file: str = parameter(
-        '', 'Cameras in place of `lens` and `style`: a folder or file with their lenses and where '
-        'they stand, as `calibrate` writes it; poses are of the first', file=True
+        '', 'Cameras in place of `lens` and `style`: a folder or file with their lenses and '
+        'relative poses, as `calibrate` writes it; `poses` are those of the first '
+        'camera', file=True
     )
 
 
@@ -180,7 +181,7 @@ def _cameras_of(path: Path, version: int) -> tuple[tuple[str, ...], tuple[Lens, 
     held = cameras_in(path)
     missing = [name for name in names if name not in held]
     if missing:
-        raise LensError(f'{path}: the rig has the camera {missing[0]}, and there is no lens of it')
+        raise LensError(f'{path}: the rig has the camera {missing[0]}, which has no lens')
     return names, tuple(load_lens(f'{path}#{name}') for name in names), places
 
 

@@ -115,7 +115,7 @@ def solve_hand_eye(camera: Pose, flange: Pose) -> Transforms:
     sign = np.sign(np.linalg.det(first))
     base, mount = nearest_rotation(sign * first), nearest_rotation(sign * second)
     if np.linalg.det(second) * sign < 0:
-        raise GeometryError('no hand-eye transform explains how the robot turned')
+        raise GeometryError('no hand-eye transform explains the rotations of the robot')
     return _solve_lengths(camera, flange, base, mount)
 
 

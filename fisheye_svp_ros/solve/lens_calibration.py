@@ -317,7 +317,7 @@ def _check_focal(adjusted: AdjustedLens, source: str) -> None:
             relative = float(np.sqrt(adjusted.covariance[i, i])) / adjusted.lens.fx
             if not relative < FOCAL_UNCERTAINTY:
                 raise GeometryError(
-                    f'{source}: {name} is known to {100 * relative:.0f} % only, rms '
+                    f'{source}: {name} is known only to {100 * relative:.0f} %, rms '
                     f'{rms_px(adjusted.residual):.3g} px; add views in which the target is tilted '
                     'and covers the image; check that image points and landmarks belong together '
                     '(order, units, axes: u to the right, v down, x, y, z right-handed)'

@@ -56,7 +56,7 @@ def localize_measured(model: ForwardModel, observations: Observations) -> Measur
         views, result, gross = views.take(fixed), result.take(fixed), gross[fixed]
         reasons = tuple(np.array(reasons, dtype=object)[fixed])
     if not len(views.frame):
-        raise GeometryError(f'{observations.source}: the points of no frame fix a pose')
+        raise GeometryError(f'{observations.source}: no frame has points that determine a pose')
     return MeasuredPoses(views, result, checked.sigma, left_out, gross, reasons)
 
 
@@ -143,7 +143,7 @@ def _check_inside(observations: Observations, lens: Lens) -> None:
     if outside.any(axis=1).mean() > _OUTSIDE_SHARE:
         raise ObservationError(
             f'{observations.source}: image points lie outside the {lens.width}x{lens.height} px '
-            f'of lens {lens.name!r}; is it the lens of this camera?')
+            f'of lens {lens.name!r}; check that it is the lens of this camera')
 
 
 def poses_by_frame(

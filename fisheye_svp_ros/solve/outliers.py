@@ -18,11 +18,11 @@ _OUTLIER_SIGMAS = 8.0  # robust standard deviations beyond which a point is not 
 _SWAP_SIGMAS = 6.0  # and within which it belongs to another one
 _SWAP_CHANCE = 0.01  # that so many do by chance
 _SUSPICIOUS_SIGMAS = 6.0  # below this no point is worth a robust fit
-SWAPPED_POINT = 'it lies where another landmark is predicted'
+SWAPPED_POINT = 'at the predicted place of another landmark'
 FAR_POINT = 'far from its prediction'
-VIEW = 'the whole view is off: its points may be in another order'
-FRAME = ('its cameras contradict each other: points in another order, another moment, or cameras '
-         'exchanged')
+VIEW = 'all points of the view are off: check their order'
+FRAME = ('its cameras contradict each other: check the order of points, the moment, and left and '
+         'right')
 _VIEW_RATIO, _MIN_VIEW_PX = 15.0, 3.0  # times the median view, px: it belongs elsewhere
 _FRAME_RATIO = 6.0  # times the median frame: cameras that contradict each other
 _MAX_INCONSISTENT_SHARE = 0.5  # of the views that another camera can contradict: a minority

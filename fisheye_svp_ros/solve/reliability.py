@@ -128,7 +128,7 @@ def doubt_of_pairs(
     behind = int((~best.valid).sum())
     if behind > (1 - _MIN_AGREEMENT) * len(landmark):
         return (f'the rays of {behind} of {len(landmark)} landmarks do not meet in front of both '
-                'cameras: left and right, rig or ids may be wrong')
+                'cameras: check left and right, rig and ids')
     cost = np.square(np.stack([best.left_residual, best.right_residual])).sum(axis=(0, -1))
     cost, ids = cost[best.valid] / sigma**2, landmark[best.valid]
     gross = cost > _GROSS**2
@@ -154,8 +154,8 @@ def misfit_reason(excess: float, freedom: int) -> str:
     """Say in words that the misfit is too large: excess over its expectation, as a variance."""
     return (
         f'the residuals are {np.sqrt(excess):.3g} times what sigma allows ({freedom} degrees of '
-        'freedom) and no few points are to blame: lens, image size, landmarks or their unit may '
-        'be wrong'
+        'freedom) and no single points explain it: check lens, image size, landmarks and their '
+        'unit'
     )
 
 
@@ -275,14 +275,14 @@ def _landmark_names(landmark: Index, size: Array) -> str:
 
 
 def _noisy_reason(sigma: float) -> str:
-    return (f'the noise would be {sigma:.3g} px, which no detector has: lens, image size, '
-            'landmarks or their unit may be wrong')
+    return (f'the noise would be {sigma:.3g} px, more than any detector has: check lens, image '
+            'size, landmarks and their unit')
 
 
 def _far_reasons(views: Views, found: Localization) -> list[str]:
     away = np.linalg.norm(views.points - found.pose.position[:, None], axis=-1)
     farthest = np.where(views.weight > 0, away, 0.0).max(axis=1)
-    why = f'landmarks lie up to {farthest.max():.0f} m away: are they in meters?'
+    why = f'landmarks lie up to {farthest.max():.0f} m away; check that they are in meters'
     return [why if far > _MAX_RANGE else '' for far in farthest]
 
 

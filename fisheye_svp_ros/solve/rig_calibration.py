@@ -116,9 +116,9 @@ def _without_outliers(
     state = initial_state(data, lenses[0], lenses[1:])
     if is_unrelated(data, state):
         raise ObservationError(
-            f'{rows.source}: none explains where {" and ".join(rows.cameras)} stand in most '
-            'frames; photographs of one moment must have one frame number, others different ones, '
-            'and points be numbered from the same end')
+            f'{rows.source}: no relative pose of {" and ".join(rows.cameras)} explains most '
+            'frames; give simultaneous photographs the same frame number, others different ones, '
+            'and number points from the same end')
     _, found = find_outliers(data, state)
     torn = {int(rows.frame[row]) for row, why in zip(found.rows, found.why, strict=True)
             if why == FRAME}

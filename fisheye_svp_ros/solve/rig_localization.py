@@ -69,8 +69,8 @@ def localize_rig(
     information = np.swapaxes(linear.frame_columns, -1, -2) @ linear.frame_columns
     if not np.isfinite(linear.residual).all() or (
             np.linalg.eigvalsh(information)[:, 0] <= 0).any():
-        raise GeometryError(f'{table.source}: a frame cannot be posed by the rig; do lenses, rig '
-                            'and observations belong together?')
+        raise GeometryError(f'{table.source}: the rig does not determine the pose of a frame; '
+                            'check that lenses, rig and observations belong together')
     known = sigma_known(rows)
     sigma = None if known else noise_sigma(
         float((linear.residual**2).sum()), int(linear.row_mask.sum()), 6 * data.frames)

@@ -29,8 +29,8 @@ from fisheye_svp_ros.study.metrics import (
 T = TypeVar('T')
 Pair = tuple[ForwardModel, ForwardModel]  # of the left and the right camera
 
-_NO_POSE = 'image_points: they do not fix a pose (all near one line, or of another lens?)'
-_NO_RIG = 'image_points: they do not fix a rig'
+_NO_POSE = 'image_points: they do not determine a pose (all near one line, or of another lens?)'
+_NO_RIG = 'image_points: they do not determine a rig'
 _NO_PAIR = 'image_points: no landmark is in both images'
 
 

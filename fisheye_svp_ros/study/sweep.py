@@ -61,7 +61,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     camera = parameters.get(CAMERA, {})
     base, sweep = with_values(Scenario(), camera), sweep_of(Scenario, camera)
     if not sweep.lists:
-        raise ParameterError('nothing is swept; a list such as sweep.radius: [2.0, 0.5] is needed')
+        raise ParameterError('no parameter is swept; add a list such as sweep.radius: [2.0, 0.5]')
     names = solvers_of(base, sweep)
     tables = {
         name: with_values(SOLVERS[name].settings(), parameters.get(name, {})) for name in names}
@@ -82,7 +82,7 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
                              'camera or a pair: leave rig_file out, and choose a style')
     mono = {style == MONO for style in sweep.lists.get('style', (base.style,))}
     if len(mono) > 1:
-        raise ParameterError(f'{SWEEP}style has {MONO} beside rigs; make two sweeps of it')
+        raise ParameterError(f'{SWEEP}style has {MONO} together with rigs; make two sweeps of it')
     return ('localizer',) if mono.pop() else ('stereo_calibrator', 'stereo_depth')
 
 

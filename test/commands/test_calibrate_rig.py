@@ -77,7 +77,7 @@ def test_cameras_that_nothing_holds_are_named(
     table = photographs(3, (45.0, 135.0))
     calibrate_cameras(table, dict.fromkeys(CAMERAS, LENS), tmp_path)
     said = capsys.readouterr()
-    assert 'rig: nothing holds cam3 to cam0, cam1, cam2: no frame shows the target' in said.err
+    assert 'rig: cam3 cannot be related to cam0, cam1, cam2: no frame shows the target' in said.err
     assert 'cam3' not in said.out
     assert len(load_rigs(tmp_path / 'rig.yaml')) == 2
 
@@ -112,7 +112,7 @@ def test_a_rig_of_three_is_posed_and_diagnosed_as_one(
     extended = [f'--lens=cam{i}={out}/cam{i}/extended_lens.yaml' for i in range(3)]
     assert cli.main(['localize', str(tmp_path / 'obs.csv'), *extended, '--rig',
                      str(out / 'rig.yaml'), '-o', str(tmp_path / 'poses')]) == 0
-    assert 'cam0 in the world, by' in capsys.readouterr().out
+    assert 'cam0 in the world, from' in capsys.readouterr().out
     document = json.loads((tmp_path / 'poses' / 'localize.json').read_text())
     assert document['frames'] == 24 and list(document['cameras']) == list(CAMERAS[:3])
     assert document['rms_px'] < 1.1 * NOISE * 2**0.5

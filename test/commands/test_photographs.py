@@ -79,10 +79,10 @@ def test_images_in_a_subfolder_beside_photographs_are_told(
     shutil.copytree(folder, tmp_path / 'photographs' / 'second')
     (tmp_path / 'photographs' / 'empty').mkdir()
     command = ['detect', '--board', BOARD, '-o', str(tmp_path / 'out.csv')]
-    for paths, told in (['photographs'], ['second: images in it are passed over (11)']), (
+    for paths, told in (['photographs'], ['second: its 11 images are skipped']), (
             ['photographs', 'photographs/second'], []):
         assert cli.main([*command, *(str(tmp_path / path) for path in paths)]) == 0
-        lines = [x for x in capsys.readouterr().err.splitlines() if 'passed over' in x]
+        lines = [x for x in capsys.readouterr().err.splitlines() if 'images are skipped' in x]
         assert len(lines) == len(told)
         assert all(text in line for text, line in zip(told, lines, strict=True))
 
@@ -94,7 +94,7 @@ def test_what_is_passed_over_is_told_where_the_others_show_no_board(
     cv2.imwrite(str(tmp_path / 'cover.png'), np.zeros((400, 424), np.uint8))
     assert cli.main(['detect', str(tmp_path), '--board', BOARD]) == 2
     note, error = capsys.readouterr().err.splitlines()
-    assert 'photographs: images in it are passed over (11)' in note
+    assert 'photographs: its 11 images are skipped' in note
     assert 'no chessboard' in error and 'inner corners: one less than squares' in error
 
 
@@ -203,10 +203,10 @@ def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
     table = tmp_path / 'mm.csv'
     uv = image.uv[frame, corner] + 5 * np.random.default_rng(0).standard_normal((len(frame), 2))
     write_observations(table, make_observations(frame, corner, uv, 1000 * PRINTED.corners[corner]))
-    assert 'the size of the images' in refused(capsys, 'calibrate', table)
+    assert 'the image size is unknown' in refused(capsys, 'calibrate', table)
     cli.main(['calibrate', str(table), '--image-size', '424x400'])
     said = capsys.readouterr().err
-    assert 'are these mm?' in said
+    assert 'not in mm' in said
     assert 'does not fit this lens' in said
 
 
@@ -234,7 +234,7 @@ def test_few_boards_may_be_another_board(
     write(tmp_path, [*shown, *(blank + i for i in range(4))])
     assert cli.main(['detect', str(tmp_path), '--board', BOARD]) == 0
     said = capsys.readouterr().err
-    assert f'most photographs show no {BOARD}: check kind and size of the board' in said
+    assert f'no {BOARD} in most photographs; check kind and size (inner corners)' in said
 
 
 @pytest.mark.parametrize('said', [
@@ -277,4 +277,4 @@ def test_photographs_of_before_are_told(
     assert cli.main([*command, '2']) == cli.main([*command, '2']) == 0
     assert capsys.readouterr().err == ''
     assert cli.main([*command, '1']) == 0
-    assert 'out: 1 other photographs are in it, too' in capsys.readouterr().err
+    assert 'out: 1 other photographs are in it too' in capsys.readouterr().err

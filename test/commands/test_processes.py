@@ -113,7 +113,7 @@ def test_a_demo_deletes_only_what_a_demo_made(
     (tmp_path / 'recording').mkdir()
     (tmp_path / 'recording' / 'mine.txt').write_text('precious')
     assert main(['demo', '-o', str(tmp_path)]) == 2
-    assert 'no demo has made it' in capsys.readouterr().err
+    assert 'is not from an earlier demo' in capsys.readouterr().err
     assert (tmp_path / 'recording' / 'mine.txt').read_text() == 'precious'
 
 

@@ -28,7 +28,7 @@ def test_without_ros_a_command_says_the_ways_to_get_it(
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     assert main([places.get(word, word) for word in words]) == 2
     told = capsys.readouterr().err
-    assert told.count('\n') == 1 and 'has no ROS 2 for nodes' in told
+    assert told.count('\n') == 1 and 'nodes need ROS 2' in told
     assert 'apt install ros-jazzy-ros-base' in told and 'the extra `ros`' in told
     assert [path.name for path in tmp_path.iterdir()] == ['sweep.yaml']
 

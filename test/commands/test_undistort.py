@@ -171,19 +171,19 @@ def test_what_cannot_be_done_is_said_in_a_line(
     end = '-o', out
     assert '--fov' not in refused(capsys, 'undistort', lens, photos / 'left', '--fov', 190, *end)
     said = refused(capsys, 'undistort', f'{folder / "lenses"}/', photos, '--as', 'fisheye', *end)
-    assert "'fisheye' has no epipolar rows" in said
+    assert "'fisheye' has no straight epipolar rows" in said
     said = refused(capsys, 'undistort', lens, photos / 'left', '--range', 0.001, *end)
     assert 'range is 0.001 m' in said
     said = refused(capsys, 'undistort', lens, photos / 'left', '--rig',
                    folder / 'lenses' / 'rig.yaml', *end)
-    assert 'it is of two cameras, and there are lenses of 1' in said
+    assert 'a rig of two cameras needs two lenses, got 1' in said
     small = tmp_path / 'small'
     small.mkdir()
     cv2.imwrite(str(small / 'x.png'), np.zeros((40, 42), np.uint8))
     said = refused(capsys, 'undistort', lens, small, *end)
-    assert "x.png: image of 42x40 px, and lens 'small' is of 424x400 px" in said
+    assert "x.png: the image is 42x40 px, lens 'small' is for 424x400 px" in said
     twice = [photos / 'left' / '00.png', photos / 'right' / '00.png']
-    assert 'another photograph is called 00, too' in refused(
+    assert 'another photograph is also called 00' in refused(
         capsys, 'undistort', lens, *twice, *end)
     assert not out.exists() or not [*out.rglob('*.*')]
 
@@ -197,7 +197,7 @@ def test_a_broken_photograph_is_named_and_the_rest_goes_on(
     (photos / 'b.png').write_bytes((photos / 'a.png').read_bytes()[:2000])
     run(folder / 'lenses' / 'left.yaml', photos, '-o', tmp_path / 'out')
     said = capsys.readouterr()
-    assert 'b.png: the PNG ends before its image does' in said.err
+    assert 'b.png: the PNG is incomplete' in said.err
     assert ': 1 photographs' in said.out
 
 
@@ -231,7 +231,7 @@ class TestLensForOneViewpoint:
     ) -> None:
         lens = folder / 'lenses' / 'left.yaml'
         said = refused(capsys, 'lens', lens, '-o', tmp_path / 'x.yaml', '--range', 1)
-        assert '--range 1: name the form to write, --format ros' in said
+        assert '--range 1 needs --format, for example ros' in said
         said = refused(capsys, 'lens', lens, '-o', tmp_path / 'x', '--format', 'ros',
                        '--range', -1)
         assert "range is -1 m; lens 'small' needs more than" in said

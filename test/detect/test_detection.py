@@ -254,7 +254,7 @@ class TestCorners:
         found = np.arange(len(off)), off
         monkeypatch.setattr('fisheye_svp_ros.detect.points.DETECTORS', {
             'saddle': (('chessboard',), lambda *_: found)})
-        assert 'a square off' in str(find_points(photograph(pose), PATTERN, 'saddle'))
+        assert 'shifted by one square' in str(find_points(photograph(pose), PATTERN, 'saddle'))
 
     def test_a_steep_board_out_of_focus(self) -> None:
         """Neither search finds it unless the image is sharpened."""
@@ -449,14 +449,14 @@ class TestPhotographs:
         assert 'a copy of' in said['10_copy.png']
         assert said['11_blank.png'] == 'no board found'
         assert 'is 424x390 px; the others are 424x400' in said['12_size.png']
-        assert 'JPEG ends' in said['14_cut.jpg']
-        assert 'not an image' in said['15_empty.png']
-        assert 'not an image' in said['16_text.png']
+        assert 'JPEG is incomplete' in said['14_cut.jpg']
+        assert 'the image cannot be read' in said['15_empty.png']
+        assert 'the image cannot be read' in said['16_text.png']
         assert all('\n' not in reason for reason in said.values())
         notes = {Path(one.name).name: ' '.join(one.notes) for one in detection.searched}
         assert 'blurred by 2.' in notes['17_soft.png']
         assert 'over-exposed' in notes['18_burnt.png']
-        assert 'same place as 03.png' in notes['19_deep.png']
+        assert 'same viewpoint as 03.png' in notes['19_deep.png']
         assert not notes['00.png']
 
     def test_observations_are_the_corners(self, detection: Detection) -> None:
@@ -470,7 +470,7 @@ class TestPhotographs:
             assert np.abs(table.uv[mine] - true).max() < 0.1
 
     def test_nothing_found(self, tmp_path: Path) -> None:
-        with pytest.raises(ObservationError, match='no photograph in it'):
+        with pytest.raises(ObservationError, match='hold no photograph'):
             found(tmp_path)
         write(tmp_path, [np.full((50, 60), 9, np.uint8)])
         with pytest.raises(ObservationError, match='no board found'):
@@ -536,15 +536,15 @@ class TestCameras:
         assert self.cameras(tmp_path) == cameras
 
     @pytest.mark.parametrize(('files', 'told'), [
-        (['left01.png', 'right01.png', 'notes.png'], 'those of one camera, since notes.png is'),
+        (['left01.png', 'right01.png', 'notes.png'], 'those of one camera, since notes.png names'),
         (['left01.png', 'right01.png'], ''),
         (['left01.png', 'other.png'], ''),
-        (['1.png', 'results/1.png'], 'results: images in it are passed over (1)'),
+        (['1.png', 'results/1.png'], 'results: its 1 images are skipped'),
         (['1.png', 'results/1.txt'], ''),
         (['1.png', 'second/left/1.png', 'second/right/1.png'],
-         'second: images in it are passed over (2)'),
+         'second: its 2 images are skipped'),
         (['left/1.png', 'right/1.png', 'left/old/1.png'],
-         'left/old: images in it are passed over (1)'),
+         'left/old: its 1 images are skipped'),
     ])
     def test_what_may_not_be_meant_is_told(
         self, tmp_path: Path, files: list[str], told: str
@@ -594,7 +594,7 @@ def test_a_png_that_announces_more_than_it_holds(tmp_path: Path) -> None:
     for place in (33, good.index(b'IEND') - 4):
         data = bytearray(good)
         data[place:place + 4] = b'\x7f\xff\xff\xf0'  # a length; OpenCV 5 makes room for it
-        with pytest.raises(ObservationError, match='the PNG ends before its image does'):
+        with pytest.raises(ObservationError, match='the PNG is incomplete'):
             decode_image(bytes(data), 'x')
 
 
@@ -772,5 +772,5 @@ def test_a_board_with_more_squares_is_said_to_be_larger(
     assert 'larger' not in capsys.readouterr().err
     cli.main(['detect', str(tmp_path), '--board', 'chessboard:8x6:20mm'])
     told = capsys.readouterr().err
-    assert re.search(r'\d+ of \d+ boards look larger than chessboard:8x6:20mm, which counts', told)
-    assert 'its squares go on beyond the corners looked for' in told
+    assert re.search(r'\d+ of \d+ boards look larger than chessboard:8x6:20mm; count', told)
+    assert 'its squares continue beyond the given corners' in told

@@ -76,7 +76,7 @@ def test_what_shows_brightness_becomes_grey(encoding: str) -> None:
 def test_what_does_not_is_refused_with_the_reason_and_what_to_send(encoding: str) -> None:
     with pytest.raises(ObservationError) as caught:
         pixels(SimpleNamespace(**{**vars(image('mono8')), 'encoding': encoding}))
-    reason = 'not of brightness' if encoding in REFUSED else 'unknown'
+    reason = 'not one of brightness' if encoding in REFUSED else 'unknown'
     assert f'one: encoding {encoding!r} is {reason}' in str(caught.value)
     assert 'have the driver send mono8, bgr8' in str(caught.value)
 

@@ -79,14 +79,15 @@ def test_a_rig_whose_photographs_are_named_by_stamps(
     out = tmp_path / 'observations.csv'
     assert cli.main(['detect', str(tmp_path), '--board', BOARD, '-o', str(out)]) == 0
     told = capsys.readouterr()
-    assert 'cameras left, right: 2 moments shared, paired by stamp, 0.00123 ms apart' in told.out
-    assert '1 of 5 photographs have no partner of the same moment, by stamp: ' in told.err
+    assert ('cameras left, right: 2 simultaneous pairs, matched by stamp, 0.00123 ms apart'
+            in told.out)
+    assert '1 of 5 photographs have no simultaneous partner, by stamp: ' in told.err
     table = read_observations(out)
     right = table.take(table.camera == table.cameras.index('right'))
     assert right.frames.tolist() == [1, 2]
     assert table.t.min() == pytest.approx(BASE / 1e9, abs=1e-6)
     assert cli.main(['detect', str(tmp_path), '--board', BOARD, '--sync', '1us']) == 0
-    assert 'no photograph of one camera has a partner' in capsys.readouterr().err
+    assert 'no photographs of two cameras are simultaneous' in capsys.readouterr().err
     with pytest.raises(SystemExit):
         cli.main(['detect', str(tmp_path), '--board', BOARD, '--sync', '5'])
-    assert "'5' is not a time with its unit, as in 5ms" in capsys.readouterr().err
+    assert "'5' is not a time with a unit, such as 5ms" in capsys.readouterr().err

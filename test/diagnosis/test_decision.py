@@ -28,7 +28,7 @@ SOUND = LensFacts(
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
     found = decide_lens(SOUND)
     assert found.say == 'keep' and found.bound == [SMALL] and found.confidence == 0.95
-    assert 'costs at most 0.02 px (0.05 mrad) at the edge' in found.why
+    assert 'cause at most 0.02 px (0.05 mrad) at the edge' in found.why
 
 
 @pytest.mark.parametrize('causes', [[], ['target_shape']])
@@ -37,7 +37,7 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     off = SOUND._replace(offset=LensOffset(1.2, 3.0, 0.001, 1.5), causes=causes, file=BETTER)
     found = decide_lens(off)
     assert found.say == 'recalibrate'
-    assert '3.0 times what the errors of both fits allow' in found.why
+    assert '3.0 times the combined standard error' in found.why
     assert found.confidence is not None and found.confidence > 0.99
 
 
@@ -89,7 +89,7 @@ def test_the_target_is_judged_apart() -> None:
     alone = TARGET._replace(causes=[], size='')
     assert decide_target(alone).say == 'measure_again'
     harmless = decide_target(alone._replace(local_px=0.03))
-    assert harmless.say == 'keep' and 'landmarks are off by 0.04 mm rms' in harmless.why
+    assert harmless.say == 'keep' and 'landmarks are displaced by 0.04 mm rms' in harmless.why
     assert decide_target(alone._replace(local_px=0.0, local_m=0.0)).say == 'keep'
 
 

@@ -45,7 +45,7 @@ def test_water_is_named_and_measured(lens, others):
     assert found.lens.port.medium_index == cause.parameters['medium_index']['value']
     assert found.lens.fx == AIR.fx and found.figures.gain.value > 0.9
     assert 'air or another medium behind it' in verdict_sentences(found)[0]
-    assert 'in air, too' not in verdict_sentences(found)[2]
+    assert 'in air first' not in verdict_sentences(found)[2]
 
 
 def test_coarse_points_in_air_are_no_reason_to_fit_a_port(monkeypatch):
@@ -87,7 +87,7 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     assert found.figures.extended.heldout_rms_px < 0.2
     assert any('leaves open' in advice.what for advice in found.advice)
-    assert 'diagnose the photographs in air, too' in verdict_sentences(found)[2]
+    assert 'diagnose the photographs in air first' in verdict_sentences(found)[2]
 
 
 @pytest.mark.parametrize('block', [

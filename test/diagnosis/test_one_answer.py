@@ -77,7 +77,7 @@ def test_decision_verdict_and_report_agree(results: dict[str, Path], name: str) 
     assert (found['verdict'] in ('explained', 'partly_explained')) == (
         bool(effects) or lens['say'] == 'recalibrate')
     words = {'keep': 'Keep the lens', 'use_extended': 'Use extended_lens.yaml',
-             'recalibrate': 'Do not use the lens', 'undecided': 'Do not decide on the lens yet'}
+             'recalibrate': 'Do not use the lens', 'undecided': 'Undecided'}
     title = (out / 'report.html').read_text().partition('<h1>')[2].partition('</h1>')[0]
     assert words[lens['say']] in title
     if lens['say'] == 'use_extended':
@@ -127,4 +127,4 @@ def test_a_lens_that_is_not_recommended_is_not_offered(
     assert ('/extended_lens.yaml' in page) == offered
     assert ('Correct it by extended_lens.yaml' in page) <= offered
     first = (out / 'extended_lens.yaml').read_text().partition('\n')[0]
-    assert first.startswith('# Not better than the lens as given') == (not offered)
+    assert first.startswith('# It is not known to be better than') == (not offered)

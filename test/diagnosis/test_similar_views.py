@@ -52,7 +52,7 @@ def test_what_repeats_is_found_predicted_and_told_of():
     assert found.scatter_px == pytest.approx(np.hypot(part.sd_px, noise.sd_px))
     assert found.figures.extended.heldout_rms_px < 0.75 * found.figures.base.heldout_rms_px
     assert found.verdict == 'unexplained'
-    assert any('differ from each other' in advice.what for advice in found.advice)
+    assert any('from more different poses' in advice.what for advice in found.advice)
 
 
 def test_frames_in_turn_gain_by_it_too():

@@ -53,7 +53,7 @@ def test_what_moves_with_the_lens_holds_in_the_other_set():
     assert said.tried[0].target is None
     e0 = said.parameters['viewpoint_shift.e0']
     assert abs(e0.standardized_difference) < 3 and e0.value == pytest.approx(0.02, abs=0.003)
-    assert 'holds in both sets' in sections(found)[0].sentence
+    assert 'hold in both sets' in sections(found)[0].sentence
     assert found.to_dict()['external']['sets']['against'] == 'set 32'
 
 
@@ -120,7 +120,7 @@ def test_command(tmp_path, capsys):
                  '--free', 'intrinsics', '--quick', '--against', str(tmp_path / 'b.csv')]
     assert main(arguments) == 0
     printed = capsys.readouterr().out
-    assert 'What moves with the lens holds in both sets' in printed
+    assert 'The causes in the lens hold in both sets' in printed
     assert 'Another data set of this camera' in printed
 
 

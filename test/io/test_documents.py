@@ -129,7 +129,7 @@ def test_files_have_bounds(tmp_path: Path) -> None:
     path = tmp_path / 'a'
     path.write_bytes(bytes(10))
     assert read_bytes(path, ParameterError, 10) == bytes(10)
-    with pytest.raises(ParameterError, match='which is more than is read'):
+    with pytest.raises(ParameterError, match='the largest size that is read'):
         read_bytes(path, ParameterError, 9)
     with pytest.raises(ParameterError, match='Is a directory'):
         read_bytes(tmp_path, ParameterError)

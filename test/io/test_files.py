@@ -20,7 +20,7 @@ def test_what_is_no_regular_file_is_not_replaced(
     with pytest.raises(OutputError, match='not a regular file'):
         write_text(tmp_path / 'there', 'text')
     assert not (tmp_path / 'there').is_file()
-    with pytest.raises(OutputError, match='/dev/null: it is there and not a regular file'):
+    with pytest.raises(OutputError, match='/dev/null: it exists and is not a regular file'):
         write_text('/dev/null', 'text')
     assert Path('/dev/null').is_char_device()
 

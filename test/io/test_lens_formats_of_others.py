@@ -379,10 +379,10 @@ def test_the_skew_of_a_camera_matrix_is_kept(
     (OCAM.format(0.0).replace('480 640', ''), 'image size is missing'),
     (KALIBR.replace('pinhole', 'omni').replace('[600.1', '[1.0, 600.1'), 'omni with equidistant '
      'is not a form that can be read; those are pinhole with equidistant'),
-    ('{"sfm_data_version": "0.3"}', 'this is an OpenMVG scene, which cannot be read; those of '),
-    ('<lensdatabase version="2"></lensdatabase>', 'this is a lensfun database'),
+    ('{"sfm_data_version": "0.3"}', 'an OpenMVG scene cannot be read; readable are '),
+    ('<lensdatabase version="2"></lensdatabase>', 'a lensfun database cannot be read'),
     ('p f2 w3000 h1500 v360\ni w2000 h2000 f3 v180\n', 'Hugin or PTGui'),
-    ('some words\n', 'no lens file: it has no projection, and is none of ROS camera_info, Kalibr'),
+    ('some words\n', 'it has no projection, and no format of ROS camera_info, Kalibr'),
 ])
 def test_a_format_is_named_and_what_can_be_read(text: str, said: str, tmp_path: Path) -> None:
     (tmp_path / 'lens').write_text(text)
@@ -420,8 +420,8 @@ mirror_offset: 0.0125
     assert 'principal point (4100.0, -600.0) lies outside the image of 3104x3000 px' in told.err
     worst = read_lens_file(path).worst_px['camera']
     assert worst > 1
-    assert f'no lens here comes nearer than {worst:.2g} px to the model of this file' in told.err
-    assert f'a fit of kannala_brandt to BoofCV, {worst:.2g} px off at worst' in told.out
+    assert f'the nearest lens is {worst:.2g} px off the model of this file' in told.err
+    assert f'kannala_brandt fitted to BoofCV, at most {worst:.2g} px off' in told.out
     assert cli.main(['budget', '--lens', str(path)]) == 2  # without a viewpoint shift
     assert 'lies outside the image' in capsys.readouterr().err
     save_lens(replace(load_lens(path), cx=1500.0, cy=1500.0), tmp_path / 'inside.yaml')

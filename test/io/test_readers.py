@@ -205,7 +205,7 @@ class TestObservationsCsv:
 
     def test_no_such_file(self, tmp_path):
         fails(tmp_path / 'none.csv', 'cannot be read')
-        fails(tmp_path / 'none', 'there is no such file or folder')
+        fails(tmp_path / 'none', 'no such file or folder')
 
     def test_unknown_form(self, csv):
         fails(csv(ROWS, 'observations.xlsx'), 'known form', 'a .csv file', 'ORPC'.lower())

@@ -128,7 +128,7 @@ def test_a_set_without_one_says_so(graphs: list[Graph]) -> None:
 
 def test_the_critic_of_a_rig_takes_one_lens(graphs: list[Graph]) -> None:
     start(graphs, 'stereo:=true')
-    with pytest.raises(FisheyeSvpError, match='one lens for both'):
+    with pytest.raises(FisheyeSvpError, match='one lens file for both'):
         graphs[-1].start(ModelCritic)
 
 
@@ -160,7 +160,7 @@ def test_a_camera_info_of_no_use(changes: dict[str, Any], reason: str) -> None:
 @pytest.mark.parametrize(('model', 'd', 'reason'), [
     ('thin_prism', (0.1,), "'thin_prism'; known are equidistant"),
     ('equidistant', (0.1,), 'has 1 coefficients'), ('plumb_bob', (0.1,), 'has 1 coefficients'),
-    ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate it again, as equidistant'),
+    ('plumb_bob', (-0.9, 0.9, 0.01, 0.02, 0.0), 'calibrate again, as equidistant'),
     ('equidistant', (0.1, 1e300, 0.0, 5e-324), 'no lens'),
 ])
 def test_a_model_that_no_lens_comes_near_to(

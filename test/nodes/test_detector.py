@@ -156,10 +156,10 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(
     noise = np.kron(noise, np.ones((3, 3), np.uint8))
     # Nothing else is held up meanwhile: that the executor goes round shows it.
     g.until(lambda: (setattr(node, '_size', None), images.publish(raw(noise, 6)),
-                     node._counts['searches broken off'])[2])
+                     node._counts['searches ended'])[2])
     g.until(lambda: (images.publish(raw(good, 7)),
                      any(p.header.stamp.nanosec == 7 for p in points))[1])
-    g.until(lambda: any(pair.key == 'searches broken off' and int(pair.value)
+    g.until(lambda: any(pair.key == 'searches ended' and int(pair.value)
                         for m in diagnostics for pair in m.status[0].values))
 
 
@@ -243,6 +243,6 @@ def test_tags_that_others_found(graph: Callable[..., Graph], tmp_path: Path) -> 
     frame, ids, uv = node._read_tags(message, 'detections')
     assert frame == 'camera' and ids.tolist() == [0, 1, 2, 3, 8, 9, 10, 11]
     assert uv.tolist() == [[9.5 + i, 19.5] for i in range(4)] * 2
-    with pytest.raises(ObservationError, match='no tag of the board among 1'):
+    with pytest.raises(ObservationError, match='none of 1 tags belongs'):
         message.detections = tags[2:]
         node._read_tags(message, 'detections')

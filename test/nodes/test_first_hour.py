@@ -107,7 +107,7 @@ def landmarks(stamp: int = 0) -> Any:
     return messages.landmarks_message(environment('whole', 2.0), stamp, 'world')
 
 
-@tries('Nothing comes: the topic has another name')
+@tries('No messages: wrong topic name')
 def another_name(hour: Hour, pattern: str) -> None:
     g = hour.begin(f'board:={BOARD}')
     g.probe.create_publisher(Image, '/camera/image_raw', SENSOR)
@@ -116,15 +116,15 @@ def another_name(hour: Hour, pattern: str) -> None:
     hour.logs(pattern)
 
 
-@tries('Nothing comes: nobody publishes')
+@tries('No messages: no publisher')
 def nobody(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(Localizer)
     hour.says(pattern)
-    hour.logs('nothing has come on /image_points: nobody')
+    hour.logs('no message on /image_points: it has no publisher')
 
 
-@tries('Nothing comes: the topic has another type')
+@tries('No messages: wrong topic type')
 def another_type(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     context = Context()  # one process cannot have two types on one topic
@@ -137,7 +137,7 @@ def another_type(hour: Hour, pattern: str) -> None:
     context.shutdown()
 
 
-@tries('Nothing comes: an override of the quality of service')
+@tries('No messages: a QoS override')
 def another_qos(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING, 'qos_overrides./image_points.subscription.reliability:=reliable')
     driver = g.probe.create_publisher(PointCloud2, '/image_points', SENSOR)
@@ -145,7 +145,7 @@ def another_qos(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: driver.publish(image_points()))
 
 
-@tries('Nothing comes of large images')
+@tries('No messages: large images are lost')
 def large_images(hour: Hour, pattern: str) -> None:
     g = hour.begin(f'board:={BOARD}')
     g.probe.create_publisher(Image, '/image', SENSOR)
@@ -153,7 +153,7 @@ def large_images(hour: Hour, pattern: str) -> None:
     hour.says(pattern)
 
 
-@tries('Data stop: their publisher gets none any more, or has ended')
+@tries('Messages stop: the publisher has no input, or has ended')
 def data_stop(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(Localizer)
@@ -162,7 +162,7 @@ def data_stop(hour: Hour, pattern: str) -> None:
     hour.says(pattern)
 
 
-@tries('No errors: true poses have stamps of their own, and are far apart')
+@tries('No errors: the stamps of true poses are far from those of the sets')
 def far_poses(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(Localizer)
@@ -174,7 +174,7 @@ def far_poses(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: points.publish(image_points(1000 * MS)))
 
 
-@tries('A rig gives nothing: the stamps of its cameras differ')
+@tries('No results of a rig: the stamps of its cameras differ')
 def stereo_stamps(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(StereoDepth)
@@ -213,7 +213,7 @@ def not_calibrated(hour: Hour, pattern: str) -> None:
                                 points.publish(image_points())))
 
 
-@tries('Some landmarks are latched under the stamp of one set, others under that of another')
+@tries('Some sets fail: landmarks are latched under the stamps of different sets')
 def landmarks_of_one_set(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING)
     g.start(Localizer)
@@ -224,7 +224,7 @@ def landmarks_of_one_set(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: points.publish(image_points(3000 * MS)))
 
 
-@tries('No board is found: depth images in place of photographs')
+@tries('No board is found: depth images instead of photographs')
 def depth_images(hour: Hour, pattern: str) -> None:
     g = hour.begin(f'board:={BOARD}')
     g.hear(PointCloud2, 'image_points')
@@ -234,7 +234,7 @@ def depth_images(hour: Hour, pattern: str) -> None:
         Image(height=1, width=1, encoding='32FC1', step=4, data=b'\0' * 4)))
 
 
-@tries('Poses are off: camera_info is of another image size')
+@tries('Wrong poses: camera_info is for another image size')
 def another_size(hour: Hour, pattern: str) -> None:
     g = hour.begin(f'board:={BOARD}')
     g.hear(PointCloud2, 'image_points')
@@ -246,7 +246,7 @@ def another_size(hour: Hour, pattern: str) -> None:
     hour.says(pattern, lambda: (driver.publish(info), images.publish(image)))
 
 
-@tries('Time stands still: use_sim_time without a clock')
+@tries('No progress: use_sim_time without a clock')
 def no_clock(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING, 'use_sim_time:=true')
     g.start(Localizer)
@@ -256,7 +256,7 @@ def no_clock(hour: Hour, pattern: str) -> None:
     hour.says(pattern)
 
 
-@tries('A parameter changes nothing: its name is misspelled')
+@tries('A parameter has no effect: its name is misspelled')
 def misspelled(hour: Hour, pattern: str) -> None:
     g = hour.begin(*SOLVING, 'patence:=3.0')
     g.start(Localizer)
@@ -287,8 +287,8 @@ def test_data_that_stop_are_missed_until_they_come_again(hour: Hour) -> None:
     g.start(Localizer)
     told, points = g.tell(PointCloud2, 'landmarks', LATCHED), g.tell(PointCloud2, 'image_points')
     told.publish(landmarks())
-    for stopped in (r'nothing has come on /image_points for \d+ s: probe is still connected',
-                    r'nothing has come on /image_points for \d+ s: nobody publishes it any more'):
+    for stopped in (r'no message on /image_points for \d+ s: probe is still connected',
+                    r'no message on /image_points for \d+ s: its publisher is gone'):
         hour.reports.clear()
         g.until(lambda: (points.publish(image_points()), any(
             m.status[0].message == 'all inputs usable' for m in hour.reports))[1])

@@ -76,9 +76,9 @@ def test_an_image_that_the_lens_is_not_for_is_named(
 
 
 @pytest.mark.parametrize(('arguments', 'reason'), [
-    (('near:=0.5', 'far:=0.4'), 'near is not below far'),
+    (('near:=0.5', 'far:=0.4'), 'near must be below far'),
     (('detections:=true',), 'must be an aprilgrid|cannot be used with detections'),
-    ((), 'not an empty folder'), (('guide_output:=notes.txt/guided',), 'can be written'),
+    ((), 'an empty, writable folder'), (('guide_output:=notes.txt/guided',), 'writable'),
 ])
 def test_a_guide_that_cannot_work_is_refused(
     graph: Callable[..., Graph], tmp_path: Path, arguments: tuple[str, ...], reason: str,

@@ -501,7 +501,7 @@ def all_in_one_place(sets: Sets, stamp: int) -> None:
 
 
 @pytest.mark.parametrize(('spoil', 'reason'), [
-    (unknown_landmark, 'landmark 99 is not among the landmarks'),
+    (unknown_landmark, 'landmark 99 is not one of the landmarks'),
     (too_few, 'has 3 usable points'),
     (far_outside, 'has 0 usable points inside the field of view'),
     (all_in_one_place, ''),

@@ -165,7 +165,7 @@ def test_a_recording_that_was_cut_short_yields_what_is_whole(
     (tmp_path / 'bag' / 'metadata.yaml').unlink()
     bag = Bag(tmp_path / 'bag')
     columns = tabulate(bag.records(is_tabulated))
-    assert 'only what is whole is read' in bag.damage
+    assert 'only its intact parts are read' in bag.damage
     known = [v for v in columns.get('localizer.rms_px', []) if v is not None]
     assert len(columns['stamp_ns']) == whole
     # Results were written from the last stamp to the first: the first are what is lost.
@@ -221,7 +221,7 @@ def test_a_chunk_that_became_a_footer_is_no_end(tmp_path: Path) -> None:
     assert data[chunk] == 6
     data[chunk] = 2
     file.write_bytes(data)
-    with pytest.raises(BagError, match=f'from byte {chunk} on it cannot be followed'):
+    with pytest.raises(BagError, match=f'it cannot be read from byte {chunk} on'):
         list(Bag(tmp_path / 'bag').records(is_tabulated))
 
 
@@ -300,14 +300,14 @@ def test_a_recording_says_what_its_publishers_offered(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('make', 'reason'), [
-    (lambda path: None, 'there is no such recording; check the path'),
+    (lambda path: None, 'no such recording; check the path'),
     (lambda path: path.mkdir(), 'no .mcap or .db3 file in this folder'),
     (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'')),
-     'not a recording, or nothing in it is whole'),
+     'not a recording, or no part of it is intact'),
     (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(os.urandom(5000))),
-     'not a recording, or nothing in it is whole'),
+     'not a recording, or no part of it is intact'),
     (lambda path: (path.mkdir(), (path / 'x.mcap').write_bytes(b'\x89MCAP0\r\n' + b'\5' * 999)),
-     'not a recording, or nothing in it is whole'),
+     'not a recording, or no part of it is intact'),
 ])
 def test_what_is_no_recording_is_refused(
     tmp_path: Path, make: Callable[[Path], None], reason: str,
@@ -326,7 +326,7 @@ def test_a_recording_without_results_is_refused(
         message = messages.number_message(1.0)
         bag.write('/x', 'std_msgs/msg/Float64', serialize_message(message))
     assert main(['table', str(tmp_path / 'bag')]) == 2
-    assert 'neither scenarios nor results in it' in capsys.readouterr().err
+    assert 'it holds neither scenarios nor results' in capsys.readouterr().err
 
 
 def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
@@ -420,7 +420,7 @@ def test_no_empty_recording_is_left_behind(
 ) -> None:
     monkeypatch.setattr(Recorder, 'spin', lambda *_: None)  # interrupted before anything came
     assert main(['record', '-o', str(tmp_path / 'bag')]) == 2
-    assert 'no message came on a topic that is recorded, and nothing is kept' in (
+    assert 'no message arrived on a recorded topic, so nothing is kept' in (
         capsys.readouterr().err)
     assert not (tmp_path / 'bag').exists()
 
@@ -438,7 +438,7 @@ def test_a_recorder_that_is_killed_leaves_what_it_has_flushed(
     assert camera.finish(signal.SIGTERM) == 0
     bag = Bag(tmp_path / 'bag')
     assert len(tabulate(bag.records(is_tabulated))['stamp_ns']) >= 5
-    assert 'only what is whole is read' in bag.damage
+    assert 'only its intact parts are read' in bag.damage
 
 
 def test_a_recorder_has_flushed_what_came_and_ends_while_others_go_on(
@@ -467,7 +467,7 @@ def test_bad_arguments_of_record(command: Callable[..., NodeProcess], tmp_path: 
     assert there.finish() == 2
     assert 'a recording cannot be written there' in there.lines[-1]
     broken = command('record', '-o', str(tmp_path / 'new'), '--topics', '(')
-    assert broken.finish() == 2 and 'is no regular expression' in broken.lines[-1]
+    assert broken.finish() == 2 and 'is not a regular expression' in broken.lines[-1]
     assert not (tmp_path / 'new').exists()
 
 

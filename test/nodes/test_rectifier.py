@@ -202,7 +202,7 @@ def test_what_cannot_be_rectified_is_refused(graph: Callable[..., Graph], lens: 
     assert result.successful
     (lens.parent / 'broken.yaml').write_text('name: x')
     result = set_parameter(node, 'lens', str(lens.parent / 'broken.yaml'))
-    assert not result.successful and 'no lens file: it has no projection' in result.reason
+    assert not result.successful and 'not a lens file: it has no projection' in result.reason
     assert node.settings.lens == str(lens)
 
 
@@ -215,7 +215,7 @@ def test_a_pair_without_a_rig_does_not_start(graph: Callable[..., Graph], lens: 
 def test_a_topic_that_would_be_heard_and_published_is_refused(ros_domain: int) -> None:
     g = Graph('-r', 'image/camera_info:=/camera_info')
     try:
-        with pytest.raises(ParameterError, match='/camera_info would be heard and published'):
+        with pytest.raises(ParameterError, match=r'its own output .*/camera_info'):
             g.start(Rectifier)
     finally:
         g.close()

@@ -184,7 +184,7 @@ def test_landmarks_that_come_set_by_set_never_stand_in_for_others(
     message = solving.graph.until(lambda: next(
         (m for m in solving.results if stamp_of(m) == 1150 * MS), None))
     assert 'the nearest is 50.0 ms off' in message.status[0].message
-    assert 'the stamp 0' in message.status[0].message
+    assert 'with stamp 0' in message.status[0].message
     solving.tell_landmarks(0)
     solving.points[0].publish(points_message(moved(1.0), 1200 * MS))
     assert solving.metrics(1200 * MS)

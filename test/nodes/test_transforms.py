@@ -48,7 +48,7 @@ def test_without_tf2_it_is_refused_at_the_start(
     monkeypatch.setitem(sys.modules, 'tf2_msgs', None)
     monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
     g = graph('publish_tf:=true')
-    with pytest.raises(ParameterError, match=r'tf2_msgs is not installed; .* publish_tf at false'):
+    with pytest.raises(ParameterError, match=r'tf2_msgs is not installed; .* publish_tf:=false'):
         g.start(kind)
 
 

@@ -20,7 +20,7 @@ from fisheye_svp_ros.commands import watch
 
 
 @pytest.mark.parametrize(('width', 'shown'), [
-    (24, 'a terminal 64 columns wide is needed; this one has 24'),
+    (24, 'the terminal must be 64 columns wide; this one has 24'),
     (64, '-0.0123457 -0.0123457 0.0123457')])
 def test_a_terminal_that_is_too_narrow_is_told_so(width: int, shown: str) -> None:
     from fisheye_svp_ros.nodes.watcher import MetricHistory, Results

@@ -207,8 +207,8 @@ def test_broken_lens_is_refused_with_its_reason(path, value, reason, tmp_path):
 
 
 @pytest.mark.parametrize(('content', 'reason'), [
-    (b'', 'no lens file: it has no projection'),
-    (b'- 1\n', 'no lens file: it has no projection'),
+    (b'', 'not a lens file: it has no projection'),
+    (b'- 1\n', 'not a lens file: it has no projection'),
     (b'image: {width: 1\n', 'broken YAML at line 2: '),
     (b'\xff\xfe\x00', 'not a text file; one in UTF-8 is expected'),
 ])

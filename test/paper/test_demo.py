@@ -114,7 +114,7 @@ def test_the_nodes_have_nothing_to_complain_of(demo: Any) -> None:
     for log in (folder / 'logs').glob('*.log'):
         # A camera that has published its sets ends, some seconds before those of other nodes.
         text = '\n'.join(line for line in log.read_text().splitlines()
-                         if 'nobody publishes it any more' not in line)
+                         if 'its publisher is gone' not in line)
         assert 'Traceback' not in text and 'WARN' not in text and 'dropped' not in text, log
 
 
@@ -141,7 +141,7 @@ def computed(
 def test_without_ros_the_same_scenarios_are_computed(computed: Any) -> None:
     folder, printed = computed
     first, *others = printed.splitlines()
-    assert first.startswith('  Without ROS 2 (') and 'in one process, no node graph' in first
+    assert first.startswith('  ROS 2 is missing (') and 'in one process, without nodes' in first
     assert sum(line.startswith('  fish180 ') for line in others) == 9
     assert sorted(path.name for path in folder.iterdir() if path.suffix != '.parquet') == [
         'demo.json', 'errors.png', 'rectified.png', 'residuals.png', 'table.csv']

@@ -151,7 +151,7 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
     assert [len(row) for row in rows(doubt)] == [6, 6] and 'sure' in rows(doubt)[-1][-1]
     assert '--without' not in purpose(doubt._replace(answers=(0.1, 0.5, 0.9)))
     hardly = doubt._replace(answers=(0.02, 0.03, 0.04), others=('flat_port',))
-    assert purpose(hardly).endswith('exclude what is absent by --without flat_port')
+    assert purpose(hardly).endswith('exclude an absent one with --without flat_port')
     sized = next_photographs(linear, [cause([])], NOISE, 2, room=ROOM)
     assert (sized.asked, sized.unit) == ('viewpoint_shift', 'm')
     assert 'mm' in rows(sized)[0][-1]
@@ -165,7 +165,7 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
 
 
 def test_what_cannot_be_planned_is_refused(linear, board):
-    with pytest.raises(ParameterError, match='no number of the lens'):
+    with pytest.raises(ParameterError, match='no parameter of the lens'):
         next_photographs(linear, [], NOISE, 1, 'colour', ROOM)
     with pytest.raises(GeometryError, match='does not see the whole board from 50 to 60 m'):
         candidate_shots(linear.state, board, ViewLimits(50.0, 60.0), np.random.default_rng(0))

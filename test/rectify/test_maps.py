@@ -103,7 +103,7 @@ def test_the_mask_is_what_the_lens_and_the_photograph_reach() -> None:
 
 def test_photographs_of_another_size_are_refused() -> None:
     side = Rectification(SVP, camera_for([SVP], 'pinhole'))
-    with pytest.raises(ParameterError, match="1280x801 px, and lens 'svp' is of 1280x800"):
+    with pytest.raises(ParameterError, match="1280x801 px, lens 'svp' is for 1280x800"):
         side.remap(np.zeros((801, 1280), np.uint8))
     color = np.zeros((800, 1280, 3), np.uint16)
     assert side.remap(color).shape == (800, 1280, 3)
@@ -148,7 +148,7 @@ def test_impossible_cameras_and_ranges_are_refused() -> None:
             rectified_camera(projection, (640, 480), np.radians(degrees))
     with pytest.raises(ParameterError, match='size is 0x480'):
         rectified_camera('pinhole', (0, 480), 1.0)
-    with pytest.raises(ParameterError, match='has no epipolar rows; take one of pinhole'):
+    with pytest.raises(ParameterError, match='has no straight epipolar rows; take one of pinhole'):
         rectified_camera('fisheye', (640, 480), 1.0, along_baseline=True)
     for range_m in (0.0, -1.0, np.nan, 0.003):
         with pytest.raises(ParameterError, match=r"range is .*lens 'small' needs more than"):

@@ -43,7 +43,7 @@ def test_what_is_settled_and_what_photographs_cannot_tell(guide):
     guide.adopt(stand)
     assert guide_words(guide) == (
         'settled', 'diagnosis: viewpoint_shift, or flat_port: photographs cannot separate them',
-        '0 photographs, e0 -3 +- 0.1 mm, wanted +- 0.3')
+        '0 photographs, e0 -3 +- 0.1 mm, goal +- 0.3')
 
 
 def test_a_large_image_of_16_bits_makes_a_small_picture(guide):

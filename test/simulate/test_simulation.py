@@ -225,5 +225,5 @@ def test_cameras_of_a_file_see_what_they_would_alone(tmp_path):
 def test_a_rig_without_a_lens_is_refused(tmp_path):
     four_cameras(tmp_path)
     (tmp_path / 'cam2.yaml').unlink()
-    with pytest.raises(LensError, match='the rig has the camera cam2, and there is no lens of it'):
+    with pytest.raises(LensError, match='the rig has the camera cam2, which has no lens'):
         simulate_scenario(Scenario(rig_file=str(tmp_path)))

@@ -187,7 +187,7 @@ def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> N
         True, True, False, False, True, True, False, False
     ]
     assert 'has 3 usable points' in columns['localizer.note'][2]
-    assert 'do not fix a pose' in columns['localizer.note'][6]
+    assert 'do not determine a pose' in columns['localizer.note'][6]
     assert columns['localizer.note'][0] is None
 
 
@@ -201,13 +201,13 @@ BAD = {
     'sweep.style: [mono, parallel]': 'make two sweeps of it',
     'sweep.lens: [fish214, nonsense]': "'nonsense' is neither a file",
     'sweep.environment: [nowhere]': "environment 'nowhere' is unknown",
-    'radius: 2.0': 'nothing is swept',
-    'sweep.seed: [1], radios: 3': 'radios is no parameter of synthetic_camera',
+    'radius: 2.0': 'no parameter is swept',
+    'sweep.seed: [1], radios: 3': 'radios is not a parameter of synthetic_camera',
     'sweep.seed: [1], poses: [1.0, 2.0]': 'seven a pose are needed',
     'sweep.seed: [1], poses: 3.0': 'poses is 3.0; a list is needed',
     'sweep.seed: [1], noise_px: much': "noise_px is 'much'; float is needed",
     f'sweep.seed: {list(range(1001))}, sweep.radius: {[0.1 * n for n in range(1, 1001)]}':
-        '1001000 scenarios (1001 seed x 1000 radius); --large if that is meant',
+        '1001000 scenarios (1001 seed x 1000 radius); add --large to run them all',
 }
 
 
@@ -224,8 +224,8 @@ def test_a_bad_sweep_is_refused_before_anything_runs(
 
 
 @pytest.mark.parametrize(('text', 'reason'), [
-    ('localiser: {ros__parameters: {svp: true}}', 'is no node of a sweep'),
-    ('localizer: {ros__parameters: {sweep.radius: [1.0]}}', 'is no parameter of localizer'),
+    ('localiser: {ros__parameters: {svp: true}}', 'is not a node of a sweep'),
+    ('localizer: {ros__parameters: {sweep.radius: [1.0]}}', 'is not a parameter of localizer'),
     ('', 'should hold node names'),
     ('a: [', 'broken YAML at line 2'),
     ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
@@ -280,21 +280,21 @@ def test_parts_are_neither_repeated_nor_mixed_nor_lost(
     process.communicate()
     done = {p.name: p.stat().st_mtime_ns for p in (out / 'parts').glob('0*.json')}
     assert main(['sweep', str(path), '-o', str(out)]) == 2
-    assert '--resume goes on with it' in capsys.readouterr().err
+    assert 'continue with --resume' in capsys.readouterr().err
     other = tmp_path / 'other.yaml'
     other.write_text(LONG.replace('0.5\n', '0.6\n'))
     assert main(['sweep', str(other), '-o', str(out), '--resume']) == 2
-    assert 'another sweep was interrupted there' in capsys.readouterr().err
+    assert 'it holds another, interrupted sweep' in capsys.readouterr().err
     # What is done stays as it is until it is joined.
     kept: dict[str, int] = {}
     monkeypatch.setattr('shutil.rmtree', lambda folder, **_: kept.update(
         {p.name: p.stat().st_mtime_ns for p in Path(folder).glob('0*.json')}))
     sweep(path, '-o', out, '--resume')
-    assert 'scenarios are done already' in capsys.readouterr().err
+    assert 'scenarios are already done' in capsys.readouterr().err
     assert len(kept) == TASKS and {name: kept[name] for name in done} == done
     monkeypatch.undo()
     sweep(path, '-o', out, '--resume')
-    assert 'holds this sweep already' in capsys.readouterr().err
+    assert 'already holds this sweep' in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -434,7 +434,7 @@ def test_without_pyarrow_there_is_csv_and_one_line_that_says_so(
     assert main(['sweep', str(write(SMALL)), '-o', str(tmp_path / 'out')]) == 0
     err = capsys.readouterr().err
     tables.arrow.cache_clear()
-    assert 'no Parquet file, the CSV file has it all: pyarrow' in err and err.count('\n') == 1
+    assert 'only CSV, no Parquet file: pyarrow' in err and err.count('\n') == 1
     assert not (tmp_path / 'out' / 'sweep.parquet').exists()
     assert (tmp_path / 'out' / 'sweep.csv').read_text() == (
         tmp_path / 'with' / 'sweep.csv').read_text()

@@ -157,14 +157,14 @@ def find_medium(problem: Problem, progress: Progress) -> Medium | None:
     air = problem.linear
     if not (_is_magnified(air, lens, air) if free else rms_px(air) > _SUSPICIOUS_PX):
         return None
-    progress('asking whether the camera looks into another medium', 0.02)
+    progress('testing for another medium in front of the camera', 0.02)
     curve = Linearization(data, fit_free_curve(data, base), ())
     if not (_is_magnified(air, lens, curve) or _leaves_room_for_port(air, curve)):
         return None
     known = InAir.from_lens(lens)
     media = [_assess_port(table, lens, start_port(data, lens), free, 0.0)]
     if known is not None:
-        progress('asking what photographs in air left open of the lens', 0.03)
+        progress('computing the uncertainty of the calibration in air', 0.03)
         wet = _correct_lens(table, lens, known)
         distance = 0.0 if wet is None else known.squared_distance(wet)
         media.append(_assess_port(table, lens, wet, free, distance))

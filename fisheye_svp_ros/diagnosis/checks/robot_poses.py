@@ -49,8 +49,8 @@ def find_hand_eye(linear: Linearization, poses: dict[int, Pose]) -> HandEye:
         return fit_hand_eye(data, linear.state, linear.free, *flange_poses(data, poses))[1]
     except GeometryError as cause:
         raise ObservationError(
-            f'{data.observations.source}: the given poses are not those of the camera in the '
-            f'world, nor of a flange that carries it: {cause}; or leave the poses out') from cause
+            f'{data.observations.source}: the given poses fit neither the camera in the world nor '
+            f'a flange that carries it: {cause}; or leave the poses out') from cause
 
 
 def misfit_ratio(problem: Problem, poses: dict[int, Pose]) -> float:

@@ -196,7 +196,7 @@ def agree_on_target(
     """Ask the cameras of a rig whether they agree on the target; give up what they do not."""
     if selection.null.linear.data.cameras < 2:
         return selection, []
-    progress('validating each camera by the other', 0.78)
+    progress('cross-camera validation', 0.78)
     pairs, problem = compare_cameras(selection), selection.problem
     gone = tuple(e.name for e, _, _ in selection.causes
                  if e.stage == 'target' and e.name not in problem.options.included)

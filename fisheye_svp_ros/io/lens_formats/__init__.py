@@ -68,8 +68,7 @@ def read_foreign(path: str | Path, text: str) -> Foreign | None:
             return read(text, str(path))
     for name, mark in UNREADABLE_FORMATS.items():
         if re.search(mark, text, re.MULTILINE):
-            raise LensError(f'{path}: this is {name}, which cannot be read; those of {READABLE} '
-                            'can be')
+            raise LensError(f'{path}: {name} cannot be read; readable are {READABLE}')
     return None
 
 

@@ -90,7 +90,8 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     edge = np.abs(plane).max(axis=0)
     degrees = int(np.ceil(np.degrees(4 * np.arctan(edge[0] / 2))))
     if degrees >= 360:
-        raise LensError(f'lens {lens.name!r}: no splined model sees so far behind the camera')
+        raise LensError(f'lens {lens.name!r}: a splined model cannot reach its max_incidence_deg, '
+                        'so far behind the camera')
     spacing = _spacing(columns, degrees)
     rows = int(np.ceil(2 * edge[1] / spacing)) + _MARGIN_NODES
     focal, centre = np.array([lens.fx, lens.fy]), np.array([lens.cx, lens.cy])

@@ -33,8 +33,8 @@ def read(text: str, where: str) -> Foreign:
     """Read the lens; raises LensError, naming the line that is missing."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != '#']
     if len(lines) < len(_LINES):
-        raise LensError(f'{where}: {_LINES[len(lines)]} is missing; whole is OCamCalib\'s '
-                        'calib_results.txt with its five lines of numbers')
+        raise LensError(f'{where}: {_LINES[len(lines)]} is missing; calib_results.txt of '
+                        'OCamCalib has five lines of numbers')
     try:
         rows = [np.array([float(word) for word in line.split()]) for line in lines]
         direct, (row, column) = rows[0], rows[2]

@@ -44,7 +44,7 @@ def kannala_brandt(
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx, cy or k1 to k4 are incomplete') from cause
     if not all(abs(value) < MAX_NUMBER for value in curve.coefficients):
-        raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no lens has these')
+        raise LensError(f'{where}: k1 to k4 are {curve.coefficients}; no real lens has these')
     if not (width.is_integer() and height.is_integer()):
         raise LensError(f'{where}: the image size is {width} x {height}; whole numbers are needed')
     lens = Lens(name, int(width), int(height), fx, fy, cx, cy, curve, np.nan, shift,
@@ -68,7 +68,7 @@ def fit_curve(
     except (TypeError, ValueError, OverflowError) as cause:
         raise LensError(f'{where}: size, fx, fy, cx or cy are incomplete') from cause
     if not (np.isfinite([width, height, cx, cy, limit]).all() and 0 < min(fx, fy) < np.inf):
-        raise LensError(f'{where}: image size or intrinsics are no numbers of a lens')
+        raise LensError(f'{where}: image size or intrinsics are no valid numbers')
     corner = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
     theta = np.linspace(0.0, limit, _GRID)[1:]
     heights = curve(theta)
@@ -82,7 +82,7 @@ def fit_curve(
     powers = theta[:, None] ** np.arange(1, 10, 2)
     scale, *rest = np.linalg.lstsq(powers, heights, rcond=None)[0].tolist()
     if not scale > 0:
-        raise LensError(f'{where}: no fisheye curve is near the projection')
+        raise LensError(f'{where}: no fisheye curve fits the projection')
     worst = float(np.abs(powers @ [scale, *rest] - heights).max() * max(fx, fy))
     lens = kannala_brandt(name, size, (scale * fx, scale * fy, cx, cy),
                           [value / scale for value in rest], where, shift)
@@ -98,8 +98,8 @@ def nearest_kannala_brandt(lens: Lens) -> Lens:
         lens.name, (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy),
         lambda theta: value(theta)[0], lens.max_incidence, lens.name, lens.viewpoint_shift)
     if worst > _TOLERANCE:
-        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any that this form '
-                        'knows; calibrate it as kannala_brandt')
+        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any curve of this '
+                        'format; calibrate it as kannala_brandt')
     return found
 
 

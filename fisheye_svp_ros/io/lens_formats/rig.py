@@ -28,6 +28,6 @@ def read(text: str, where: str) -> Foreign:
                                 fields.numbers(entry, 'quaternion', 4, place), place))
     for one, other in itertools.pairwise(names):
         if one.partition('_in_')[2] != other.partition('_in_')[0]:
-            raise LensError(f'{where}: {other} does not go on where {one} ends')
+            raise LensError(f'{where}: {other} does not continue where {one} ends')
     cameras = (*(name.partition('_in_')[0] for name in names), names[-1].partition('_in_')[2])
     return Foreign('rig', {}, tuple(rigs), {}, cameras)

@@ -98,7 +98,7 @@ def lens_of(
         with np.errstate(all='ignore'):
             return _lens_of(model, size, intrinsics, d, name, where)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
-        raise LensError(f'{where}: its numbers make no lens ({cause})') from cause
+        raise LensError(f'{where}: its numbers are no valid lens ({cause})') from cause
 
 
 def _lens_of(
@@ -119,8 +119,8 @@ def _lens_of(
     distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
     lens, worst = nearest_lens(name, size, intrinsics, distortion, where)
     if not worst <= _TOLERANCE:
-        raise LensError(f'{where}: no lens here comes nearer than {worst:.2g} px to this {model}; '
-                        'calibrate it again, as equidistant')
+        raise LensError(f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
+                        'again, as equidistant')
     return lens, worst
 
 
