@@ -17,7 +17,7 @@ from fisheye_svp_ros.nodes.signals import SignalHandler
 from fisheye_svp_ros.nodes.watcher import Watcher
 
 SIGNALS = signal.SIGINT, signal.SIGTERM
-RECORDED = 'no message came on a topic that is recorded, and nothing is kept'
+RECORDED = 'no message arrived on a recorded topic, so nothing is kept'
 
 
 @pytest.fixture(autouse=True)
