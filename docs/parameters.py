@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.parameters import Row  # noqa: E402
 from fisheye_svp_ros.nodes import NODES, executables  # noqa: E402
 
 _TABLE = '<!-- parameters of {node} -->\n{table}<!-- end -->'
-_SHARED = 3  # nodes
+_SHARED = 2  # nodes
 _COMMON = 'several nodes'
 
 
@@ -47,14 +47,14 @@ def node_section(table: list[Row], common: list[Row]) -> str:
     """Return what nodes.md says of the parameters of one node."""
     own = [row for row in table if row not in common]
     names = ', '.join(f'`{row.name}`' for row in table if row in common)
-    shared = textwrap.fill(f'[Of several nodes](#parameters-of-several-nodes): {names}.', 100,
+    shared = textwrap.fill(f'[Common parameters](#common-parameters): {names}.', 100,
                            break_long_words=False, break_on_hyphens=False)
     return '\n'.join([*([markdown(own)] if own else []), *([shared + '\n'] if names else [])])
 
 
 def parameter_file(node: str, table: list[Row]) -> str:
     """Return a commented parameter file that holds the defaults."""
-    lines = [f'# Parameters of {node}, with their defaults.  docs/reference/nodes.md says more.',
+    lines = [f'# Parameters of {node}, with their defaults; see docs/reference/nodes.md.',
              '/**:', '  ros__parameters:']
     for row in table:
         unit = f' [{row.unit}]' if row.unit else ''

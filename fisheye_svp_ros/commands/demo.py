@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> None:
     note_formats()
     _print(rows)
     print_remaining(f'A pair of {args.lenses[0]}, rectified at {range_text(pair.left.range)}: '
-                    'rows of left and right differ by', apart)
+                    'difference between the rows of left and right', apart)
     print(f'  {"recording, " if bag else ""}table, pictures: {args.output}')
 
 

@@ -16,7 +16,7 @@ from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.simulate.render import Exposure, Print
 from fisheye_svp_ros.simulate.targets import board, board_views
 
-_README = """# Twenty photographs of a bent board
+_README = """# Fourteen photographs of a bent board
 
 Rendered, with noise, through a fisheye lens whose viewpoint moves (e0 = 4 mm), of a chessboard
 that stands out by 1.5 mm in the middle.  `truth/` holds lens, poses and true corners.
@@ -39,11 +39,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Render the photographs, write the truth and a README."""
-    lens = Lens('example', 640, 600, 213.8, 214.0, 320.4, 298.7,
+    lens = Lens('example', 480, 450, 160.3, 160.5, 240.4, 223.7,
                 KannalaBrandt(-0.010, 0.004, -0.0015, 0.0), np.radians(94.0), Gennery(e0=0.004))
     printed = Print(9, 6, 0.025)
     printed = Print(9, 6, 0.025, bow=parabola(printed.corners, 0.0015))
-    poses = board_views(lens, printed, 20, (0.10, 0.30), np.random.default_rng(1))
+    poses = board_views(lens, printed, 14, (0.10, 0.30), np.random.default_rng(1))
     truth = args.output / 'truth'
     with write_together():
         write_photographs({'': (lens, identity())}, board(printed), poses, Exposure(), 0,

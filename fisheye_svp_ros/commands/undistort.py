@@ -100,8 +100,8 @@ def run(args: argparse.Namespace) -> None:
     for name, side in sides.items():
         _print_camera(side, name, left.get(name))
     if pair and rows:
-        print_remaining(f'baseline {1000 * pair.baseline:.2f} mm; rows of left and right differ '
-                        'by', rows)
+        print_remaining(f'baseline {1000 * pair.baseline:.2f} mm; difference between the rows of '
+                        'left and right', rows)
         print(f'  {tolerated_text(rows)}')
     print(f'{args.output}: {sum(counts.values())} photographs, maps for cv2.remap')
 
@@ -217,8 +217,8 @@ def _print_camera(side: Rectification, name: str, left: Remaining | None) -> Non
           f'{camera.f:.2f} px, {np.degrees(camera.field_of_view):.1f} deg wide; '
           f'{100 * side.maps.mask.mean():.1f} % of the pixels lie in its field of view')
     if left is None:
-        print('  the lens has one viewpoint: the maps hold at every range')
+        print('  the lens has one viewpoint: the maps are exact at every range')
         return
-    print_remaining(f'{f"{name}: " * bool(name)}the maps hold at {range_text(side.range)}; '
-                    'elsewhere the shift leaves', left)
+    print_remaining(f'{f"{name}: " * bool(name)}the maps are exact at {range_text(side.range)}; '
+                    'error at other ranges', left)
     print(f'  {tolerated_text(left)}')

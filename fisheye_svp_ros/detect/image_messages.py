@@ -87,7 +87,7 @@ def _samples(message: Any, name: str) -> tuple[_Encoding, NDArray[Any]]:
     data, height, step = bytes(message.data), message.height, message.step
     width = message.width * encoding.channels * dtype.itemsize
     if not 0 < width <= step or not 0 < step * height * (1 + encoding.planes) <= len(data):
-        raise ObservationError(f'{name}: {len(data)} bytes are too few for an image of '
+        raise ObservationError(f'{name}: {len(data)} bytes do not hold an image of '
                                f'{message.width}x{height} {message.encoding}')
     rows = np.frombuffer(data, np.uint8)[:step * height]
     rows = np.ascontiguousarray(rows.reshape(height, step)[:, :width])

@@ -88,5 +88,5 @@ def interval(low: float, high: float) -> str:
 def noise_text(sigma: float | None) -> str:
     """Say what noise the standard errors rest on: sigma, px, estimated, or None if given."""
     if sigma is None:
-        return 'standard errors for the sigma that the observations bring'
-    return f'standard errors for {sigma:.4f} px in u and in v, estimated from the residuals'
+        return 'standard errors from the sigma of the observations'
+    return f'standard errors from {sigma:.4f} px in u and in v, estimated from the residuals'

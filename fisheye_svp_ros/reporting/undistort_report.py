@@ -79,7 +79,7 @@ def _remaining(
 
 def print_remaining(title: str, left: Remaining) -> None:
     """Print the errors by range."""
-    header = ['range', 'median, px', '95 %, px', 'worst, px']
+    header = ['range', 'median, px', '95 %, px', 'largest, px']
     rows = [[range_text(r), *(_number(value, 3) for value in row)]
             for r, row in zip(left.ranges, left.table, strict=True)]
     if left.depth is not None:

@@ -65,7 +65,7 @@ def test_the_command_calibrates_all(
     assert cli.main(['calibrate', str(tmp_path / 'obs.csv'), '--image-size', '1280x800',
                      '-o', str(out)]) == 0
     printed = capsys.readouterr().out
-    assert 'rig: cameras in cam0, from 36 frames that several of them saw' in printed
+    assert 'rig: cameras in cam0, from 36 frames that several cameras see' in printed
     assert cameras_in(out) == CAMERAS  # rig, camchain and tf_static are no lenses
     assert load_lens(f'{out}/#cam3').name == 'cam3'
     assert len(load_rigs(out / 'rig.yaml')) == 3

@@ -138,7 +138,7 @@ class TestLocalize:
         assert 'estimated from the residuals' in out
         assert err == ''
         assert cli.main(['localize', str(folder / 'given.csv'), '--lens', lens]) == 0
-        assert 'the sigma that the observations bring' in capsys.readouterr().out
+        assert 'the sigma of the observations' in capsys.readouterr().out
 
     def test_the_standard_errors_are_those_of_the_worst_direction(self, output, scene, capsys):
         folder, _, _ = scene

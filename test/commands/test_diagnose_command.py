@@ -424,7 +424,7 @@ class TestWords:
     def test_many_causes_are_counted(self, found):
         wrong, *_ = verdict_sentences(with_changes(found, causes=5 * found.causes))
         assert wrong.count('viewpoint_shift') == 3
-        assert 'and for 2 more reasons in the table' in wrong
+        assert 'the table lists 2 more causes' in wrong
 
     def test_parameters_that_the_data_leave_open_are_not_shown(self, found):
         entry = {'value': 0.1, 'stderr': 1e20, 'unit': '1'}

@@ -22,10 +22,15 @@ from fisheye_svp_ros import cli
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 _BLOCK = re.compile(r'<!-- a test runs this -->\n```(?:ba)?sh\n(.*?)```', re.DOTALL)
 _COMMAND = re.compile(r'^ *fisheye-svp (.*?)(?:  +#.*| [|&>;].*)?$', re.MULTILINE)
-BLOCKS = [
-    pytest.param(block, id=f'{page.name} {number}')
+_ALL = {
+    f'{page.name} {number}': block
     for page in PAGES
     for number, block in enumerate(_BLOCK.findall(page.read_text()))
+}
+# A block that another one begins with runs there.
+BLOCKS = [
+    pytest.param(block, id=name) for name, block in _ALL.items()
+    if not any(other != block and other.startswith(block) for other in _ALL.values())
 ]
 
 
@@ -55,7 +60,7 @@ def test_commands_run_as_they_stand(block: str, tmp_path: Path, ros_domain: int)
                                    start_new_session=True, stdout=stream,
                                    stderr=subprocess.STDOUT)
         try:
-            status = process.wait(120)
+            status = process.wait(300)
         finally:
             with suppress(ProcessLookupError):  # what a block that failed has left behind
                 os.killpg(process.pid, signal.SIGKILL)

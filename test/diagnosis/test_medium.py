@@ -86,7 +86,7 @@ def test_what_photographs_in_air_left_open_of_the_lens_is_found_under_water():
     heights = [one.fx * one.image_height.value_and_slope(theta)[0] for one in (found.lens, AIR)]
     assert heights[0] == pytest.approx(heights[1], rel=0.01)
     assert found.figures.extended.heldout_rms_px < 0.2
-    assert any('leaves open' in advice.what for advice in found.advice)
+    assert any('errors of its calibration' in advice.what for advice in found.advice)
     assert 'diagnose the photographs in air first' in verdict_sentences(found)[2]
 
 

@@ -292,7 +292,7 @@ def test_data_that_stop_are_missed_until_they_come_again(hour: Hour) -> None:
         hour.reports.clear()
         g.until(lambda: (points.publish(image_points()), any(
             m.status[0].message == 'all inputs usable' for m in hour.reports))[1])
-        if 'nobody' in stopped:
+        if 'gone' in stopped:
             g.probe.destroy_publisher(points)
         hour.says(stopped)
         hour.reports.clear()

@@ -157,7 +157,7 @@ def test_an_argument_wins_over_what_files_say_of_the_node(
                       '/robot/localizer: {ros__parameters: {lens: fish214}}\n')
     mono = launch('mono.launch.py', 'namespace:=robot', 'lens:=fish180', 'svp:=false',
                   f'localizer_params:={params}')
-    mono.wait_for(r'solving with the lens fish180 as it stands \(svp: false\)')
+    mono.wait_for(r'solving with the lens fish180 with its viewpoint shift \(svp: false\)')
 
 
 @pytest.mark.parametrize('composed', ['true', 'false'])

@@ -132,10 +132,10 @@ def test_a_parameter_of_ros_itself_starts_nothing_over(start: Callable[..., Any]
 
 @pytest.mark.parametrize(('arguments', 'solves_svp', 'said'), [
     ((), True, 'the lens that scenario names without its viewpoint shift (svp: auto)'),
-    (('lens:=fish180',), False, 'the lens fish180 as it stands (svp: auto)'),
+    (('lens:=fish180',), False, 'the lens fish180 with its viewpoint shift (svp: auto)'),
     (('lens:=fish180', 'svp:=true'), True, 'lens fish180 without its viewpoint shift (svp: true)'),
     (('lens:=fish180', "svp:='true'"), True, 'without its viewpoint shift (svp: true)'),
-    (('svp:=false',), False, 'the lens that scenario names as it stands (svp: false)'),
+    (('svp:=false',), False, 'the lens that scenario names with its viewpoint shift (svp: false)'),
 ])
 def test_a_node_says_which_lens_it_solves_with(
     arguments: tuple[str, ...], solves_svp: bool, said: str, start: Callable[..., Any],
