@@ -55,7 +55,7 @@ KINDS = {
     'ReplaceComparisonOperator': 'another comparison',
     'ReplaceBinaryOperator': 'another arithmetic operator',
     'ReplaceUnaryOperator': 'a sign or a `not`',
-    'AddNot': 'a condition turned round',
+    'AddNot': 'an inverted condition',
     'Replace': 'a constant or keyword replaced',
 }
 
@@ -233,30 +233,29 @@ def _kind(operator: str) -> str:
 def report(mutants: list[Mutant], verdicts: dict[str, str], command: str) -> str:
     """Return the page: a table by room, and the survivors by their fault."""
     rooms: dict[str, Counter[bool]] = {room: Counter() for room in ROOMS}
-    alive: dict[str, list[tuple[Mutant, str]]] = {}
+    alive: dict[str, list[Mutant]] = {}
     for mutant in mutants:
         said = verdicts[_key(mutant)]
         lives = said.startswith(('survived', 'nothing'))
         rooms[mutant.room][lives] += 1
         if lives:
-            alive.setdefault(_kind(mutant.operator), []).append((mutant, said))
+            alive.setdefault(_kind(mutant.operator), []).append(mutant)
     total: Any = sum(rooms.values(), Counter())
     lines = [
         '# Which faults the tests find', '',
-        f'`{command}` puts one small fault at a time into a copy of the package and runs the '
-        'tests that reach it.', '',
+        f'`{command}` puts one small fault at a time into the package and runs the tests that '
+        'reach it.', '',
         '| room | mutants | found | share |', '|---|---|---|---|',
     ]
     for room, count in [*rooms.items(), ('all', total)]:
         tried = count.total()
         if tried:
             lines.append(f'| {room} | {tried} | {count[False]} | {count[False] / tried:.0%} |')
+    lines += ['', '| not found | faults | file and line |', '|---|---|---|']
     for kind, ones in sorted(alive.items()):
-        lines += ['', f'## Not found: {kind}', '']
-        lines += [
-            f'- `{m.path}`, line {m.line}: {m.operator.removeprefix("core/")}, {said}'
-            for m, said in sorted(ones)
-        ]
+        places = ', '.join(f'`{m.path.removeprefix("fisheye_svp_ros/")}` {m.line}'
+                           for m in sorted(ones))
+        lines.append(f'| {kind} | {len(ones)} | {places} |')
     return '\n'.join(lines) + '\n'
 
 

@@ -16,7 +16,7 @@ from fisheye_svp_ros.optics.engines import VARIABLE
 ONE_CORE = ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'NUMBA_NUM_THREADS')
 _OV_PLANE = Path(__file__).parents[3] / 'shared' / 'data' / 'ov_plane'
 _TEXT = (
-    'Each once, as a process of its own with all cores; the observations are real ones, ov_plane.'
+    'Each once, with all cores; the observations are those of ov_plane.'
 )
 
 

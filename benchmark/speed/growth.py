@@ -27,9 +27,8 @@ from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.solve.stereo_calibration import calibrate_stereo
 
-_TEXT = """Time is the median of repeats in turns, memory the peak of what was allocated on top (as
-tracemalloc sees it); the engine is NumPy. The exponents are fitted over
-all sizes: 1 is proportional growth."""
+_TEXT = """Median time and peak of newly allocated memory, NumPy engine; an exponent of 1 is
+proportional growth."""
 
 
 class Growth(NamedTuple):

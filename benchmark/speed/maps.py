@@ -18,7 +18,7 @@ from fisheye_svp_ros.rectify.maps import Maps, Rectification
 
 OPENCV = 'cv2.fisheye.initUndistortRectifyMap'
 _SIZE, _FIELD = (1280, 800), np.radians(100.0)
-_TEXT = 'To a pinhole camera 100 degrees wide; float32, ours with a mask.'
+_TEXT = 'To a pinhole camera 100 degrees wide, float32.'
 
 
 def rows(repeats: int = 15) -> list[Row]:

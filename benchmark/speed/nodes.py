@@ -15,17 +15,15 @@ from fisheye_svp_ros.nodes import NODES
 from fisheye_svp_ros.optics.engines import VARIABLE
 
 _GOAL = 1e-3  # s that a localizer may add
-_TEXT = """From `image_points` in to `~/pose` out, through a localizer (33 landmarks, ShiftVP) and
-through a node that answers each set at once with a pose it has not looked for: separate processes
-on loopback, the same messages, in turns. "Adds" is the difference of the medians. Throughput: the
-highest rate at which every set of one second was answered; then the first at which not, and how
-many were. All topics are reliable with a depth of 100."""
+_TEXT = """Latency from `image_points` to `~/pose` of a localizer (33 landmarks, ShiftVP) and of an
+echo node that answers at once, in processes of their own on loopback. Throughput: the highest rate
+at which all sets were answered, then the first at which not, and how many."""
 _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 _START_GOAL = 1.0  # s from the first import to a node that is ready
 _STARTS = 9
 _WITH_FILES = ('measured_camera', 'rectifier')  # which cannot start without any
-_START_TEXT = f"""From the first import to a node that is ready, its lens loaded: medians of
-{_STARTS} starts in turns, on the clock and of processor time, with Python's own start in it."""
+_START_TEXT = f"""From the start of Python to a node that is ready, its lens loaded: medians of
+{_STARTS} starts, wall clock and processor time."""
 _START = """
 import sys, time
 begun = time.perf_counter()

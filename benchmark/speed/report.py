@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import textwrap
 from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -18,17 +19,12 @@ _WORDS = ('what', 'node', 'version', 'who', 'notes', 'work', 'that grows', 'comm
           'engine', 'against')
 _HEAD = """# Benchmarks
 
-Written by `make bench`, which runs `{command}` in an environment of its own
-(`benchmark/requirements.txt`); no peer is a dependency of this package.
+`make bench` runs `{command}` in its own environment (`benchmark/requirements.txt`).
 
-All sides of a table do the same work with the same lens (of `config/lenses`), the same data with
-{noise} px of noise, and the same start unless a note says otherwise; they run in one process in
-turns of 20 ms or, where that takes longer, of one call, on one core unless said otherwise. Figures
-are medians over the turns, of processor time unless said otherwise. "Off" is the largest distance
-of a result from that of the common answer: image points from those of the NumPy engine, poses and
-rigs from those of SciPy's `least_squares` with tolerances of 1e-14 and a last Gauss-Newton step
-(SciPy compares sums of squares, which cannot tell poses 1e-10 m apart). Ratios say how many times
-faster the package is than the peer in that line.
+All rows of a table do the same work with the same lens, data ({noise} px of noise) and start,
+unless a note says otherwise, in turns on one core. Times are medians of processor time. "Off" is
+the largest distance of a result from the reference: the NumPy engine for image points, SciPy's
+`least_squares` with tolerances of 1e-14 for poses and rigs.
 """
 
 
@@ -46,10 +42,10 @@ def document(command: str, noise: float, sections: Sequence[Row | Table]) -> str
     """Return the report as Markdown."""
     rows = [section for section in sections if isinstance(section, Row)]
     parts = [_HEAD.format(command=command, noise=noise)]
-    tables = [versions(), goals(rows), *(
+    tables = [goals(rows), *(
         of_row(section) if isinstance(section, Row) else section for section in sections
     )]
-    return '\n'.join([*parts, *(markdown(table) for table in tables)])
+    return '\n'.join([*parts, versions(), *(markdown(table) for table in tables)])
 
 
 def markdown(table: Table) -> str:
@@ -70,8 +66,8 @@ def number(value: float) -> str:
     return f'{value:.0f}' if value >= 100 else f'{value:.3g}'
 
 
-def versions() -> Table:
-    """Say what was compared, and on what."""
+def versions() -> str:
+    """Return a paragraph of what was compared, and on what."""
     found = {'Python': platform.python_version(), 'processor': _processor()}
     for package in _PACKAGES:
         try:
@@ -83,7 +79,8 @@ def versions() -> Table:
             found[name] = look()
         except NotHereError as reason:
             found[name] = str(reason)
-    return Table('Versions', ('what', 'version'), list(found.items()))
+    text = ', '.join(f'{name} {value}' for name, value in found.items())
+    return textwrap.fill(f'Versions: {text}.', 100, break_on_hyphens=False) + '\n'
 
 
 def goals(rows: Sequence[Row]) -> Table:
@@ -102,21 +99,15 @@ def goals(rows: Sequence[Row]) -> Table:
 
 def of_row(row: Row) -> Table:
     """Return the table of one row: a line a side."""
-    ours = [timing.name for timing in row.timings if timing.name.startswith(OURS)]
     compared = any(timing.error is not None for timing in row.timings)
     header = (
-        'who', row.unit, 'quartiles', *([f'off, {row.error_unit}'] if compared else ()),
-        *(f'{name.removeprefix(OURS + ", ")} is faster by' for name in ours), 'notes',
+        'who', row.unit, 'quartiles', *([f'off, {row.error_unit}'] if compared else ()), 'notes',
     )
     lines = []
     for timing in row.timings:
         low, middle, high = (number(value / row.scale) for value in timing.quartiles)
-        ratios = (
-            '' if name == timing.name else f'{number(row.ratio(name, timing.name))} ×'
-            for name in ours
-        )
         off = ['' if timing.error is None else f'{timing.error:.1e}'] if compared else ()
-        lines.append((timing.name, middle, f'{low} to {high}', *off, *ratios, timing.note))
+        lines.append((timing.name, middle, f'{low} to {high}', *off, timing.note))
     notes = [f'{name} did not take part: {why}.' for name, why in row.left_out.items()]
     return Table(row.title, header, lines, row.text, notes)
 

@@ -29,9 +29,8 @@ _CASES = {
 _WORKERS = ('--workers', '2')
 _WATCH = 0.1  # s
 _TEXT = """`fisheye-svp sweep FILE`: one camera, 33 landmarks, swept over `shift_scale`, `radius`,
-`noise_px` and `seed`. A sweep of one scenario is the start; what each further one costs is net of
-it. The short ones are medians of runs in turns with it. Memory: of all processes together, at
-most."""
+`noise_px` and `seed`. Each further scenario: without the start. Memory: maximum of all
+processes."""
 
 
 class Run(NamedTuple):

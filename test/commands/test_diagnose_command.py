@@ -291,7 +291,7 @@ class TestTerminal:
         name = str(scene / 'clean.csv')
         assert ' '.join(twice.out.replace(str(tmp_path / 'twice.csv'), name).split()) == (
             ' '.join(once.split()))
-        assert 'image points are those of an earlier frame: frame 99' in twice.err
+        assert 'image points repeat those of an earlier frame: frame 99' in twice.err
 
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
         assert run('poor.csv', scene) == 0
@@ -376,7 +376,7 @@ class TestWords:
         wrong, _, _ = verdict_sentences(with_changes(
             found, causes=[], advice=[], remaining=left, gross=gross,
             extended=extended))
-        assert '2 points are outliers, furthest frame 4 landmark 17 (12.3 px)' in wrong
+        assert '2 points are outliers, the largest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma states' in wrong
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
@@ -401,7 +401,7 @@ class TestWords:
             found, causes=[cause], advice=[], lenses={'': lens}))[2]
             for lens in (found.lens, shutter)]
         assert told[0] == 'Use extended_lens.yaml; to confirm rolling_shutter: use a tripod.'
-        assert told[1].startswith('Use extended_lens.yaml; it holds rolling_shutter; to')
+        assert told[1].startswith('Use extended_lens.yaml; it includes rolling_shutter; to')
         following = verdict_sentences(with_changes(
             found, causes=[*found.causes, cause], lenses={'': shutter}))[2]
         assert following.count('extended_lens.yaml') == 1

@@ -94,7 +94,7 @@ def confounder(tests):
 
 
 def test_an_effect_with_more_parameters_takes_the_place_of_another_cause(false_tilt):
-    assert confounder(false_tilt) == 'with session_step in place of focal_drift it is not needed'
+    assert confounder(false_tilt) == 'not significant if session_step replaces focal_drift'
 
 
 def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
@@ -106,5 +106,5 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
     monkeypatch.setattr(EffectTests, 'held_out_gain', lambda *_: gain)
     assert not confounder(false_tilt)
     gain = HeldOutGain(1.0, 2.0)
-    assert confounder(false_tilt) == ('with session_step in place of focal_drift it gains nothing '
-                                      'on held-out frames beyond its error')
+    assert confounder(false_tilt) == ('no significant gain on held-out frames if session_step '
+                                      'replaces focal_drift')
