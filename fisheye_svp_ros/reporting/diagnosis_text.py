@@ -211,7 +211,7 @@ def _wrong(d: Diagnosis) -> str:
                 f'frames the residuals are {noise}, without a pattern.')
     if not d.causes:
         return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
-                'effect of the catalogue explains them: '
+                'effect of the catalog explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; because '.join(
         f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'

@@ -408,7 +408,7 @@ class TestWords:
         worse = replace(found.figures.named, heldout_rms_px=2 * found.figures.base.heldout_rms_px)
         refuted = verdict_sentences(with_changes(
             found, causes=[cause], advice=[], lenses={'': shutter}, named=worse))
-        assert 'no correction' in refuted[1]
+        assert 'do not correct' in refuted[1]
 
     def test_a_frame_that_several_cameras_saw_is_named_once(self):
         assert advice_text(Advice('look', frames=[4, 1, 4])) == 'look (frames 4 and 1)'
