@@ -18,7 +18,7 @@ from fisheye_svp_ros.detect.extent import goes_on
 from fisheye_svp_ros.detect.finders import FIRST_LOOKS, default_detector, invert_image
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
-from fisheye_svp_ros.detect.patterns import Pattern, Turn
+from fisheye_svp_ros.detect.patterns import Pattern, Turn, check_of_board
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
 from fisheye_svp_ros.detect.points import SATURATED_SHARE, Points, find_points, full_scale_share
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
@@ -141,11 +141,8 @@ def detect(
     if not any(one.points for one in searched):
         reasons = Counter(one.reason.partition(';')[0] for one in searched).most_common(2)
         said = ', '.join(f'{reason} ({count})' for reason, count in reasons)
-        counted = {'chessboard': ' (inner corners: one less than squares)',
-                   'charuco': ' (squares, columns first) and its dictionary'}
         raise ObservationError(f'{source}: no {pattern.spec} in {len(searched)} photographs: '
-                               f'{said}; check kind and size of the board'
-                               + counted.get(pattern.kind, ''))
+                               f'{said}; {check_of_board(pattern)}')
     return _table(*_moments(searched, sync), pattern, source)
 
 

@@ -224,3 +224,10 @@ def _checks(columns: int, rows: int) -> Array:
     """Return the tint of inner corners: the print's first square is dark, as OpenCV prints it."""
     y, x = np.mgrid[:rows, :columns]
     return np.asarray(-((-1.0) ** (x + y)).ravel())
+
+
+def check_of_board(pattern: Pattern) -> str:
+    """Return what to check where a board is never found."""
+    counted = {'chessboard': ' (inner corners: one less than squares)',
+               'charuco': ' (squares, columns first) and its dictionary'}
+    return f'check kind and size of the board{counted.get(pattern.kind, "")}'

@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.finders import default_detector
-from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
+from fisheye_svp_ros.detect.patterns import Pattern, check_of_board, parse_pattern
 from fisheye_svp_ros.detect.photographs import Pixels, message_pixels
 from fisheye_svp_ros.detect.points import Points, search
 from fisheye_svp_ros.detect.workers import BoundedCalls, TimedOut
@@ -37,6 +37,7 @@ from fisheye_svp_ros.study.settings import Settings
 _RAW, _COMPRESSED = 'image', f'image{COMPRESSED_SUFFIX}'
 _LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
 _MAX_LEAD = 100  # images of which one topic may be ahead of the other
+_MIN_FAILURES = 20  # images without a board before the first with one: it may be another board
 _LOOK = 0.005  # s, how often what a search found is looked for
 
 
@@ -108,6 +109,7 @@ class Detector(BaseNode):
         self._searched: tuple[int, str, Pixels] | None = None
         self._infos = CameraInfos(self.get_logger().info)
         self._misfit = ''
+        self._failures_at_first = 0  # images before the first with a board
         self._counts = {'images overtaken': 0, 'images without board': 0, 'searches ended': 0}
         if self.settings.detections:
             self.listen(_tag_array(), 'detections', self._read_tags, self._publish_tags)
@@ -160,15 +162,23 @@ class Detector(BaseNode):
     def configure(self, pattern: Pattern) -> None:
         """Look for another board from now on."""
         self._pattern, self._near, self._size = pattern, None, None
+        self._failures_at_first = 0
         board = Landmarks(np.arange(len(pattern.points)), pattern.points)
         self._landmarks.publish(messages.landmarks_message(board, 0, self.settings.board_frame))
 
     def report(self) -> tuple[dict[str, object], str]:
         """Return how many images were overtaken, and how many showed no board."""
+        trouble = self._misfit or self._missing_board()
         if self._guiding is None:
-            return dict(self._counts), self._misfit
-        guide, trouble = self._guiding.report()
-        return {**self._counts, **guide}, self._misfit or trouble
+            return dict(self._counts), trouble
+        guide, more = self._guiding.report()
+        return {**self._counts, **guide}, trouble or more
+
+    def _missing_board(self) -> str:
+        if self._size is not None or self._failures_at_first < _MIN_FAILURES:
+            return ''
+        return (f'image: no {self.settings.board} in the first {self._failures_at_first} images; '
+                + check_of_board(self._pattern))
 
     def _take(self, stamp: int, image: Unread) -> None:
         """Keep the newest image, if anybody wants to know what is in it."""
@@ -230,6 +240,9 @@ class Detector(BaseNode):
         else:
             self._near = None
             self._counts['images without board'] += 1
+            self._failures_at_first += self._size is None
+            if self._failures_at_first == _MIN_FAILURES and self._size is None:
+                self.get_logger().warning(self._missing_board())
             self._counts['searches ended'] += isinstance(found, TimedOut)
             if isinstance(found, Exception):
                 self.unforeseen(found)

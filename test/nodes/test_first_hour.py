@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from helpers.graph import LATCHED, Graph
+from helpers.graph import LATCHED, Graph, set_parameter
 from helpers.nodes import ROOT
-from helpers.photographs import BOARD
+from helpers.photographs import BOARD, photograph, poses
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -94,6 +94,7 @@ class Hour:
 def hour(graph: Callable[..., Graph], capfd: pytest.CaptureFixture[str],
          monkeypatch: pytest.MonkeyPatch) -> Hour:
     monkeypatch.setattr('fisheye_svp_ros.nodes.base.LIMIT', 0.5)
+    monkeypatch.setattr('fisheye_svp_ros.nodes.detector._MIN_FAILURES', 3)
     return Hour(graph, capfd)
 
 
@@ -232,6 +233,21 @@ def depth_images(hour: Hour, pattern: str) -> None:
     images = g.tell(Image, 'image', SENSOR)
     hour.says(pattern, lambda: images.publish(
         Image(height=1, width=1, encoding='32FC1', step=4, data=b'\0' * 4)))
+
+
+@tries('No board is found: `board` describes another one')
+def another_board(hour: Hour, pattern: str) -> None:
+    g = hour.begin('board:=chessboard:9x6:25mm')
+    g.hear(PointCloud2, 'image_points')
+    node = g.start(Detector)
+    images = g.tell(Image, 'image', SENSOR)
+    told = messages.image_message(photograph(poses(1, 4).take(0)), 7, 'camera')
+    hour.says(pattern, lambda: images.publish(told))
+    hour.logs(pattern)
+    assert set_parameter(node, 'board', BOARD).successful
+    hour.reports.clear()
+    g.until(lambda: (images.publish(told), any(
+        m.status[0].message == 'all inputs usable' for m in hour.reports[1:]))[1])
 
 
 @tries('Wrong poses: camera_info is for another image size')

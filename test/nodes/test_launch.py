@@ -271,6 +271,28 @@ def test_arguments_reach_the_nodes_and_frames_resolve(
     mono.wait_for(r'\[localizer-\d\] .*solving with the lens')
 
 
+def test_frames_are_launch_arguments(graph: Graph, launch: Callable[..., NodeProcess]) -> None:
+    kind = pytest.importorskip('tf2_msgs.msg').TFMessage
+    heard = graph.hear(kind, '/tf')
+    launch('mono.launch.py', 'namespace:=front', 'publish_tf:=true', 'world_frame:=map',
+           'camera_frame:=eye')
+    graph.until(lambda: {(one.header.frame_id, one.child_frame_id)
+                         for message in heard for one in message.transforms}
+                == {('map', 'eye'), ('map', 'eye_true')})
+
+
+def test_a_sweep_that_cannot_be_used_starts_nothing(
+    launch: Callable[..., NodeProcess], tmp_path: Path
+) -> None:
+    sweep = tmp_path / 'sweep.yaml'
+    sweep.write_text('synthetic_camera: {ros__parameters: {sweep.radios: [1]}}')
+    started = launch('sweep.launch.py', f'sweep:={sweep}', f'bag:={tmp_path / "bag"}')
+    assert started.finish() != 0
+    text = '\n'.join(started.lines)
+    assert 'sweep.radios: no such parameter to sweep' in text and 'process started' not in text
+    assert not (tmp_path / 'bag').exists()
+
+
 def test_a_rig_and_its_points_resolve(
     graph: Graph, launch: Callable[..., NodeProcess]
 ) -> None:
