@@ -18,13 +18,19 @@ T = TypeVar('T')
 
 
 class Registry(Mapping[str, T]):
-    """Kinds by name; what: the last word of the group of entry points; base: of every class."""
+    """Kinds by name; what: the last word of the group of entry points; base: of every class.
 
-    def __init__(self, what: str, own: Mapping[str, T], base: type) -> None:
-        self._what, self._own, self._base = what, own, base
+    unlisted: kinds that are found by name, and are not among all.
+    """
+
+    def __init__(
+        self, what: str, own: Mapping[str, T], base: type, unlisted: Mapping[str, T] | None = None
+    ) -> None:
+        self._what, self._own, self._base, self.unlisted = what, own, base, unlisted or {}
 
     def __getitem__(self, name: str) -> T:
-        return self._own[name] if name in self._own else self._entry_points[name]
+        known = {**self.unlisted, **self._own}
+        return known[name] if name in known else self._entry_points[name]
 
     def __iter__(self) -> Iterator[str]:
         return iter((*self._own, *self._entry_points))
@@ -52,7 +58,8 @@ class Registry(Mapping[str, T]):
         except Exception as cause:  # whatever somebody else's module raises
             raise ParameterError(
                 f'{whose} cannot be loaded ({cause}); fix or uninstall it') from cause
-        if entry.name in self._own or getattr(kind, 'name', entry.name) != entry.name:
+        own = {*self.unlisted, *self._own}
+        if entry.name in own or getattr(kind, 'name', entry.name) != entry.name:
             raise ParameterError(
                 f'{whose}: the name is taken, or is not that of its class; rename it')
         if not issubclass(kind if isinstance(kind, type) else type(kind), self._base):

@@ -18,6 +18,7 @@ from fisheye_svp_ros.commands.photographs import (
     search_options,
 )
 from fisheye_svp_ros.commands.plan import view_limits
+from fisheye_svp_ros.commands.ports import add_dome_arguments, dome_of
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
 from fisheye_svp_ros.io.files import write_json, write_together
@@ -55,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='an effect that is known to be present: fit it without a test')
     parser.add_argument('--without', dest='left_out', action='append', default=[], metavar='NAME',
                         help='an effect that is known to be absent: do not test it')
+    add_dome_arguments(parser)
     parser.add_argument('--quick', action='store_true',
                         help='a first answer in seconds: one round on 1500 to 3000 points, '
                         'selection without held-out frames')
@@ -88,6 +90,7 @@ def run(args: argparse.Namespace) -> None:
     given = load_lenses(args.lens)
     if args.count and len(given) > 1:
         raise ParameterError('--next plans the photographs of one camera; give one lens')
+    stated = dome_of(args, given)
     free = True if args.free == 'intrinsics' else None
     observations, lens = _read(args.observations, args, given)
     held_out = _read(args.held_out, args, given)[0] if args.held_out else None
@@ -100,7 +103,7 @@ def run(args: argparse.Namespace) -> None:
         settings: dict[str, Any] = {
             'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
             'options': DiagnosisOptions(
-                tuple(args.included), tuple(args.left_out), args.quick, args.range_m),
+                tuple(args.included), tuple(args.left_out), args.quick, args.range_m, stated),
             'progress': progress,
         }
         try:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 
+from fisheye_svp_ros.effects.dome_port import DomePortEffect
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port
 
 _FORMS = 'flat, flat:5mm:1.49 (glass and its index), dome:60mm, dome:60mm:4mm:1.5 (inner radius)'
@@ -43,6 +46,42 @@ def port_of(args: argparse.Namespace) -> Port | None:
         if wrong := given.check():
             raise ParameterError(f'{option}: {wrong}')
     return port
+
+
+def add_dome_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare --medium and --port of a diagnosis: a dome in air."""
+    parser.add_argument('--medium', metavar='MEDIUM',
+                        help='with --port dome: air; another medium is looked for anyway')
+    parser.add_argument('--port', metavar='SPEC',
+                        help='a dome that the camera looks through: dome:60mm:4mm:1.5 (inner '
+                        'radius, glass, index) or dome, 50 mm with 4 mm of glass; where its '
+                        'center is beside the camera is estimated')
+
+
+def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomePortEffect, ...]:
+    """Return the dome that a diagnosis in air is told of; none where the arguments name no port.
+
+    Raises ParameterError for another port or medium, which is found without being named.
+    """
+    dome = DomePortEffect()
+    if args.port == 'dome':
+        args.port = f'dome:{1e3 * dome.radius:g}mm:{1e3 * dome.thickness:g}mm'
+    port = port_of(args)
+    if port is None:
+        return ()
+    option = ' '.join(f'--{name} {value}' for name, value in (
+        ('medium', args.medium), ('port', args.port)) if value)
+    if not isinstance(port, DomeGlass):
+        raise ParameterError(f'{option}: a flat port is looked for anyway; leave the option out')
+    if port.medium_index != MEDIA['air']:
+        raise ParameterError(f'{option}: a dome is diagnosed in air, with --medium air; in water '
+                             '`calibrate --lens AIR.yaml` with the same options fits it')
+    if not port.thickness:
+        raise ParameterError(f'{option}: glass of no thickness bends nothing in air; state it, as '
+                             'in --port dome:60mm:4mm')
+    if len(lenses) > 1 or any(lens.port is not None for lens in lenses.values()):
+        raise ParameterError(f'{option}: one lens without a port of its own is needed')
+    return (DomePortEffect(port.radius, port.thickness, port.glass_index),)
 
 
 def _index(medium: str) -> float:

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.arrays import Array, Index, flat_rows
 from fisheye_svp_ros.diagnosis.effect_tests import SIGNIFICANCE, EffectTests
 from fisheye_svp_ros.diagnosis.noise_growth import NoiseGrowth
 from fisheye_svp_ros.diagnosis.null_model import PlacedEffect
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import photograph_entry
 from fisheye_svp_ros.solve.outliers import Outliers
+from fisheye_svp_ros.solve.rig_state import rms_px
 
 # An effect is confounded with another unless, with it in the model, the other is still needed.
 CONFOUNDED_P = 0.002
@@ -57,13 +59,43 @@ def selected_causes(
     for (effect, columns, values), (rms, gain) in zip(found, held_out, strict=True):
         name = effect.name
         parameters = parameters_of(effect, values, errors[columns])
+        alike = confounded_effects(tests, name, columns)
         causes.append(Cause(
             name, effect.key, parameters,
             tests.test_removal(tests.null.included_columns, columns, effect).p_value,
-            shares[name], _survives(tests, effect, columns), rms, gain,
-            confounded_effects(tests, name, columns), effect.to_separate,
+            shares[name], _survives(tests, effect, columns), rms, gain, alike,
+            '; '.join([effect.to_separate, *_look_alike_texts(tests, alike, columns)]),
         ))
     return causes
+
+
+def _look_alike_texts(tests: EffectTests, alike: Sequence[str], columns: Index) -> list[str]:
+    """Return how to tell a cause from effects that are not tested, and what they would leave."""
+    return [
+        f'{effect.to_separate}; if it is a {effect.name}, a ray error of '
+        f'{1e3 * _error_of_imitation(tests, at, columns):.2g} mrad remains'
+        for effect, at in tests.null.look_alikes if effect.name in alike
+    ]
+
+
+def _error_of_imitation(tests: EffectTests, true: Index, columns: Index) -> float:
+    """Return the ray error, rad, rms, where an effect is true and a cause is fitted for it.
+
+    true: the border's columns of the effect, of the size that it has in the place of the cause.
+    """
+    null, linear = tests.null, tests.null.linear
+    rest = np.setdiff1d(null.included_columns, columns)
+    values = tests.score_beside(rest, true).estimate * null.scale[true]
+    basis = group_basis(linear.frame_columns)
+
+    def project_out_poses(rows: Array) -> Array:
+        return rows - basis @ (np.swapaxes(basis, -1, -2) @ rows)
+
+    moved = project_out_poses(null.fixed.border[..., true] @ values[:, None])
+    fitted = flat_rows(project_out_poses(null.fixed.border[..., null.included_columns]))
+    inverse, _ = pseudo_inverse(fitted.T @ fitted)
+    remaining = moved.ravel() - fitted @ (inverse @ (fitted.T @ moved.ravel()))
+    return rms_px(linear, remaining.reshape(linear.residual.shape)) / linear.state.lens.focal
 
 
 def parameters_of(effect: Effect, values: Array, errors: Array) -> dict[str, dict[str, Any]]:
@@ -90,19 +122,23 @@ def confounded_effects(tests: EffectTests, name: str, columns: Index) -> list[st
     """Return the effects with which in the model this one would no longer be needed."""
     if CATALOGUE[name].asked_last:
         return []
-    rest = np.setdiff1d(tests.null.included_columns, columns)
+    null = tests.null
+    rest = np.setdiff1d(null.included_columns, columns)
     strength = tests.score_beside(rest, columns).statistic
-    known = tests.null.effect_kinds
+    others = [(one.effect, null.form_columns(one.form), one.score.statistic)
+              for one in tests.candidates(rest)]
+    if CATALOGUE[name].budget_stage() == 'lens':
+        others += [(effect, at, tests.score_beside(rest, at).statistic)
+                   for effect, at in null.look_alikes]
     same: list[str] = []
-    for other in tests.candidates(rest):
-        if known & set(other.effect.kinds) or other.effect.name in (name, *same):
+    for effect, at, statistic in others:
+        if null.effect_kinds & set(effect.kinds) or effect.name in (name, *same):
             continue
-        if other.score.statistic < _CONFOUNDED_SHARE * strength:
+        if statistic < _CONFOUNDED_SHARE * strength:
             continue
-        both = np.concatenate([rest, tests.null.form_columns(other.form)])
-        own = tests.score_beside(both, columns)
+        own = tests.score_beside(np.concatenate([rest, at]), columns)
         if own.p_value > CONFOUNDED_P:
-            same.append(other.effect.name)
+            same.append(effect.name)
     return same
 
 

@@ -34,7 +34,8 @@ class EffectForms:
 
     effects: every form; at: the columns of each (a form of several cameras has those of each);
     columns (F, M, K), whitened; generic (K,): those of the richest forms, of equals all;
-    form_counts: of each name; untestable: why, by name.
+    form_counts: of each name; untestable: why, by name; look_alikes: effects that are not tested,
+    with their columns.
     """
 
     effects: tuple[Effect, ...]
@@ -43,6 +44,7 @@ class EffectForms:
     generic: Index
     form_counts: Mapping[str, int]
     untestable: dict[str, str]
+    look_alikes: tuple[tuple[Effect, Index], ...]
 
     def count_effects(self) -> int:
         """Return how many effects are tested, single landmarks and causes without forms too."""
@@ -52,17 +54,21 @@ class EffectForms:
 def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectForms:
     """Return the columns of the catalogue, without the effects left out."""
     effects, richest, untestable = _catalogue_effects(linear, left_out)
-    ends = np.cumsum([0, *(len(effect.parameters) for effect in effects)])
-    at = [np.arange(*ends[i : i + 2]) for i in range(len(effects))]
-    blocks = [linear.effect_columns(effect) for effect in effects]
+    alike = _look_alikes(linear) if effects else []
+    ends = np.cumsum([0, *(len(effect.parameters) for effect in (*effects, *alike))])
+    at = [np.arange(*ends[i : i + 2]) for i in range(len(ends) - 1)]
+    blocks = [linear.effect_columns(effect) for effect in (*effects, *alike)]
     columns = np.concatenate([np.zeros((*linear.residual.shape, 0)), *blocks], axis=-1)
+    look_alikes = tuple(zip(alike, at[len(effects) :], strict=True))
+    at = at[: len(effects)]
     generic = [own for e, own in zip(effects, at, strict=True) if any(e is r for r in richest)]
     where = np.concatenate([np.zeros(0, dtype=np.int64), *generic])
     for both, theirs in _common_forms(effects, at, linear.data.cameras):
         effects.append(both)
         at.append(theirs)
     form_counts = Counter(effect.name for effect in effects)
-    return EffectForms(tuple(effects), tuple(at), columns, where, form_counts, untestable)
+    return EffectForms(
+        tuple(effects), tuple(at), columns, where, form_counts, untestable, look_alikes)
 
 
 def _catalogue_effects(
@@ -91,6 +97,12 @@ def _catalogue_effects(
                 most = max(len(form.parameters) for form in lasting)
                 richest += [form for form in lasting if len(form.parameters) == most]
     return effects, richest, untestable
+
+
+def _look_alikes(linear: Linearization) -> list[Effect]:
+    """Return effects that are not tested, of each camera, as others may be mistaken for them."""
+    return [form for kind in CATALOGUE.unlisted.values()
+            for own in _forms(kind, linear) for form in own]
 
 
 def simplest_form(kind: type[Effect], linear: Linearization) -> Effect:

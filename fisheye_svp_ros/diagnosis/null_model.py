@@ -250,6 +250,11 @@ class NullModel:
         """Return the border's columns of a form."""
         return self.fixed.forms.at[form] + self.column_count
 
+    @property
+    def look_alikes(self) -> list[tuple[Effect, Index]]:
+        """Effects that are not tested, with their columns of the border."""
+        return [(effect, at + self.column_count) for effect, at in self.fixed.forms.look_alikes]
+
     def prior_precision(self, columns: Index, effect: Effect) -> Array:
         """Return precisions (P,) of an effect's normalized columns: it is hardly beyond large."""
         large = np.array([parameter.large for parameter in effect.parameters])

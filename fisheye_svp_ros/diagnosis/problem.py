@@ -59,7 +59,8 @@ def can_be_included(name: str) -> bool:
 class DiagnosisOptions:
     """Effects to include without a test, effects to leave out, whether time matters most.
 
-    range_m: where ray errors are asked for, m, beside those at 0.3, 1 and 5 m.
+    range_m: where ray errors are asked for, m, beside those at 0.3, 1 and 5 m; stated: forms of
+    effects that are known to be there, which are included as well.
     Raises ParameterError for a name that is in no catalogue, or that cannot be included, and for
     a range that is none.
     """
@@ -68,6 +69,7 @@ class DiagnosisOptions:
     left_out: tuple[str, ...] = ()
     quick: bool = False
     range_m: float | None = None
+    stated: tuple[Effect, ...] = ()
 
     def leave_out(self, *names: str) -> DiagnosisOptions:
         """Return the options with more effects left out."""
@@ -76,6 +78,8 @@ class DiagnosisOptions:
     def __post_init__(self) -> None:
         if self.range_m is not None and not 0 < self.range_m < np.inf:
             raise ParameterError(f'range {self.range_m:g}: a distance in m, above 0, is needed')
+        names = (*self.included, *(effect.name for effect in self.stated))
+        object.__setattr__(self, 'included', tuple(dict.fromkeys(names)))
         for name in (*self.included, *self.left_out):
             if name not in CATALOGUE:
                 known = ', '.join(CATALOGUE)

@@ -293,16 +293,18 @@ def _estimate_forms(
 
 
 def _include_effects(problem: Problem) -> RigState:
-    """Return the fitted state with the causes that the user knows of, in their simplest forms.
+    """Return the fitted state with the causes that the user knows of, in stated or simple forms.
 
     Raises ObservationError for one that the data cannot hold.
     """
     state = problem.base
     if not problem.options.included:
         return state
+    stated = {effect.name: effect for effect in problem.options.stated}
     for name in problem.options.included:
         try:
-            state = with_effect(state, simplest_form(CATALOGUE[name], problem.linear))
+            form = stated.get(name) or simplest_form(CATALOGUE[name], problem.linear)
+            state = with_effect(state, form)
         except Untestable as why:
             raise ObservationError(f'{problem.observations.source}: {name}: {why}') from why
     return adjust(problem.data, state, problem.free)

@@ -29,8 +29,11 @@ def _effect(name: str) -> type[Effect]:
     return kind
 
 
+# Not tested for: only stated by the user, or named as what a cause may be mistaken for.
+_LOOK_ALIKES = ('dome_port',)
 CATALOGUE: Registry[type[Effect]] = Registry(
-    'effects', {name: _effect(name) for name in _MODULES}, Effect)
+    'effects', {name: _effect(name) for name in _MODULES}, Effect,
+    {name: _effect(name) for name in _LOOK_ALIKES})
 
 
 def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:

@@ -36,6 +36,7 @@ _HEADLINES = {
     'decentering': 'The lens is decentered',
     'sensor_tilt': 'The sensor is tilted',
     'flat_port': 'The camera looks through a port',
+    'dome_port': 'The camera is beside the center of its dome',
     'focal_drift': 'The focal length drifts',
     'session_step': 'The intrinsics jump between groups of frames',
     'landmark_survey': 'Single landmarks are displaced',

@@ -27,6 +27,7 @@ from fisheye_svp_ros.library import calibrate
 from fisheye_svp_ros.optics.camera import back_project
 from fisheye_svp_ros.optics.curves import Equidistant
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.ports import DomeGlass
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.outliers import Outliers
 
@@ -355,6 +356,18 @@ class TestCalibrate:
         out = tmp_path / 'lens.yaml'
         refused(capsys, *sized, '--free', 'f,s0', '-o', out)
         assert not out.exists()
+
+    def test_a_diagnosis_is_told_of_a_dome_in_air_alone(self, scene, capsys, tmp_path):
+        air, wet = scene[0] / 'lens.yaml', tmp_path / 'wet.yaml'
+        save_lens(replace(LENS, port=DomeGlass(0.05, 1.0)), wet)
+        base = ('diagnose', scene[0] / 'observations.csv')
+        for lens, options, why in (
+            (air, ('--medium', 'water'), 'a flat port is looked for anyway'),
+            (air, ('--port', 'dome:60mm:4mm'), 'in air, with --medium air'),
+            (air, ('--medium', 'air', '--port', 'dome:60mm'), 'of no thickness'),
+            (wet, ('--medium', 'air', '--port', 'dome'), 'one lens without a port'),
+        ):
+            assert why in refused(capsys, *base, '--lens', lens, *options)
 
     def test_a_lens_without_rays_to_what_was_seen_is_one_line(self, scene, capsys, monkeypatch):
         def trust(*_):

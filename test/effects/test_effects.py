@@ -16,6 +16,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import FlatPort
+from fisheye_svp_ros.optics.ports import DomeGlass
 from fisheye_svp_ros.pose import identity
 from fisheye_svp_ros.scene.observations import views_of
 
@@ -257,3 +258,19 @@ def test_no_motion_is_taken_from_a_pause():
     twist = Scene(views, lens(), pose, np.zeros((7, 3, 2))).twist
     assert twist[:6] == pytest.approx(np.tile(speed, (6, 1)), abs=1e-6)
     assert not twist[6].any()
+
+
+@pytest.mark.parametrize('distance', [0.5, 1e3])
+def test_a_dome_turns_rays_as_its_glass_does(distance):
+    rng = np.random.default_rng(0)
+    points = rng.normal([0.0, 0.0, 1.0], 1.0, (100, 3))
+    points *= distance / np.linalg.norm(points, axis=1, keepdims=True)
+    plain = lens('fish180')
+    glass = DomeGlass(0.05, 1.0, 0.004, -0.003, 0.0, 0.004, 1.5)
+    exact, air, found = (ForwardModel(one, terms).project(points) for one, terms in (
+        (replace(plain, port=glass), ()), (plain, ()),
+        (plain, [(CATALOGUE['dome_port'](0.05, 0.004, 1.5), np.array([0.004, -0.003]))])))
+    seen = exact.valid & found.valid
+    moved = (exact.uv - air.uv)[seen]
+    assert seen.sum() > 50 and np.abs(moved).max() > 0.3
+    assert (found.uv - air.uv)[seen] == pytest.approx(moved, abs=0.03 * np.abs(moved).max())
