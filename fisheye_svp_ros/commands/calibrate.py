@@ -112,6 +112,8 @@ def run(args: argparse.Namespace) -> None:
         _print(one)
         for warning in one.warnings:
             say(warning)
+    if args.output:
+        print(f'{", ".join(map(str, paths.values()))}; report: {report}')
     lenses = {camera: one.lens for camera, one in found.items()}
     if len(lenses) > 1:
         calibrate_cameras(_join_tables([one.table for one in found.values()]), lenses, args.output)

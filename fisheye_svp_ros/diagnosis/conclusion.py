@@ -160,7 +160,8 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         terms = [term for term in linear.state.terms if term[0].name == worst.effect]
         maps = board_maps(linear.data.views, terms, linear.state.lens)
         one = max(maps, key=lambda board: board.peak_to_valley)
-        return f'board {one.board} is bent by {1e3 * one.peak_to_valley:.2g} mm'
+        which = f'board {one.board}' if len(maps) > 1 else 'the board'
+        return f'{which} is bent by {1e3 * one.peak_to_valley:.2g} mm'
     if worst.effect == 'landmark_survey':
         count = len({name.partition('.')[0] for name in worst.parameters})
         return f'{count} landmark{"s are" if count > 1 else " is"} displaced'

@@ -92,12 +92,12 @@ def _drawings(results: Results) -> dict[str, tuple[Any, ...]]:
 
 def _summary(results: Results) -> Iterator[Block]:
     verdicts = results.verdicts()
-    yield Heading("Kita's evaluation of the SVP approximation, beside ours", 1)
+    yield Heading("Kita's evaluation of the SVP approximation, compared with ours", 1)
     yield Text(
         'Kita, Evaluation of 3D Analysis Error Caused by SVP Approximation of Fisheye Lens: every '
-        'printed number beside the one that comes out here, and what the paper did not look at. '
-        'mm, degree and px as the paper prints them; x to the right, y up, the camera gazes '
-        'along -z. Made by: fisheye-svp paper.'
+        'printed number compared with the one computed here, and further evaluations. Units as in '
+        'the paper: mm, degree, px; x to the right, y up, the camera looks along -z. Made by: '
+        'fisheye-svp paper.'
     )
     yield Text(
         f'{results.agreeing(0.10)} of the 36 z and residual cells of tables 1 and 2 lie within '
@@ -113,8 +113,8 @@ def _recovery(results: Results) -> Iterator[Block]:
     yield Text(
         'The lens curves, focal lengths and landmarks are not printed. They were solved for from '
         f'tables 1 and 2 with the exact solver, from {count} starts, {len(fits)} of which '
-        'reproduce at least 35 of the 36 z and residual cells within 10 %. The best one is '
-        'used here; figures 9 and 10 and tables 3 and 4 had no say in it. To repeat the search: '
+        'reproduce at least 35 of the 36 z and residual cells within 10 %. The best one is used '
+        'here; figures 9 and 10 and tables 3 and 4 were not used. To repeat the search: '
         f'{COMMAND}.'
     )
     yield Picture('figure4.png', 'Figure 4: incident angle and viewpoint shift. Bold: used here; '
@@ -134,10 +134,10 @@ def _recovery(results: Results) -> Iterator[Block]:
     yield TableBlock(['lens', 'quantity', 'used', 'all fits'], rows, 2)
     yield Text(
         'Determined: the shift of Fish180 to some tenths of a millimeter over the whole field, '
-        'that of Fish214 up to where the landmarks end (88 degree); beyond, nothing holds it. '
-        'Open: how f and the size of the shift share what the residuals say, the single '
-        'coefficients of the curve, and the place of every single landmark. Fish180 wants the '
-        'largest f that fits its image.'
+        'that of Fish214 up to where the landmarks end (88 degree); beyond, it is undetermined. '
+        'Open: how f and the size of the shift share the residuals, the single coefficients of '
+        'the curve, and the position of every single landmark. Fish180 fits best with the largest '
+        'f that its image allows.'
     )
 
 
@@ -147,7 +147,7 @@ def _localization(results: Results) -> Iterator[Block]:
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 1]]}', 3)
         yield _comparison_table(results, table, SPREADS)
         if table == 1:
-            yield Text('*: the row that is out of line in the paper itself, see below.')
+            yield Text('*: the row that is inconsistent in the paper itself, see below.')
     yield Picture('figure6.png', 'Figure 6: two views of each environment, image points and '
                   'residuals x 100 of Fish180 and Fish214.')
 
@@ -155,16 +155,15 @@ def _localization(results: Results) -> Iterator[Block]:
 def _stopping(results: Results) -> Iterator[Block]:
     study = results.stopping
     off = 100 * study.off
-    yield Heading('The cell that is out of line')
+    yield Heading('The inconsistent cell')
     yield Text(
         'z of Fish180, Whole, 2.0 m is -0.1148 mm in the paper, -0.1614 and -0.1631 mm in the '
-        'rows below it; x, y and the row of Outer at 2.0 m are out of line as well. At the '
-        f'published position the sum of squares is only {100 * study.relative_cost:.1f} % above '
-        'the least one: a solver that stops early may well end there. Two ways of damping were '
-        'tried, from 40 starts within some 20 mm and 2 degree: in proportion to the data '
-        '(Marquardt), and the same for every mm and rad (Levenberg). Each stops when the sum of '
-        'squares falls by less than a limit in a step; the table has the median distance of z '
-        'from the optimum, in %.'
+        'rows below it; x, y and the row of Outer at 2.0 m are inconsistent too. At the published '
+        f'position the sum of squares is only {100 * study.relative_cost:.1f} % above the least '
+        'one: a solver that stops early may end there. Two ways of damping were tried, from 40 '
+        'starts within some 20 mm and 2 degree: in proportion to the data (Marquardt), and the '
+        'same for every mm and rad (Levenberg). Each stops when the sum of squares falls by less '
+        'than a limit in a step; the table has the median distance of z from the optimum, in %.'
     )
     header = ['damping', 'limit, px²', *(
         f'{NAMES[name]} {spread} {RADII[r]}' for name in LENSES
@@ -194,11 +193,11 @@ def _calibration(results: Results) -> Iterator[Block]:
         yield Heading(f'Table {table}: {NAMES[LENSES[table - 3]]}', 3)
         yield _comparison_table(results, table, STYLE_NAMES)
     yield Text(
-        'new: cells that the paper leaves empty. The ten poses are not printed either. The '
-        f'last columns of the list of differences below have what {POSE_SETS} random sets of ten '
-        'poses give: position errors owe at least as much to the poses as to the lens. The row '
+        'new: cells that the paper leaves empty. The ten poses are not printed either. The last '
+        f'columns of the list of differences below are results of {POSE_SETS} random sets of ten '
+        'poses: position errors depend at least as much on the poses as on the lens. The row '
         'divergent, 0.2 m of table 3 repeats y, z and residual of divergent, 2.0 m digit by '
-        'digit, and is taken for a slip.'
+        'digit, probably by mistake.'
     )
 
 
@@ -217,10 +216,10 @@ def _stereo(results: Results) -> Iterator[Block]:
         'Points that one of the two cameras does not see are left out: the rig of Fish214 stands '
         '0.1 m ahead, so that half of the landmarks at 0.2 m are behind it. Error2 is the mean '
         'distance to the epipolar curve; measured within the column, as the drawn lines are, it '
-        'is up to a few times as large, since curves run steeply near the rim. The text has kept '
-        'five of nine captions a lens; each was given to the panel that it fits best, in printed '
-        'order. Error3 is the mean distance of the points halfway between the two rays; points '
-        'near the line through both cameras dominate it.'
+        'is up to a few times as large, since curves run steeply near the rim. The text contains '
+        'five of nine captions per lens; each was assigned to the panel that it fits best, in '
+        'printed order. Error3 is the mean distance of the points halfway between the two rays; '
+        'points near the line through both cameras dominate it.'
     )
     for name, figure in zip(LENSES, (9, 10), strict=True):
         yield Picture(f'figure{figure}.png', f'Figure {figure}: {NAMES[name]}. Left images with '
@@ -228,7 +227,7 @@ def _stereo(results: Results) -> Iterator[Block]:
 
 
 def _claims(results: Results) -> Iterator[Block]:
-    yield Heading('What the text says')
+    yield Heading('Statements of the text')
     yield TableBlock(
         ['section', 'statement', 'verdict', 'numbers'],
         [
@@ -244,9 +243,9 @@ def _solvers(results: Results) -> Iterator[Block]:
     yield Text(
         'The same image points, solved with the ShiftVP lens, with a shift that is 10 % or 30 % '
         'off, and with a shift that was calibrated (with f and the principal point) from 30 views '
-        f'of Whole with {CALIBRATION_NOISE} px of noise, one draw. What a shift is off by, the '
-        'errors keep of those of SVP. What a calibration leaves in z grows with the range: it '
-        'comes from f. All cells are in paper.json.'
+        f'of Whole with {CALIBRATION_NOISE} px of noise, one draw. A shift that is wrong by a '
+        'share leaves the same share of the SVP errors. The z error after a calibration grows '
+        'with the range: it comes from f. All cells are in paper.json.'
     )
     rows = []
     for variant, found in results.found.items():
@@ -278,7 +277,7 @@ def _noise(results: Results) -> Iterator[Block]:
     header = ['lens', 'error', 'landmarks or style', *(f'{n} px' for n in NOISES)]
     yield TableBlock(header, rows, 3)
     yield Picture('noise.png', 'The same as curves; where there is no point, the SVP error is '
-                  'under the noise at 0.2 m already.')
+                               'below the noise even at 0.2 m.')
 
 
 def _differences(results: Results) -> Iterator[Block]:
@@ -308,17 +307,17 @@ def _differences(results: Results) -> Iterator[Block]:
 
 def _reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
-        return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the layout found does '
-                'not follow')
+        return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout does '
+                'not reproduce')
     place = _cell_index(cell, STYLE_NAMES)
     if place[:3] == REPEATED_CELL:
         return 'a row of the paper that repeats another one'
     if low[place] <= cell.published <= high[place]:
-        return 'within what other sets of poses give'
+        return 'within the range of other sets of poses'
     size = max(abs(low[place]), abs(high[place]))
     if abs(cell.published) <= FACTOR * size:
-        return 'of the size that other sets of poses give'
-    return 'beyond what other sets of poses give'
+        return 'of the size of other sets of poses'
+    return 'beyond the range of other sets of poses'
 
 
 def _comparison_table(results: Results, table: int, names: Sequence[str]) -> TableBlock:

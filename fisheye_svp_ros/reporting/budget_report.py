@@ -94,8 +94,8 @@ def answer(points: Sequence[Point], asked: BudgetRequest) -> str:
     remedy = (f'it {neglected} from {needed:.2f} m on' if np.isfinite(needed)
               else 'it fails at every range up to the largest computed one')
     return (
-        f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits, worst the '
-        f'{_LABELS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
+        f'No: {where} {asked.model} breaks {len(broken)} of {len(judged)} limits; the worst is '
+        f'the {_LABELS[worst.quantity]}: {factor * worst.error:.3g} {unit}, '
         f'{worst.error / worst.limit:.1f} times {limit}; with this spread {remedy}'
         + (f'; {untold}.' if unknown else '.')
     )

@@ -133,7 +133,7 @@ def _frames(figure: Any, one: CalibratedCamera) -> None:
 def _uncertainty(figure: Any, one: CalibratedCamera, uv: Array, rays: RayModel) -> None:
     image, angles = figure.subplots(1, 2)
     shown = image.scatter(*uv.T, c=1e3 * rays.sd[-1], s=9, cmap='viridis')
-    figure.colorbar(shown, ax=image, label=f'of a ray at {RANGES[-1]:g} m / mrad')
+    figure.colorbar(shown, ax=image, label=f'standard error at {RANGES[-1]:g} m / mrad')
     _image(image, one.lens)
     axis = rays.points[-1] / np.linalg.norm(rays.points[-1], axis=-1, keepdims=True)
     theta = np.degrees(np.arccos(np.clip(axis[:, 2], -1, 1)))
