@@ -307,8 +307,8 @@ def _differences(results: Results) -> Iterator[Block]:
 
 def _reason(cell: Cell, low: Array, high: Array) -> str:
     if cell.table < 3:
-        return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout does '
-                'not reproduce')
+        return (f'{abs(cell.ours - cell.published):.4f} {cell.unit} that the recovered layout '
+                'does not reproduce')
     place = _cell_index(cell, STYLE_NAMES)
     if place[:3] == REPEATED_CELL:
         return 'a row of the paper that repeats another one'
