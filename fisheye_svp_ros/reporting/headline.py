@@ -23,8 +23,7 @@ TARGET = {
     'measure_again': 'Measure the board, flatten or replace it',
 }
 PHOTOGRAPHS = {
-    'enough': 'Enough photographs', 'more': 'Take more photographs',
-    'retake': 'Take photographs again',
+    'enough': 'Enough', 'more': 'Take more', 'retake': 'Take some again',
 }
 _HEADLINES = {
     'viewpoint_shift': 'The viewpoint of the lens moves',
