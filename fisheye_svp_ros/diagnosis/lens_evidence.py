@@ -21,7 +21,7 @@ from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.lens_errors import InAir, stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.mixed_model import pseudo_inverse
+from fisheye_svp_ros.mixed_model import pseudo_inverse, solve_lower
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.ray_errors import (
     RANGES,
@@ -221,7 +221,7 @@ def _offset(
     noise: px; angles far below it, and what a large change is by more than linear, do not count.
     """
     nearer = min((one[_NEAR_RANGE] for one in off), key=_rms)
-    expected = model.sample()[_NEAR_RANGE]
+    expected = model.sample(_NEAR_RANGE)
     stated = _stated_sample(given, uv)
     if stated is not None and stated.shape == expected.shape:
         expected = expected + stated
@@ -241,16 +241,12 @@ def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     Source: Mahalanobis, On the generalized distance in statistics (1936).
     """
     flat = samples.reshape(-1, samples.shape[-1])
-    floor = floor * np.sqrt(len(flat) / 3)
-    axes, size, _ = np.linalg.svd(flat / np.sqrt(flat.shape[1]), full_matrices=False)
-
-    def distance(angles: Array) -> Array:
-        within = axes.T @ angles
-        rest = (angles**2).sum(axis=0) - (within**2).sum(axis=0)
-        whole = (within**2 / (size**2 + floor**2)[:, None]).sum(axis=0) + rest / floor**2
-        return np.asarray(np.sqrt(np.maximum(whole, 0.0)))
-
-    return float(distance(off.reshape(-1, 1))[0]), distance(flat)
+    covariance = flat @ flat.T / flat.shape[1]
+    covariance[np.diag_indices_from(covariance)] += floor**2 * len(flat) / 3
+    whitened = solve_lower(
+        np.linalg.cholesky(covariance), np.column_stack([off.ravel(), flat]))
+    distances = np.sqrt((whitened**2).sum(axis=0))
+    return float(distances[0]), distances[1:]
 
 
 def _rms(angles: Array) -> float:
@@ -268,5 +264,4 @@ def _stated_sample(lens: Lens, uv: Array) -> Array | None:
     def perturb_lens(step: Array) -> Lens:
         return lens.with_parameters(stated.names, [*(values + step).tolist()])
 
-    sample: Array = ray_model(perturb_lens, stated.covariance, uv)[0].sample(seed=1)[_NEAR_RANGE]
-    return sample
+    return ray_model(perturb_lens, stated.covariance, uv)[0].sample(_NEAR_RANGE, seed=1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Self
 
 import numpy as np
@@ -89,11 +90,19 @@ class ChebyshevHeight:
     @property
     def powers(self) -> tuple[float, ...]:
         """Factors of theta^3, theta^5, ... of the same polynomial."""
-        z = np.polynomial.Polynomial([-1.0, 2.0])
-        inner = np.polynomial.Polynomial(np.polynomial.chebyshev.cheb2poly(self._series()))(z)
-        scaled = zip(inner.coef[1:].tolist(), itertools.count(3, 2), strict=False)
+        inner = self._series() @ _shifted_chebyshev(len(self.values) + 1)
+        scaled = zip(inner[1:].tolist(), itertools.count(3, 2), strict=False)
         return tuple(factor / (2 * self.theta_max**power) for factor, power in scaled)
 
     def _series(self) -> Array:
         signs = (-1.0) ** np.arange(1, len(self.values) + 1)
         return np.concatenate([[-float(np.dot(signs, self.values))], self.values])
+
+
+@cache
+def _shifted_chebyshev(count: int) -> Array:
+    """Return the factors (count, count) of 1, s, s^2 ... in T_0(2s - 1), T_1(2s - 1) ..."""
+    found, z = np.zeros((count, count)), np.polynomial.Polynomial([-1.0, 2.0])
+    for order in range(count):
+        found[order, : order + 1] = np.polynomial.Chebyshev.basis(order)(z).coef
+    return found

@@ -127,6 +127,7 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
             axis.plot(middle, expected, color=INK, lw=1.4, label='noise alone')
             axis.set(yscale='log', ylim=(0.5, None), xlabel='residual / noise')
             axis.set_title(side, color=colour)
+            axis.minorticks_off()
             axis.legend(loc='upper right')
         axes[0].set_ylabel('image coordinates')
 

@@ -19,6 +19,7 @@ OURS, PUBLISHED, FAINT = '#1f5fa8', '#e07b28', '#b8bfc7'
 _STYLE: Any = {
     'font.size': 9.0,
     'axes.titlesize': 10.0,
+    'axes.titley': 1.0,  # or every title asks all ticks for their places, twice a picture
     'axes.spines.top': False,
     'axes.spines.right': False,
     'axes.edgecolor': '#808890',
@@ -31,6 +32,7 @@ _STYLE: Any = {
     'ytick.color': '#404850',
 }
 _LEGEND_COLUMNS = 4
+_COMPRESSION = {'compress_level': 3}  # files 6 % larger than at 6, in a third of the time
 
 
 @contextmanager
@@ -54,7 +56,7 @@ def drawing(file: BytesIO, width: float, height: float, form: str = 'png') -> It
         assert engine is not None
         engine.execute(figure)
         figure.set_layout_engine(None)
-        figure.savefig(file, format=form)
+        figure.savefig(file, format=form, pil_kwargs=_COMPRESSION if form == 'png' else None)
 
 
 def round_number(value: float) -> float:

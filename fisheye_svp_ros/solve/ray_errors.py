@@ -58,20 +58,27 @@ class RayModel(NamedTuple):
 
         difference (R, G, 3), rad: of a lens to this one; None for this lens itself.
         """
-        off = self.sample()
+        draws, (ranges, points, _, count) = self._draw_parameters(0), self.columns.shape
+        columns = self.columns.reshape(ranges, 3 * points, count)
         if difference is not None:
-            off = off + difference[..., None]
-        rms = np.sqrt((off**2).sum(axis=2).mean(axis=1))
+            columns = np.concatenate([columns, difference.reshape(ranges, -1, 1)], axis=-1)
+            draws = np.concatenate([draws, np.ones((1, _SAMPLES))])
+        # The mean square over the points is a quadratic form of the parameters.
+        form = np.swapaxes(columns, -1, -2) @ columns / points
+        rms = np.sqrt(np.maximum((draws * (form @ draws)).sum(axis=1), 0.0))
         return [RayError(range_m, float(np.sqrt((one**2).mean())),
-                         *(float(q) for q in np.quantile(one, (0.025, 0.975))))
+                         *np.quantile(one, (0.025, 0.975)).tolist())
                 for range_m, one in zip(self.ranges, rms, strict=True)]
 
-    def sample(self, seed: int = 0) -> Array:
-        """Return errors (R, G, 3, samples), rad, as the covariance of the parameters has them."""
+    def sample(self, at: int, seed: int = 0) -> Array:
+        """Return errors (G, 3, samples), rad, at one of the ranges, drawn by the covariance."""
+        return np.asarray(self.columns[at] @ self._draw_parameters(seed))
+
+    def _draw_parameters(self, seed: int) -> Array:
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        normal = np.random.default_rng(seed).standard_normal((len(root), _SAMPLES))
-        return np.asarray(self.columns @ (root @ normal))
+        return np.asarray(root @ np.random.default_rng(seed).standard_normal(
+            (len(root), _SAMPLES)))
 
 
 def typical_points(uv: Array) -> Array:
