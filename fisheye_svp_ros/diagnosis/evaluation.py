@@ -27,7 +27,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
-from fisheye_svp_ros.diagnosis.image_fields import WrittenField
+from fisheye_svp_ros.diagnosis.image_fields import CameraField, WrittenField
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
@@ -314,13 +314,29 @@ class Evaluation:
     @cached_property
     def covariance(self) -> Array:
         """Covariance (N, N) of what is shared in the model whose lens is written."""
+        larger = self._error_ratios
+        return self.averaged_model.widen(self._least_covariance * np.outer(larger, larger))
+
+    @cached_property
+    def _least_covariance(self) -> Array:
+        """Covariance (K, K) of what is shared beside the random effects, by this model alone."""
         own = self.null.included_columns
         inverse, _ = pseudo_inverse(self.null.information[np.ix_(own, own)], 1e-13)
-        scale = self.null.scale[own]
-        known = np.sqrt(np.diag(inverse)) / scale
+        return np.asarray(inverse / np.outer(self.null.scale[own], self.null.scale[own]))
+
+    @cached_property
+    def _error_ratios(self) -> Array:
+        """By how much (K,) standard errors are larger than that: other likely models."""
+        known = np.sqrt(np.diag(self._least_covariance))
         larger = np.nan_to_num(self._errors_without_shifts) / np.maximum(known, 1e-300)
-        larger = np.where(known > 0, np.maximum(larger, 1.0), 0.0) / scale
-        return self.averaged_model.widen(inverse * np.outer(larger, larger))
+        return np.where(known > 0, np.maximum(larger, 1.0), 0.0)
+
+    def field_covariance(self, known: CameraField) -> tuple[Array, Array]:
+        """Return the covariance (2 Q, 2 Q), px^2, of a field; with what is shared (N, 2 Q)."""
+        cross = np.zeros((len(self.covariance), len(known.root)))
+        cross[self.averaged_model.place] = (
+            self._error_ratios[:, None] * known.shared @ known.root.T)
+        return known.root @ known.root.T, cross
 
     @cached_property
     def base_quality(self) -> FitQuality:

@@ -2,16 +2,18 @@
 
 It is made of the predicted random effects of the image, with those of frames and target beside
 them in the model.  It is written only where it predicts frames that took no part: every fourth
-frame is left out in turn, and no contiguous third refutes it.  The variances stay as they are.
+frame is left out in turn.  Contiguous thirds that it predicts worse are a warning.  The variances
+stay as they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.averaging import OpenShifts
@@ -33,9 +35,27 @@ from fisheye_svp_ros.optics.lens import Lens
 
 FOLDS, BLOCKS = 4, 3  # every fourth frame; contiguous thirds
 MIN_GAIN = 0.01  # of the rms of frames that are left out
-_BROAD = 'image_broad'  # what poses and intrinsics nearly take up
 _PITCH, _EDGE = 0.6, 2.0  # of the finest grid's: that of the spline, what lies around the bumps
 _DIGITS = 6  # px
+
+
+class CameraField(NamedTuple):
+    """The field of a camera and how well it is known.
+
+    grids: of the bumps that it is made of; root (2 Q, C): of the covariance of their coefficients,
+    px, u and v of each bump in turn; shared (K, C): of that of the model's shared parameters.
+    """
+
+    field: ImageField
+    grids: tuple[ImageGrid, ...]
+    root: Array
+    shared: Array
+
+    def bumps_at(self, uv: Array) -> Array:
+        """Return the values (N, Q) of its bumps at image points (N, 2), px."""
+        every = np.ones(len(uv), dtype=bool)
+        return np.concatenate([bump_values(uv, every, grid.centres, grid.pitch).toarray()
+                               for grid in self.grids], axis=1)
 
 
 @dataclass(frozen=True)
@@ -49,7 +69,7 @@ class WrittenField:
     before: float
     after: float
     refuted: tuple[tuple[int, int], ...]
-    fields: Mapping[int, ImageField]
+    fields: Mapping[int, CameraField]
 
     @classmethod
     def from_selection(cls, selection: Selection, fitted: FittedModel) -> WrittenField | None:
@@ -58,7 +78,7 @@ class WrittenField:
         None where there is nothing to predict, or several cameras have one lens.
         """
         data, lenses = fitted.linear.data, fitted.linear.state.lenses
-        if (not _of_field(fitted).any() or data.frames < 2 * FOLDS
+        if (not fitted.random.grids or data.frames < 2 * FOLDS
                 or data.cameras > len(lenses)):
             return None
         variances, order = selection.null.variances, np.arange(data.frames)
@@ -72,28 +92,18 @@ class WrittenField:
         refuted = tuple((int(mine[0]), int(mine[-1])) for i, (without, with_field)
                         in enumerate(squares) if with_field > without
                         for mine in [numbers[block == i]])
-        return cls(before, after, refuted, {} if refuted else _fields(selection, fitted))
+        return cls(before, after, refuted, _fields(selection, fitted))
 
     def add_to(self, lens: Lens, camera: int) -> Lens:
         """Return the lens of a camera with its field."""
-        field = self.fields.get(camera)
-        return lens if field is None else replace(lens, image_field=field)
+        known = self.fields.get(camera)
+        return lens if known is None else replace(lens, image_field=known.field)
 
     def to_dict(self) -> dict[str, Any]:
         """Return what diagnosis.json holds."""
         return {'written': bool(self.fields), 'without_px': self.before, 'with_px': self.after,
                 'refuted_by_frames': [list(ends) for ends in self.refuted],
-                'rms_px': max((field.rms for field in self.fields.values()), default=0.0)}
-
-
-def _of_field(fitted: FittedModel) -> Mask:
-    """Return which of the shared random columns the field is made of."""
-    mine = np.zeros(len(fitted.random.columns.shared_label), dtype=bool)
-    at = 0
-    for grid in fitted.random.grids:
-        mine[at : at + 2 * len(grid.centres)] = grid.name != _BROAD
-        at += 2 * len(grid.centres)
-    return mine
+                'rms_px': max((one.field.rms for one in self.fields.values()), default=0.0)}
 
 
 def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
@@ -133,34 +143,34 @@ def _predict(
     solution = solve_equations(kept)
     _, unit, shared = kept.equations.split(solution.e[..., None], solution.r[:, None])
     group = np.zeros((int(out.sum()), 6 + columns.group.shape[2], 1))
-    of_field = _of_field(fitted)
+    of_field = (np.arange(len(shared)) < fitted.random.grid_columns)[:, None]
     whole, field = (
         predict_rows(tested, linear.frame_columns[out], group, offsets, values,
                      kept.equations.units)[..., 0]
         for offsets, values in ((unit, shared),
-                                (np.zeros_like(unit), np.where(of_field[:, None], shared, 0.0))))
+                                (np.zeros_like(unit), np.where(of_field, shared, 0.0))))
     fixed = linear.shared_columns[out] @ (solution.values / fitted.scale)
     return whole + fixed, field
 
 
-def _fields(selection: Selection, fitted: FittedModel) -> dict[int, ImageField]:
+def _fields(selection: Selection, fitted: FittedModel) -> dict[int, CameraField]:
     """Return the predicted field of each camera, with what its lens has already."""
     random, sigma = fitted.random, selection.null.variances.sigma
-    shared = _shared_coefficients(selection, fitted)
+    values = _shared_coefficients(selection, fitted)
     posterior = posterior_covariance(fitted.factored)
     count = fitted.solution.e.size
     root = sigma * fitted.factored.equations.split(
         posterior.root[:count].reshape(*fitted.solution.e.shape, -1), posterior.root[count:])[2]
-    by_camera: dict[int, list[tuple[ImageGrid, Array, Array]]] = {}
-    at = 0
-    for grid in random.grids:
-        own = slice(at, at + 2 * len(grid.centres))
-        at = own.stop
-        if grid.name != _BROAD:
-            by_camera.setdefault(grid.camera, []).append((grid, shared[own], root[own]))
-    lenses = fitted.linear.state.lenses
-    return {camera: _field(parts, lenses[camera].image_field)
-            for camera, parts in by_camera.items()}
+    shared = sigma * posterior.shared / fitted.scale[:, None]
+    found, camera_of = {}, np.concatenate(
+        [np.full(2 * len(grid.centres), grid.camera) for grid in random.grids])
+    for camera in np.unique(camera_of).tolist():
+        grids = tuple(grid for grid in random.grids if grid.camera == camera)
+        mine = np.flatnonzero(camera_of == camera)
+        known = fitted.linear.state.lenses[camera].image_field
+        found[camera] = CameraField(
+            _field(grids, values[mine], root[mine], known), grids, root[mine], shared)
+    return found
 
 
 def _shared_coefficients(selection: Selection, fitted: FittedModel) -> Array:
@@ -179,14 +189,12 @@ def _shared_coefficients(selection: Selection, fitted: FittedModel) -> Array:
 
 
 def _field(
-    parts: Sequence[tuple[ImageGrid, Array, Array]], known: ImageField | None
+    grids: Sequence[ImageGrid], values: Array, root: Array, known: ImageField | None
 ) -> ImageField:
-    """Return the field of bumps: grid, coefficients, root of covariance; known: added to it."""
-    finest = min(grid.pitch for grid, _, _ in parts)
-    reach = [(grid.centres - _EDGE * grid.pitch, grid.centres + _EDGE * grid.pitch)
-             for grid, _, _ in parts]
-    low = np.min([one.min(axis=0) for one, _ in reach], axis=0)
-    high = np.max([one.max(axis=0) for _, one in reach], axis=0)
+    """Return the field of bumps: coefficients (2 Q,), root of covariance; known: added to it."""
+    finest = min(grid.pitch for grid in grids)
+    low = np.min([grid.centres.min(axis=0) - _EDGE * grid.pitch for grid in grids], axis=0)
+    high = np.max([grid.centres.max(axis=0) + _EDGE * grid.pitch for grid in grids], axis=0)
     if known is not None:
         low, high = np.minimum(low, known.nodes[0, 0]), np.maximum(high, known.nodes[-1, -1])
     low = np.round(low)
@@ -194,15 +202,13 @@ def _field(
         MIN_NODES, MAX_NODES)
     pitch = np.full(2, round(_PITCH * finest, _DIGITS))
     nodes = ImageField(low, pitch, np.zeros((rows, columns, 2))).nodes
-    moved: Array = np.zeros((nodes.size // 2, 2))
-    spread = np.zeros((nodes.size // 2, 2, parts[0][2].shape[-1]))
-    for grid, values, root in parts:
-        bumps = bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
-        moved = moved + bumps @ values.reshape(-1, 2)
-        spread += (bumps @ root.reshape(len(grid.centres), -1)).reshape(spread.shape)
-    there = moved.reshape(nodes.shape)
+    bumps = sparse.hstack([
+        bump_values(nodes, np.ones(nodes.shape[:2], dtype=bool), grid.centres, grid.pitch)
+        for grid in grids], format='csr')
+    there = (bumps @ values.reshape(-1, 2)).reshape(nodes.shape)
+    spread = (bumps @ root.reshape(bumps.shape[1], -1)).reshape(rows, columns, 2, -1)
     if known is not None:
         there = there + known.displacement(nodes)
-    stderr = np.sqrt((spread**2).sum(axis=-1).mean(axis=-1)).reshape(rows, columns)
+    stderr = np.sqrt((spread**2).sum(axis=-1).mean(axis=-1))
     field = ImageField.interpolate(low, pitch, there, np.round(stderr, _DIGITS))
     return replace(field, values=np.round(field.values, _DIGITS))

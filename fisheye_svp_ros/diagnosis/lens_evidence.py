@@ -174,26 +174,18 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
-    averaged = evaluation.averaged_model
-    linear, of_lens = averaged.linear, lens_columns(averaged.linear)
-    covariance = evaluation.covariance[np.ix_(of_lens, of_lens)]
-    frames = np.zeros((linear.data.frames, 6))
+    linear = evaluation.averaged_model.linear
     before, views = lenses_of(evaluation.simulation.state), linear.data.views
     errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
-
-        def extend_lens(step: Array, name: str = name) -> Lens:
-            shared = np.zeros(len(of_lens))
-            shared[of_lens] = step
-            return lenses_of(linear.state.retract(linear.free, frames, shared))[name]
-
         uv = typical_points(views.uv[mine])
-        model, there = ray_model(extend_lens, covariance, uv)
+        model, there = _written_rays(evaluation, lenses_of, number, name, uv)
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
         if asked is not None and asked not in RANGES:
-            wider, near = ray_model(extend_lens, covariance, uv, (*RANGES, asked))
+            wider, near = _written_rays(
+                evaluation, lenses_of, number, name, uv, (*RANGES, asked))
             more = _difference(wider, points_on_rays(given, uv[near], wider.ranges))
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
@@ -201,6 +193,31 @@ def find_lens_rays(
         offsets.append(
             _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px))
     return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))
+
+
+def _written_rays(
+    evaluation: Evaluation, lenses_of: LensesOf, camera: int, name: str, uv: Array,
+    ranges: tuple[float, ...] = RANGES,
+) -> tuple[RayModel, Mask]:
+    """Return the rays of the lens of a camera that is written, and which points (G,) have some."""
+    linear, written = evaluation.averaged_model.linear, evaluation.written_field
+    of_lens, frames = lens_columns(linear), np.zeros((linear.data.frames, 6))
+
+    def extend_lens(step: Array) -> Lens:
+        shared = np.zeros(len(of_lens))
+        shared[of_lens] = step
+        lens = lenses_of(linear.state.retract(linear.free, frames, shared))[name]
+        return lens if written is None else written.add_to(lens, camera)
+
+    model, there = ray_model(
+        extend_lens, evaluation.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
+    known = None if written is None else written.fields.get(camera)
+    if known is None:
+        return model, there
+    covariance, cross = evaluation.field_covariance(known)
+    lens = extend_lens(np.zeros(int(of_lens.sum())))
+    return model.with_field(
+        lens, uv[there], known.bumps_at(uv[there]), covariance, cross[of_lens]), there
 
 
 def _difference(model: RayModel, points: Array) -> Array:
@@ -241,10 +258,10 @@ def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     Source: Mahalanobis, On the generalized distance in statistics (1936).
     """
     flat = samples.reshape(-1, samples.shape[-1])
-    covariance = flat @ flat.T / flat.shape[1]
+    covariance: Array = flat @ flat.T / flat.shape[1]
     covariance[np.diag_indices_from(covariance)] += floor**2 * len(flat) / 3
-    whitened = solve_lower(
-        np.linalg.cholesky(covariance), np.column_stack([off.ravel(), flat]))
+    root = np.asarray(np.linalg.cholesky(covariance))
+    whitened = solve_lower(root, np.column_stack([off.ravel(), flat]))
     distances = np.sqrt((whitened**2).sum(axis=0))
     return float(distances[0]), distances[1:]
 

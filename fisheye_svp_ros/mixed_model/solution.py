@@ -32,11 +32,12 @@ class Posterior(NamedTuple):
     """The covariance of all coefficients, over the noise variance.
 
     root (E k + R, C): root root' is that of all, blocks first, but for what each block (E, k, k)
-    adds within itself.
+    adds within itself; shared (X - 1, C): the same of the shared fixed coefficients.
     """
 
     block: Array
     root: Array
+    shared: Array
 
     @property
     def variances(self) -> tuple[Array, Array]:
@@ -64,12 +65,15 @@ def posterior_covariance(f: FactoredEquations) -> Posterior:
     inverse_t = np.swapaxes(f.inverse, -1, -2)
     by_border = solve_upper(f.factor, f.border[:, :-1])
     by_block = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
-    roots = [np.concatenate(covariance_roots(f))]
-    if len(f.root):
+    root, count = np.concatenate(covariance_roots(f)), len(f.root)
+    shared = np.zeros((count, root.shape[1] + count))
+    if count:
         fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
-        both = np.concatenate([by_block.reshape(-1, len(fixed)), by_border])
-        roots.append(both @ fixed)
-    return Posterior(inverse_t @ f.inverse, np.concatenate(roots, axis=1))
+        both = np.concatenate([by_block.reshape(-1, count), by_border])
+        root = np.concatenate([root, both @ fixed], axis=1)
+        # What fixed columns take up, random ones lose.
+        shared[:, -count:] = -fixed
+    return Posterior(inverse_t @ f.inverse, root, shared)
 
 
 def unit_covariances(f: FactoredEquations) -> Array:

@@ -198,7 +198,19 @@ def verdict_sentences(
 
     known: errors where the truth is known, of `diagnosis.known_errors`.
     """
-    return _wrong(diagnosis), _gain_sentence(diagnosis, known or {}), _next_step(diagnosis)
+    gain = _gain_sentence(diagnosis, known or {}) + _field_sentence(diagnosis)
+    return _wrong(diagnosis), gain, _next_step(diagnosis)
+
+
+def _field_sentence(d: Diagnosis) -> str:
+    """Return what the image field in the lens file gains, and which frames refute it."""
+    field = d.evaluation.written_field
+    if field is None or not field.fields:
+        return ''
+    refuted = join_names([f'{first} to {last}' for first, last in field.refuted])
+    return (f' The lens file holds an image field: it predicts frames left out to '
+            f'{field.after:.3g} px rms instead of {field.before:.3g}'
+            + (f', but frames {refuted} worse' if refuted else '') + '.')
 
 
 def _wrong(d: Diagnosis) -> str:

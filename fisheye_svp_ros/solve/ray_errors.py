@@ -18,6 +18,7 @@ RANGES = (0.3, 1.0, 5.0)  # m
 _STEP = 1e-3  # of a standard error
 _SAMPLES = 1000
 _POINTS = 300  # image points that stand for all
+_STEP_PX = 0.01
 
 
 class RayError(NamedTuple):
@@ -70,6 +71,25 @@ class RayModel(NamedTuple):
                          *np.quantile(one, (0.025, 0.975)).tolist())
                 for range_m, one in zip(self.ranges, rms, strict=True)]
 
+    def with_field(
+        self, lens: Lens, uv: Array, bumps: Array, covariance: Array, cross: Array
+    ) -> RayModel:
+        """Return the model with the errors of an image field beside those of the parameters.
+
+        lens: whose rays these are, at image points uv (G, 2), px; bumps (G, Q): what a coefficient
+        moves u or v of each by; covariance (2 Q, 2 Q), px^2: of these, u and v of each bump in
+        turn; cross (K, 2 Q): with the parameters.
+        """
+        steps = _STEP_PX * np.eye(2)
+        # A field that moves an image point takes the ray from where it was.
+        slope = np.stack([(points_on_rays(lens, uv - step, self.ranges)
+                           - points_on_rays(lens, uv + step, self.ranges)) / (2 * _STEP_PX)
+                          for step in steps], axis=-1)
+        moves = (slope[..., None, :] * bumps[:, None, :, None]).reshape(*self.points.shape, -1)
+        columns = np.concatenate([self.columns, without_motion(self.points, moves)], axis=-1)
+        return self._replace(columns=columns, covariance=np.block(
+            [[self.covariance, cross], [cross.T, covariance]]))
+
     def sample(self, at: int, seed: int = 0) -> Array:
         """Return errors (G, 3, samples), rad, at one of the ranges, drawn by the covariance."""
         return np.asarray(self.columns[at] @ self._draw_parameters(seed))
@@ -109,10 +129,10 @@ def ray_model(
         one, other = (points_on_rays(lens_of(sign * step), uv, ranges) for sign in (1, -1))
         there &= np.isfinite(one).all(axis=(0, 2)) & np.isfinite(other).all(axis=(0, 2))
         sides.append((one - other) / (2 * step[k]))
-    columns = np.zeros((*base[:, there].shape, count))
-    for k, side in enumerate(sides):
-        columns[..., k] = without_motion(base[:, there], side[:, there])
-    return RayModel(base[:, there], columns, covariance, ranges), np.asarray(there)
+    points = base[:, there]
+    moves = np.stack([side[:, there] for side in sides], axis=-1) if sides else (
+        np.zeros((*points.shape, 0)))
+    return RayModel(points, without_motion(points, moves), covariance, ranges), np.asarray(there)
 
 
 def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> Array:
@@ -126,7 +146,7 @@ def points_on_rays(lens: Lens, uv: Array, ranges: Sequence[float] = RANGES) -> A
 
 
 def without_motion(points: Array, change: Array) -> Array:
-    """Return changes (R, G, 3), m, of points over their range, rad, without a rigid motion.
+    """Return changes (R, G, 3, ...), m, of points over their range, rad, without a rigid motion.
 
     The motion is that of least squares over all ranges together, of the angles.
     """
@@ -137,8 +157,9 @@ def without_motion(points: Array, change: Array) -> Array:
     turns = np.moveaxis(turns, (0, 1), (-1, -2))
     shifts = np.broadcast_to(np.eye(3), (*points.shape, 3))
     motion = (np.concatenate([turns, shifts], axis=-1) / distance[..., None]).reshape(-1, 6)
-    angles = (change / distance).reshape(-1)
+    angles = change.reshape(points.size, -1) / np.repeat(distance.ravel(), 3)[:, None]
     fitted = motion @ np.linalg.lstsq(motion, angles, rcond=None)[0]
-    left = (angles - fitted).reshape(points.shape)
-    along = points / distance
-    return np.asarray(left - along * (left * along).sum(axis=-1, keepdims=True))
+    left = (angles - fitted).reshape(*points.shape, -1)
+    along = (points / distance)[..., None]
+    left = left - along * (left * along).sum(axis=-2, keepdims=True)
+    return np.asarray(left.reshape(change.shape))

@@ -14,27 +14,28 @@ from fisheye_svp_ros.diagnosis import Diagnosis, diagnose
 from fisheye_svp_ros.diagnosis.image_fields import MIN_GAIN
 from fisheye_svp_ros.effects.forward import back_project, project
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 
 
-def warp(uv: np.ndarray, size: float) -> np.ndarray:
-    """Return waves of 380 px, no spline, of so many px."""
-    x, y = np.moveaxis(uv / 60.0, -1, 0)
+def warp(uv: np.ndarray, size: float, length: float = 380.0) -> np.ndarray:
+    """Return waves of so many px, no spline, of a length in px."""
+    x, y = np.moveaxis(2 * np.pi * uv / length, -1, 0)
     return size * np.stack([np.sin(x + 0.4 * y), np.cos(y - 0.3 * x + 1)], axis=-1)
 
 
 @cache
-def diagnosed(size: float, seed: int) -> Diagnosis:
+def diagnosed(size: float, seed: int, length: float = 380.0) -> Diagnosis:
     """Diagnose sixteen photographs with noise of .1 px and a warp."""
     seen = photographs(AIR, None, 16, 0.1, seed)
-    moved = replace(seen, uv=seen.uv + warp(seen.uv, size))
+    moved = replace(seen, uv=seen.uv + warp(seen.uv, size, length))
     return diagnose(moved, AIR, free_intrinsics=True)
 
 
-@pytest.mark.parametrize('seed', [0, 1])
+@pytest.mark.parametrize(('seed', 'length'), [(0, 380.0), (1, 900.0)])
 def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
-    seed: int, tmp_path: Path
+    seed: int, length: float, tmp_path: Path
 ) -> None:
-    found = diagnosed(0.3, seed)
+    found = diagnosed(0.3, seed, length)
     field = found.evaluation.written_field
     assert field is not None and field.after < (1 - MIN_GAIN) * field.before
     save_lens(found.lens, tmp_path / 'lens.yaml')
@@ -43,20 +44,27 @@ def test_a_warp_is_written_and_brings_the_rays_nearer_to_the_truth(
     assert written.image_field is not None and written.image_field.stderr is not None
     assert 0 < np.median(written.image_field.stderr) < 0.3
     uv = found.model.data.views.uv[found.model.data.views.used]
-    far = true_directions(uv)
+    far = true_directions(uv, length)
     off = [errors_px(lens, far, uv) for lens in (replace(written, image_field=None), written)]
     assert off[1] < 0.75 * off[0]
     entry = found.to_dict()['lens']['image_field']
     assert entry['written']
     assert entry['refuted_by_frames'] == []
     assert entry['rms_px'] == pytest.approx(written.image_field.rms)
+    # The field's own errors are among those of the rays, which are nearer than those of `given`.
+    stated, given = (
+        found.to_dict()['lens']['ray_error_mrad'][which][-1] for which in ('extended', 'given'))
+    truth = 1e3 * off[1] / AIR.fx
+    assert 0.5 * stated['low'] < truth < 1.5 * stated['high']
+    assert stated['value'] < given['value']
+    assert 'image field' in verdict_sentences(found)[1]
 
 
-def true_directions(uv: np.ndarray) -> np.ndarray:
+def true_directions(uv: np.ndarray, length: float) -> np.ndarray:
     """Return directions that the true, warped lens sees at image points."""
     ideal = uv
     for _ in range(30):
-        ideal = uv - warp(ideal, 0.3)
+        ideal = uv - warp(ideal, 0.3, length)
     return back_project(AIR, ideal).direction
 
 
