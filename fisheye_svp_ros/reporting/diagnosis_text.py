@@ -19,6 +19,7 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
+from fisheye_svp_ros.scene.photograph_names import frame_name
 
 LENS_FILE = 'extended_lens.yaml'
 LENS = {
@@ -207,10 +208,12 @@ def _field_sentence(d: Diagnosis) -> str:
     field = d.evaluation.written_field
     if field is None or not field.fields:
         return ''
-    refuted = join_names([f'{first} to {last}' for first, last in field.refuted])
+    table = d.problem.observations
+    refuted = join_names([' to '.join(frame_name(table, one) for one in ends)
+                          for ends in field.refuted])
     return (f' The lens file holds an image field: it predicts frames left out to '
             f'{field.after:.3g} px rms instead of {field.before:.3g}'
-            + (f', but frames {refuted} worse' if refuted else '') + '.')
+            + (f', but {refuted} worse' if refuted else '') + '.')
 
 
 def _wrong(d: Diagnosis) -> str:
