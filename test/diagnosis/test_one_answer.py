@@ -12,6 +12,11 @@ from helpers.nodes import ROOT
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.io.csv_table import CsvTable
+from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.study.lens_trust import calibrate_without_outliers
 
 SHARED = ROOT.parent / 'shared'
 FAULTS, DATA = SHARED / 'faults', SHARED / 'data'
@@ -44,14 +49,20 @@ def diagnosed(results: dict[str, Path], name: str) -> tuple[Path, dict[str, Any]
         lens = folder / 'lens.yaml'
         if not lens.exists():
             lens = results[''] / f'{name}.yaml'
-            assert cli.main(['calibrate', str(folder / file), '--image-size', '1280x800',
-                             '-o', str(lens)]) == 0
+            save_lens(calibrated(folder / file), lens)
         more = ['--held-out', str(folder / 'test.csv')] if held_out else []
         if folder.parent == DATA:
             more.append('--quick')  # with all rounds it takes minutes
         assert cli.main(['diagnose', str(folder / file), '--lens', str(lens), *more,
                          '-o', str(out)]) == 0
     return out, json.loads((out / 'diagnosis.json').read_text())
+
+
+def calibrated(file: Path) -> Lens:
+    """Return the lens of observations, without its standard errors, which take longer than all."""
+    found, _, _ = calibrate_without_outliers(
+        read_observations(file), lambda rows: calibrate(rows, 'kannala_brandt', (1280, 800)))
+    return found.adjusted.lens
 
 
 @pytest.mark.parametrize('name', SETS)
@@ -86,12 +97,10 @@ def test_decision_verdict_and_report_agree(results: dict[str, Path], name: str) 
         assert lens['bound'] and all(one['edge_px'] > 0 for one in lens['bound'])
 
 
-def test_what_held_out_frames_refute_is_a_candidate(results: dict[str, Path]) -> None:
-    """A false tilt, which made the prediction of the test frames worse."""
+def test_a_rolling_shutter_is_no_tilt(results: dict[str, Path]) -> None:
+    """A false tilt made the prediction of the test frames worse."""
     _, found = diagnosed(results, 'shutter_and_tilt')
-    assert 'sensor_tilt' not in {cause['effect'] for cause in found['causes']}
-    why = {one['effect']: one['why'] for one in found['candidates']}
-    assert 'refutes it' in why['sensor_tilt']
+    assert {cause['effect'] for cause in found['causes']} == {'rolling_shutter'}
 
 
 def test_a_better_lens_shows_as_such(results: dict[str, Path]) -> None:
