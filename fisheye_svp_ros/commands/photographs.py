@@ -141,8 +141,8 @@ def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
     for camera, lens in lenses.items():
         size = sizes.get(camera) or sizes.get('')
         if size and size != (lens.width, lens.height):
-            raise LensError(f'{path}: images of {size[0]}x{size[1]} px, and lens {lens.name!r} is '
-                            f'of {lens.width}x{lens.height} px; give the lens of this camera at '
+            raise LensError(f'{path}: images are {size[0]}x{size[1]} px, lens {lens.name!r} is '
+                            f'for {lens.width}x{lens.height} px; give the lens of this camera at '
                             'this size')
 
 
@@ -175,8 +175,8 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     _note_alone(detection)
     unsure = int((detection.certainty < _UNCERTAIN).sum())
     if unsure:
-        say(f'{unsure} photographs: which corner is the first is less than '
-            f'{100 * _UNCERTAIN:.0f} % sure, since {args.board} looks the same when turned')
+        say(f'{unsure} photographs: their orientation is less than {100 * _UNCERTAIN:.0f} % sure, '
+            f'since {args.board} looks the same when turned')
     found = sum(one.points is not None for one in detection.searched)
     larger = sum(LARGER_BOARD in one.notes for one in detection.searched)
     if larger and larger >= _MIN_LARGER_SHARE * found:

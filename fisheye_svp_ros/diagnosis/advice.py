@@ -78,8 +78,8 @@ def turn_advice(turned: Sequence[TurnedFrame]) -> list[Advice]:
             least = min(one.odds for one in mine)
             names = [one.photograph for one in mine if not one.photograph.startswith('frame ')]
             advice.append(Advice(
-                f'corners {are} numbered from another end of the board in {len(mine)} of the '
-                f'photographs (odds {least:.2g} to 1 or more): {what}',
+                f'corners {are} numbered from another end of the board (odds {least:.2g} to 1 or '
+                f'more): {what}',
                 frames=[one.frame for one in mine], photographs=names, kind=TURNED))
     return advice
 

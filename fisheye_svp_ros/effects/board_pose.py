@@ -1,4 +1,4 @@
-"""The boards of one target sit differently from what is said."""
+"""The relative poses of the boards of one target are wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lens elements are not centred on one axis."""
+"""Lens elements are not centered on one axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lens looks through a dome whose center it is not in."""
+"""The lens looks through a dome, away from its center."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class DomePortEffect(PlaneEffect):
         'ranges alike'
     )
     to_separate = (
-        'look whether the camera is behind a dome; if so, state it: --port dome:RADIUSmm:GLASSmm '
-        '--medium air'
+        'check whether the camera is behind a dome; if so, calibrate with --port '
+        'dome:RADIUSmm:GLASSmm --medium air'
     )
 
     parameters = (Parameter('x', 'm', 0.01), Parameter('y', 'm', 0.01))

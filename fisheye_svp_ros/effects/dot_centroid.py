@@ -1,4 +1,4 @@
-"""The centroid of a dot's image is not the image of its centre."""
+"""The centroid of a dot's image is not the image of its center."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The target is larger or smaller than it is said to be, or stretched."""
+"""The target is larger or smaller than stated, or stretched."""
 
 from __future__ import annotations
 

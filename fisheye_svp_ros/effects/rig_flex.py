@@ -1,4 +1,4 @@
-"""The rig bends: its second camera does not keep its place."""
+"""The rig bends: the pose of its second camera changes."""
 
 from __future__ import annotations
 

@@ -138,7 +138,8 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
             **fields, 'what': text.describe_effect(cause.effect),
             'to_separate': cause.to_separate if cause.indistinguishable_from else '',
             'parameters': [
-                (name, text.quantity(entry), f'{entry["value"]:.6g} {entry["unit"]}')
+                (name, text.quantity(entry),
+                 f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'))
                 for name, entry in shown
             ],
             'count': len(cause.parameters),

@@ -228,13 +228,13 @@ def _wrong(d: Diagnosis) -> str:
         return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
                 'effect of the catalog explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
-    causes = '; because '.join(
+    causes = '; '.join(
         f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_MAX_CAUSES]
     )
     more = len(d.causes) - _MAX_CAUSES
     rest = f'; the table lists {more} more cause{"s" * (more > 1)}' if more > 0 else ''
-    return f'Beyond {noise} the simulation is wrong because {causes}{rest}.'
+    return f'Besides {noise}, these errors are found: {causes}{rest}.'
 
 
 def _almost(d: Diagnosis) -> str:

@@ -39,7 +39,7 @@ _HEADLINES = {
     'focal_drift': 'The focal length drifts',
     'session_step': 'The intrinsics jump between groups of frames',
     'landmark_survey': 'Single landmarks are displaced',
-    'landmark_scale': 'The target is stretched or of another size',
+    'landmark_scale': 'The scale of the target is wrong',
     'board_pose': 'The relative poses of the boards are wrong',
     'rolling_shutter': 'Rows are exposed one after the other',
     'rig_flex': 'The rig bends',

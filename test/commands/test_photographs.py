@@ -123,7 +123,7 @@ def test_a_lens_of_another_image_size_is_refused(
                            ('localize', *photographs)):
         assert cli.main([command, *rest, '--lens', str(tmp_path / 'large.yaml')]) == 2
         said = capsys.readouterr().err
-        assert "424x400 px, and lens 'small' is of 848x800 px" in said
+        assert "424x400 px, lens 'small' is for 848x800 px" in said
 
 
 def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
