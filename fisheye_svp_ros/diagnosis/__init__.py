@@ -46,20 +46,19 @@ from fisheye_svp_ros.diagnosis.evaluation import (
 )
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets, refit
 from fisheye_svp_ros.diagnosis.lens_errors import InAir, LensErrors
+from fisheye_svp_ros.diagnosis.model_errors import (
+    ErrorParts,
+    ModelErrors,
+    pose_maps,
+    pose_summary,
+)
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import DiagnosisOptions, Problem, can_be_included
 from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.diagnosis.stages import diagnose, diagnose_against
 from fisheye_svp_ros.diagnosis.stepwise import NAMED_P, TraceStep
-from fisheye_svp_ros.diagnosis.uncertainty import (
-    ErrorParts,
-    ModelErrors,
-    pose_maps,
-    pose_summary,
-    standard_errors,
-    total_errors,
-)
+from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
 from fisheye_svp_ros.diagnosis.variance_budget import Component, Structure, stage_shares
 
 __all__ = [

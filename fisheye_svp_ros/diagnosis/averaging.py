@@ -16,9 +16,9 @@ import numpy as np
 from scipy import special
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
-from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors, shared_names
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.of_cameras import OfCameras

@@ -24,9 +24,9 @@ from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
+from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.stepwise import TraceStep
-from fisheye_svp_ros.diagnosis.uncertainty import ModelErrors
 from fisheye_svp_ros.diagnosis.variance_budget import (
     REPEATED_COMPONENT,
     Component,
