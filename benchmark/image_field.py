@@ -86,9 +86,9 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
         'all warps': [one for one in outcomes if one.size],
         'warps, field written': [one for one in outcomes if one.size and one.written],
         'no warp': [one for one in outcomes if not one.size]}
-    lines = ['# The image field', '', *(__doc__ or '').split('\n')[2:8], '', f'    {command}', '',
-             'Geometric means of the ray error: without the field over that of `calibrate`, with '
-             'the field over that without it; the worst of the latter.', '',
+    lines = ['# The image field', '', *(__doc__ or '').split('\n')[2:7], '', f'`{command}`', '',
+             'Geometric means of the ray error: without the field over that of `calibrate`,',
+             'with the field over that without it; the worst of the latter.', '',
              '| sets | number | field written | without / calibrate | with / without | worst |',
              '|---|---|---|---|---|---|']
     for name, some in kinds.items():
