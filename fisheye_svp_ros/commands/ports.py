@@ -51,11 +51,11 @@ def port_of(args: argparse.Namespace) -> Port | None:
 def add_dome_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare --medium and --port of a diagnosis: a dome in air."""
     parser.add_argument('--medium', metavar='MEDIUM',
-                        help='with --port dome: air; another medium is looked for anyway')
+                        help='with --port dome: air; other media are always tested')
     parser.add_argument('--port', metavar='SPEC',
-                        help='a dome that the camera looks through: dome:60mm:4mm:1.5 (inner '
-                        'radius, glass, index) or dome, 50 mm with 4 mm of glass; where its '
-                        'center is beside the camera is estimated')
+                        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, glass, '
+                        'index), or dome for 50 mm with 4 mm of glass; the offset of its center '
+                        'from the axis is estimated')
 
 
 def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomePortEffect, ...]:

@@ -123,7 +123,7 @@ def read_columns(path: Path) -> dict[str, list[Any]]:
             raise OutputError(str(cause)) from cause
     pyarrow, problem = arrow()
     if pyarrow is None:
-        raise OutputError(f'{path}: {problem}; give the .csv beside it')
+        raise OutputError(f'{path}: {problem}; give the .csv file next to it')
     data = read_bytes(path, OutputError)
     try:
         file = pyarrow.parquet.ParquetFile(pyarrow.BufferReader(data),

@@ -90,8 +90,8 @@ def _main(name: str) -> int:
     elif '--version' in words:
         print(f'{name} {__version__}')
     elif misplaced:
-        print(f'{name}: {misplaced[0]!r} stands before --ros-args; ROS arguments come after it: '
-              f'{name} --ros-args ...', file=sys.stderr)
+        print(f'{name}: {misplaced[0]!r} comes before --ros-args; ROS arguments follow it: {name} '
+              '--ros-args ...', file=sys.stderr)
         return 2
     else:
         return run(name)

@@ -139,7 +139,7 @@ def demo_rows(columns: Columns, lenses: Sequence[str], radii: Sequence[float]) -
         for where in task.values:
             if (task.name, lens, radius, where) not in found:
                 raise BagError(f'no result of {task.node} for {lens}, {where}, {radius} m; see '
-                               'the logs beside the recording')
+                               'the logs next to the recording')
             rows.append(_row(task, lens, radius, where, found[task.name, lens, radius, where]))
     return rows
 

@@ -63,8 +63,8 @@ class Observations:
         off = np.abs(self.xyz - self.xyz[first][inverse]).max(axis=-1) > 1e-9
         if np.any(off):
             raise ObservationError(
-                f'{self.source}: landmark {self.landmark[off][0]} is said to be in two places; '
-                'x, y, z belong to a target frame that stands still'
+                f'{self.source}: landmark {self.landmark[off][0]} has two positions; x, y, z '
+                'belong to one target frame that does not move'
             )
         return Landmarks(ids, self.xyz[first])
 
@@ -184,8 +184,8 @@ def stereo_views(observations: Observations, default_sigma: float = 1.0) -> tupl
         twice = mine[row[frame[mine], slot[mine]] != mine]
         if twice.size:
             raise ObservationError(
-                f'{observations.source}: landmark {observations.landmark[twice[0]]} stands twice '
-                f'in frame {observations.frame[twice[0]]} of one camera'
+                f'{observations.source}: landmark {observations.landmark[twice[0]]} is listed '
+                f'twice in frame {observations.frame[twice[0]]} of one camera'
             )
         cameras = np.full(len(frames), camera)
         pair.append(_views(observations, row, frames, cameras, default_sigma))

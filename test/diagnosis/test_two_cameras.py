@@ -265,7 +265,7 @@ def test_a_frame_that_alone_shows_a_part_of_the_image_spoils_no_figure():
 def test_cameras_must_mean_the_same_place_by_a_landmark(longer):
     table = longer.table
     off = replace(table, xyz=table.xyz + 0.05 * table.camera[:, None])
-    with pytest.raises(ObservationError, match='landmark 0 is said to be in two places'):
+    with pytest.raises(ObservationError, match='landmark 0 has two positions'):
         diagnose(off, longer.lenses)
 
 

@@ -213,5 +213,5 @@ def test_stereo_views_refuse_what_is_not_stereo():
     with pytest.raises(ObservationError, match='it holds no observation'):
         stereo_views(table.take(np.arange(0)))
     twice = table.take(np.array([0, 1, 2, 1]))
-    with pytest.raises(ObservationError, match='landmark 1 stands twice in frame 0'):
+    with pytest.raises(ObservationError, match='landmark 1 is listed twice in frame 0'):
         stereo_views(twice)
