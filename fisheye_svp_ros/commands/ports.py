@@ -53,9 +53,9 @@ def add_dome_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--medium', metavar='MEDIUM',
                         help='with --port dome: air; other media are always tested')
     parser.add_argument('--port', metavar='SPEC',
-                        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, glass, '
-                        'index), or dome for 50 mm with 4 mm of glass; the offset of its center '
-                        'from the axis is estimated')
+                        help='dome in front of the camera: dome:60mm:4mm:1.5 (inner radius, '
+                        'glass, index), or dome for 50 mm with 4 mm of glass; the offset of its '
+                        'center from the axis is estimated')
 
 
 def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomePortEffect, ...]:
@@ -72,7 +72,7 @@ def dome_of(args: argparse.Namespace, lenses: Mapping[str, Lens]) -> tuple[DomeP
     option = ' '.join(f'--{name} {value}' for name, value in (
         ('medium', args.medium), ('port', args.port)) if value)
     if not isinstance(port, DomeGlass):
-        raise ParameterError(f'{option}: a flat port is looked for anyway; leave the option out')
+        raise ParameterError(f'{option}: a flat port is always tested; leave the option out')
     if port.medium_index != MEDIA['air']:
         raise ParameterError(f'{option}: a dome is diagnosed in air, with --medium air; in water '
                              '`calibrate --lens AIR.yaml` with the same options fits it')

@@ -362,7 +362,7 @@ class TestCalibrate:
         save_lens(replace(LENS, port=DomeGlass(0.05, 1.0)), wet)
         base = ('diagnose', scene[0] / 'observations.csv')
         for lens, options, why in (
-            (air, ('--medium', 'water'), 'a flat port is looked for anyway'),
+            (air, ('--medium', 'water'), 'a flat port is always tested'),
             (air, ('--port', 'dome:60mm:4mm'), 'in air, with --medium air'),
             (air, ('--medium', 'air', '--port', 'dome:60mm'), 'of no thickness'),
             (wet, ('--medium', 'air', '--port', 'dome'), 'one lens without a port'),

@@ -92,7 +92,7 @@ def test_a_process_that_cannot_use_its_arguments_ends_with_the_reason(
 @pytest.mark.parametrize(('words', 'status', 'said'), [
     (['--help'], 0, 'localizer: parameters, as in --ros-args -p NAME:=VALUE'),
     (['--version'], 0, f'localizer {__version__}'),
-    (['-p', 'lens:=fish180'], 2, "localizer: '-p' stands before --ros-args; ROS arguments come"),
+    (['-p', 'lens:=fish180'], 2, "localizer: '-p' comes before --ros-args; ROS arguments follow"),
 ])
 def test_an_executable_overlooks_no_argument(
     words: list[str], status: int, said: str, monkeypatch: pytest.MonkeyPatch,
@@ -130,7 +130,7 @@ def test_ros_arguments_without_ros_args_are_refused(capsys: pytest.CaptureFixtur
     from fisheye_svp_ros import cli
 
     assert cli.main(['run', 'localizer', '-p', 'svp:=true']) == 2
-    assert "'-p' stands before --ros-args" in capsys.readouterr().err
+    assert "'-p' comes before --ros-args" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
