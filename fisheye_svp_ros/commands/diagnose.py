@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.reporting.next_steps import ReportInputs
     from fisheye_svp_ros.reporting.point_residuals import PointResiduals
 
+_OF_DOTS = 'dot_centroid'  # corners have none
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
@@ -103,7 +105,7 @@ def run(args: argparse.Namespace) -> None:
         settings: dict[str, Any] = {
             'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
             'options': DiagnosisOptions(
-                tuple(args.included), tuple(args.left_out), args.quick, args.range_m, stated),
+                tuple(args.included), effects_left_out(args), args.quick, args.range_m, stated),
             'progress': progress,
         }
         try:
@@ -144,6 +146,13 @@ def _plan_next_views(
                                 args.number, room), None
     except FisheyeSvpError as why:
         return None, why
+
+
+def effects_left_out(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the effects that are not tested: the user's, and what this board cannot have."""
+    named = tuple(args.left_out)
+    dots = not args.board or args.board.startswith('circles')
+    return named if dots or _OF_DOTS in args.included else (*named, _OF_DOTS)
 
 
 def _read(

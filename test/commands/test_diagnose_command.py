@@ -14,6 +14,7 @@ from helpers.targets import plane, poses_around
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.diagnose import effects_left_out
 from fisheye_svp_ros.diagnosis import Advice, Comparison, DiagnosisOptions, Structure, diagnose
 from fisheye_svp_ros.effects.catalogue import load_effects
 from fisheye_svp_ros.effects.extension import extend_lens
@@ -551,3 +552,14 @@ def test_the_depth_of_a_rig_gains_too():
     # With cameras that stand elsewhere by the time the second exposes, a rig alone says nothing.
     late = with_effect(found.model.state, StereoTimeOffsetEffect(), np.array([0.01]))
     assert known_errors(found.simulation, Linearization(found.model.data, late, ()), ()) == {}
+
+
+@pytest.mark.parametrize(('board', 'included', 'found'), [
+    ('chessboard:9x6:25mm', [], ('skew', 'dot_centroid')),
+    ('circles:7x5:20mm', [], ('skew',)),
+    ('', [], ('skew',)),
+    ('chessboard:9x6:25mm', ['dot_centroid'], ('skew',)),
+])
+def test_corners_have_no_dots(board, included, found):
+    asked = SimpleNamespace(board=board, included=included, left_out=['skew'])
+    assert effects_left_out(asked) == found
