@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import random
 import socket
@@ -62,6 +63,12 @@ def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     """Take back what a test settles about the engine: the two agree to 1e-12, not to the bit."""
     monkeypatch.setattr(engines, '_engine', engines._engine)
     monkeypatch.setenv(engines.VARIABLE, os.environ.get(engines.VARIABLE, 'auto'))
+
+
+@pytest.fixture(autouse=True)
+def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Print no line of progress among those of a command, however busy the machine is."""
+    monkeypatch.setattr('fisheye_svp_ros.reporting.progress._INTERVAL', math.inf)
 
 
 @pytest.fixture(params=['numpy', 'numba'])

@@ -8,9 +8,10 @@ from fisheye_svp_ros.reporting import progress
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Return the time that the progress sees, as its only element."""
+def clock(monkeypatch: pytest.MonkeyPatch, no_progress: None) -> list[float]:
+    """Return the time that the progress sees, as its only element; have it print lines."""
     now = [0.0]
+    monkeypatch.setattr(progress, '_INTERVAL', 5.0)
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
     return now
 
