@@ -117,7 +117,7 @@ def test_a_camera_info_of_another_size_is_told_of(detecting: Graph) -> None:
         reports.clear()
         return status
 
-    status = says(848, 'image: 424x400 px, but camera_info is of 848x400 px')
+    status = says(848, 'image: 424x400 px, but camera_info is for 848x400 px')
     assert status.level == status.WARN
     status = says(424, 'all inputs usable')
     assert status.level == status.OK

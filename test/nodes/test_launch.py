@@ -117,8 +117,8 @@ def test_a_sweep_whose_recorder_dies_ends_with_the_reason(
 
 @pytest.mark.parametrize(('word', 'reason'), [
     ('svp:=maybe', 'maybe'),
-    ('params:=nothere.yaml', "params: 'nothere.yaml' is no file"),
-    ('localizer_params:=/', "localizer_params: '/' is no file"),
+    ('params:=nothere.yaml', "params: no file 'nothere.yaml'"),
+    ('localizer_params:=/', "localizer_params: no file '/'"),
 ])
 def test_an_argument_that_cannot_be_used_is_refused(
     launch: Callable[..., NodeProcess], word: str, reason: str

@@ -153,13 +153,13 @@ def test_a_frame_that_another_node_tells_of_is_said(
     g.start(SyntheticCamera)
     g.start(Localizer)
     other = g.tell(tf_message, '/tf')
-    g.idle(2.5)
+    g.idle(0.5)
     assert not any('another node' in m.status[0].message for m in reports)
     transform = messages.transform_message(identity(), 5, 'base_link', 'camera_optical_frame')
 
     def said() -> Any:
         other.publish(tf_message(transforms=[transform]))
-        return next((m for m in reports if "/tf: another node publishes 'camera_optical_frame' as "
-                     "well, in 'base_link'" in m.status[0].message), None)
+        return next((m for m in reports if "/tf: another node also publishes 'camera_optical_"
+                     "frame', with parent 'base_link'" in m.status[0].message), None)
 
     assert g.until(said).status[0].name == '/localizer: inputs'
