@@ -30,7 +30,8 @@ class Cause:
     """One named cause with its parameters, evidence and what it may be mistaken for.
 
     share: of the misfit of the simulation; survives: whether it is still needed with any one other
-    cause left out; heldout_rms_px, gain: of held-out frames once it is in the model.
+    cause left out; heldout_rms_px, gain: of held-out frames once it is in the model;
+    refuted_by_frames: first and last frame of contiguous thirds that are predicted worse with it.
     """
 
     effect: str
@@ -43,6 +44,7 @@ class Cause:
     gain: float
     indistinguishable_from: list[str]
     to_separate: str
+    refuted_by_frames: tuple[tuple[int, int], ...] = ()
 
     @property
     def effect_class(self) -> type[Effect]:

@@ -27,6 +27,7 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
+from fisheye_svp_ros.diagnosis.frame_blocks import refuting_blocks
 from fisheye_svp_ros.diagnosis.held_out_data import HeldOutData, valid_state
 from fisheye_svp_ros.diagnosis.image_fields import CameraField, WrittenField
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
@@ -347,6 +348,10 @@ class Evaluation:
                     for before, after in pairwise(predictions)]
         causes = selected_causes(
             EffectTests(self.null), self.selection.causes, self.errors, shares, held_out)
+        if not self.selection.problem.options.quick:
+            refuting = refuting_blocks(self.null, self.fitted)
+            causes = [replace(cause, refuted_by_frames=refuting.get(cause.effect, ()))
+                      for cause in causes]
         if self.medium is None:
             return causes
         gain = self._gain(self._given_prediction, self._base_prediction)

@@ -20,12 +20,11 @@ from fisheye_svp_ros.diagnosis.averaging import OpenShifts
 from fisheye_svp_ros.diagnosis.cross_validation import refit_shared
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
+from fisheye_svp_ros.diagnosis.frame_blocks import Ends, contiguous_blocks, misfit, split_frames
 from fisheye_svp_ros.diagnosis.random_effects import ImageGrid
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.mixed_model import (
     Variances,
-    factor_equations,
-    make_equations,
     posterior_covariance,
     predict_rows,
     solve_equations,
@@ -33,7 +32,7 @@ from fisheye_svp_ros.mixed_model import (
 from fisheye_svp_ros.optics.image_field import MAX_NODES, MIN_NODES, ImageField
 from fisheye_svp_ros.optics.lens import Lens
 
-FOLDS, BLOCKS = 4, 3  # every fourth frame; contiguous thirds
+FOLDS = 4  # every fourth frame
 MIN_GAIN = 0.01  # of the rms of frames that are left out
 _PITCH, _EDGE = 0.6, 2.0  # of the finest grid's: that of the spline, what lies around the bumps
 _DIGITS = 6  # px
@@ -68,7 +67,7 @@ class WrittenField:
 
     before: float
     after: float
-    refuted: tuple[tuple[int, int], ...]
+    refuted: tuple[Ends, ...]
     fields: Mapping[int, CameraField]
 
     @classmethod
@@ -86,12 +85,10 @@ class WrittenField:
         before, after = np.sqrt(2 * squares.sum(axis=0) / fitted.linear.row_mask.sum()).tolist()
         if not after < (1 - MIN_GAIN) * before:
             return cls(before, after, (), {})
-        block = order * BLOCKS // len(order)
+        block, ends = contiguous_blocks(data)
         squares = _hold_out(fitted, variances, block)
-        numbers = np.unique(data.views.frame)
-        refuted = tuple((int(mine[0]), int(mine[-1])) for i, (without, with_field)
-                        in enumerate(squares) if with_field > without
-                        for mine in [numbers[block == i]])
+        refuted = tuple(edge for edge, (without, with_field) in zip(ends, squares, strict=True)
+                        if with_field > without)
         return cls(before, after, refuted, _fields(selection, fitted))
 
     def add_to(self, lens: Lens, camera: int) -> Lens:
@@ -117,12 +114,8 @@ def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
     for k in range(len(squares)):
         out = fold == k
         whole, field = _predict(fitted, variances, out)
-        poses, weight = linear.frame_columns[out], linear.row_weight[out]
-        inverse = np.linalg.pinv(poses, rcond=1e-9)
         left = linear.residual[out] - whole
-        for i, rows in enumerate((left + field, left)):
-            rest = rows - (poses @ (inverse @ rows[..., None]))[..., 0]
-            squares[k, i] = ((rest[weight > 0] / weight[weight > 0]) ** 2).sum()
+        squares[k] = misfit(linear, out, left + field), misfit(linear, out, left)
     return squares
 
 
@@ -130,19 +123,11 @@ def _predict(
     fitted: FittedModel, variances: Variances, out: Mask
 ) -> tuple[Array, Array]:
     """Return what the other frames predict of the rows (F, M) of some, and the field's part."""
-    linear, columns = fitted.linear, fitted.random.columns
-    height = linear.residual.shape[1]
-    row = np.arange(out.size * height).reshape(out.size, height)
-    trained, tested = (columns._replace(
-        group=columns.group[part], offset=columns.offset[part], unit=columns.unit[part],
-        shared=columns.shared[row[part].ravel()]) for part in (~out, out))
-    border = np.concatenate(
-        [linear.shared_columns / fitted.scale, linear.residual[..., None]], axis=-1)
-    eq = make_equations(trained, linear.frame_columns[~out], border[~out])
-    kept = factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight)
+    linear = fitted.linear
+    kept, tested = split_frames(fitted, variances, out)
     solution = solve_equations(kept)
     _, unit, shared = kept.equations.split(solution.e[..., None], solution.r[:, None])
-    group = np.zeros((int(out.sum()), 6 + columns.group.shape[2], 1))
+    group = np.zeros((int(out.sum()), 6 + tested.group.shape[2], 1))
     of_field = (np.arange(len(shared)) < fitted.random.grid_columns)[:, None]
     whole, field = (
         predict_rows(tested, linear.frame_columns[out], group, offsets, values,

@@ -137,6 +137,7 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
         causes.append({
             **fields, 'what': text.describe_effect(cause.effect),
             'to_separate': cause.to_separate if cause.indistinguishable_from else '',
+            'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
             'parameters': [
                 (name, text.quantity(entry),
                  f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'))

@@ -203,14 +203,18 @@ def verdict_sentences(
     return _wrong(diagnosis), gain, _next_step(diagnosis)
 
 
+def frame_ranges(d: Diagnosis, ranges: Sequence[tuple[int, int]]) -> str:
+    """Return what the first and the last frames of ranges are called; '' for none."""
+    table = d.problem.observations
+    return join_names([' to '.join(frame_name(table, one) for one in ends) for ends in ranges])
+
+
 def _field_sentence(d: Diagnosis) -> str:
     """Return what the image field in the lens file gains, and which frames refute it."""
     field = d.evaluation.written_field
     if field is None or not field.fields:
         return ''
-    table = d.problem.observations
-    refuted = join_names([' to '.join(frame_name(table, one) for one in ends)
-                          for ends in field.refuted])
+    refuted = frame_ranges(d, field.refuted)
     return (f' The lens file holds an image field: it predicts frames left out to '
             f'{field.after:.3g} px rms instead of {field.before:.3g}'
             + (f', but {refuted} worse' if refuted else '') + '.')

@@ -19,7 +19,7 @@ from fisheye_svp_ros.diagnosis import (
     frames_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.diagnosis_text import known_rows, lens_words, size
+from fisheye_svp_ros.reporting.diagnosis_text import frame_ranges, known_rows, lens_words, size
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
@@ -140,10 +140,16 @@ def _confidence(decision: Decision) -> str:
 
 
 def _causes(d: Diagnosis) -> str:
-    """Return the confirmed causes by name, what is not told apart from each, and their sizes."""
-    return '; '.join(
-        f'{" or ".join([one.effect, *one.indistinguishable_from])} ({size(d, one)})'
-        for one in d.causes)
+    """Return the confirmed causes by name, what is not told apart from each, and their sizes.
+
+    Also which frames the others predict worse with it.
+    """
+    found = []
+    for one in d.causes:
+        worse = frame_ranges(d, one.refuted_by_frames)
+        names = ' or '.join([one.effect, *one.indistinguishable_from])
+        found.append(f'{names} ({size(d, one)}{f"; makes {worse} worse" if worse else ""})')
+    return '; '.join(found)
 
 
 def _candidates(d: Diagnosis) -> str:
