@@ -19,8 +19,8 @@ from fisheye_svp_ros.solve.rig_state import group_by_frame, with_effect
 SKEW = 3e-3
 
 
-@pytest.mark.parametrize(('last', 'refuting'), [(-SKEW / 3, {'skew': ((10, 14),)}), (SKEW, {})])
-def test_a_third_that_has_the_contrary_refutes_a_cause(last, refuting):
+@pytest.mark.parametrize(('last', 'refuting'), [(0.0, {'skew': ((10, 14),)}), (SKEW, {})])
+def test_a_third_without_it_refutes_a_cause(last, refuting):
     seen = photographs(AIR, None, 15, 0.1, 2)
     skew = np.where(seen.frame < 10, SKEW, last)
     moved = seen.uv + np.stack([skew * (seen.uv[:, 1] - AIR.cy), np.zeros(len(skew))], axis=-1)
