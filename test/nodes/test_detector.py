@@ -145,7 +145,7 @@ def test_a_search_is_bounded_and_the_next_image_is_searched(
     graph: Callable[..., Graph]
 ) -> None:
     """Noise of this size takes seconds, as everything in it may be a square."""
-    g = graph(f'board:={BOARD}', 'longest_search:=0.2')
+    g = graph(f'board:={BOARD}', 'longest_search:=0.5')
     points, diagnostics = g.hear(PointCloud2, 'image_points'), g.hear(
         DiagnosticArray, '/diagnostics')
     node = g.start(Detector)

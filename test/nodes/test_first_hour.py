@@ -86,8 +86,15 @@ class Hour:
             pytest.fail(f'{pattern!r} is not in {texts}')
 
     def logs(self, pattern: str) -> None:
-        """Assert that the log says so."""
-        assert re.search(pattern, self._capfd.readouterr().err)
+        """Assert that the log says so, sooner or later."""
+        said = ''
+
+        def told() -> bool:
+            nonlocal said
+            said += self._capfd.readouterr().err
+            return re.search(pattern, said) is not None
+
+        self.graph.until(told)
 
 
 @pytest.fixture
