@@ -26,6 +26,7 @@ STAGE_OF = {
     'board_stretch': 'target', 'board_in_plane': 'target', 'board_normal': 'target',
     'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
     'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
+    'frame_sag': 'frame',
 }
 NAMES = tuple(STAGE_OF)
 OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
@@ -139,7 +140,8 @@ class GatheredPoints(NamedTuple):
     used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none;
     board: place among the boards; local (F, N, 2): place on the board over its size; place
     (F, N, 2, 3): whitened derivatives by an offset along the board's axes, per mm; extents
-    (C, 2, 2), px: see `ColumnGeometry`.
+    (C, 2, 2), px: see `ColumnGeometry`; normals (F, boards, 3): of the boards, in the frame of the
+    camera or rig.
     """
 
     used: Mask
@@ -152,6 +154,7 @@ class GatheredPoints(NamedTuple):
     place: Array
     extents: Array
     landmarks: BoardLandmarks
+    normals: Array
 
     @classmethod
     def gather(
@@ -187,7 +190,8 @@ class GatheredPoints(NamedTuple):
                 ids, boards, np.zeros(len(ids), dtype=np.int64), np.zeros((len(ids), 2)))
             known.board_of[slot[used]], known.at[slot[used]] = board[used], local[used]
         extents = _extents(uv, used, camera) if geometry is None else geometry.extents
-        return cls(used, uv, weight, camera, slot, board, local, place, extents, known)
+        normals = np.array([one.axes[2] for one in boards]) @ linear.state.pose.rotation
+        return cls(used, uv, weight, camera, slot, board, local, place, extents, known, normals)
 
 
 def _turn_to_boards(
@@ -228,7 +232,8 @@ def make_random_effects(
     weight = points.weight.reshape(-1, 1)
     parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
-    names = [grid.name for grid in grids] + [field.name for field in fields]
+    parts.append(_sag_columns(points))
+    names = [*(one.name for one in (*grids, *fields)), 'frame_sag']
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
@@ -292,6 +297,22 @@ def _bend_columns(points: GatheredPoints) -> Array:
     mine = (points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))
     columns = bend[..., None, :] * mine[..., None, :, None]
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
+
+
+def _sag_columns(points: GatheredPoints) -> sparse.csr_array:
+    """Return columns (2 F N, 9 boards) of a bend of each board in proportion to its normal.
+
+    A board that sags by its own weight bends by b (n . g), n its normal and g the direction of
+    gravity, which stands still beside a camera that does.  The bend of the mean normal is one that
+    all frames share, and no part of it.
+    """
+    bend, frames = _bend_columns(points), len(points.normals)
+    boards = points.normals.shape[1]
+    there = ((points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))).sum(1)
+    mean = np.einsum('fb,fba->ba', there, points.normals) / np.maximum(there.sum(0), 1)[:, None]
+    slope = points.normals - mean
+    columns = bend.reshape(*bend.shape[:3], boards, 3)[..., None] * slope[:, None, None, :, None]
+    return sparse.csr_array(columns.reshape(frames * bend.shape[1] * 2, -1))
 
 
 def _image_grids(

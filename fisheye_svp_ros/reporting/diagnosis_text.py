@@ -75,6 +75,7 @@ COMPONENTS = {
     'frame_linear': 'linear field of each frame',
     'frame_quadratic': 'quadratic field of each frame',
     'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
+    'frame_sag': 'bend of the board that follows its tilt',
     'frame_similar': 'landmarks in similar views', 'noise': 'noise of image points',
 }
 STAGE_WORDS = {
