@@ -13,6 +13,7 @@ from fisheye_svp_ros.diagnosis.checks.medium import Medium
 from fisheye_svp_ros.diagnosis.checks.turned_boards import TurnedFrame
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.fitted_model import RepeatedErrors
+from fisheye_svp_ros.diagnosis.random_effects import SAG
 from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_names
@@ -24,6 +25,7 @@ USE_EXTENDED = 'solve with the extended lens file'
 RETAKE, UNLIKE, TURNED = 'retake', 'unlike', 'turned'
 _OUTSTANDING_RATIO = 2.0  # times the typical one
 _MAX_LISTED = 8
+_MIN_SAG = 0.05  # mm
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,8 @@ def advise(
     advice = _use_causes(evaluation, causes)
     if any(part.stage == 'target' for part in parts):
         advice += _measure_landmarks(evaluation, (1 - gains['named'].value) * gains['local'].value)
+    if any(part.name == SAG for part in parts):
+        advice += _support_boards(evaluation)
     if evaluation.offsets.views is not None:
         advice.append(_vary_views(evaluation.offsets.views))
     advice += _retake_frames(evaluation)
@@ -102,6 +106,16 @@ def _use_causes(evaluation: Evaluation, causes: Sequence[Cause]) -> list[Advice]
             gain=target,
         ))
     return advice
+
+
+def _support_boards(evaluation: Evaluation) -> list[Advice]:
+    """Return what to do about boards that sag by their own weight."""
+    boards = evaluation.null.linear.scene.boards
+    sizes = np.linalg.norm(evaluation.fitted.board_sags(), ord=2, axis=(1, 2))
+    return [Advice(
+        f'support the board or hold it upright: it bends by {size:.1f} mm between lying face up '
+        'and upright', boards=[board.id])
+        for board, size in zip(boards, sizes, strict=True) if size > _MIN_SAG]
 
 
 def _check_held_out(evaluation: Evaluation) -> list[Advice]:

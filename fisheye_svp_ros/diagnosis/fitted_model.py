@@ -25,6 +25,7 @@ from fisheye_svp_ros.diagnosis.null_model import (
 from fisheye_svp_ros.diagnosis.random_effects import (
     MILLIMETRE,
     NAMES,
+    SAG,
     ImageGrid,
     RandomEffects,
     make_random_effects,
@@ -257,6 +258,15 @@ class FittedModel:
             values, shared = np.split(shared, [2 * len(grid.centres)])
             grids.append((grid, values.reshape(-1, 2)))
         return PredictedOffsets(random.landmark, in_target, tuple(grids))
+
+    def board_sags(self) -> Array:
+        """Return how far boards bend as their normals turn, by gravity (boards, 3, 3), mm.
+
+        x^2, xy and y^2 over the size of a board, by each component of its normal.
+        """
+        eq, columns = self.factored.equations, self.random.columns
+        shared = eq.split(self.solution.e[..., None], self.solution.r[:, None])[2][:, 0]
+        return np.asarray(shared[columns.shared_label == NAMES.index(SAG)].reshape(-1, 3, 3))
 
     def target_modes(self, sigma: float) -> tuple[Array, Array]:
         """Return how far the landmarks may be off: modes (L, 3, K) and alone (L, 3), m.

@@ -225,9 +225,15 @@ class NullModel:
         return leave_groups_out(self.factorization, self.active_effects.columns,
                                 self.linear.frame_columns, self.fixed.border)
 
-    def information_without_frames(self, at: Index) -> Array:
-        """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
+    def information_without_frames(self, at: Index, cluster: Index | None = None) -> Array:
+        """Return the information (C, m, m) of all frames but one, of some of the border (m,).
+
+        cluster (F,): of each frame, 0 to C - 1, whose frames are left out together, as if what
+        they tell did not depend on each other.
+        """
         frames = self.leave_one_out.information[:, at[:, None], at]
+        if cluster is not None:
+            frames = np.stack([frames[cluster == i].sum(axis=0) for i in range(cluster.max() + 1)])
         return self.information[at[:, None], at] - frames / self.variances.sigma**2
 
     @property

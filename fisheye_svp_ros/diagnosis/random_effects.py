@@ -20,13 +20,14 @@ from fisheye_svp_ros.mixed_model import Components, RandomColumns
 from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
 
+SAG = 'frame_sag'
 STAGE_OF = {
     'image_broad': 'lens', 'image_coarse': 'lens', 'image_fine': 'lens', 'image_finest': 'lens',
     'landmark_in_plane': 'target', 'landmark_normal': 'target', 'landmark': 'target',
     'board_stretch': 'target', 'board_in_plane': 'target', 'board_normal': 'target',
     'frame_focal': 'frame', 'frame_centre': 'frame', 'frame_linear': 'frame',
     'frame_quadratic': 'frame', 'frame_bumps': 'frame', 'frame_bend': 'frame',
-    'frame_sag': 'frame',
+    SAG: 'frame',
 }
 NAMES = tuple(STAGE_OF)
 OF_LANDMARKS = np.array([name.startswith('landmark') for name in NAMES])  # components
@@ -232,8 +233,10 @@ def make_random_effects(
     weight = points.weight.reshape(-1, 1)
     parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
     parts += [_field_columns(points, field) for field in fields]
-    parts.append(_sag_columns(points))
-    names = [*(one.name for one in (*grids, *fields)), 'frame_sag']
+    names = [*(grid.name for grid in grids), *(field.name for field in fields)]
+    if linear.data.poses is None:  # else the camera moves, and gravity beside it
+        parts.append(_sag_columns(points))
+        names.append(SAG)
     of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
@@ -303,15 +306,11 @@ def _sag_columns(points: GatheredPoints) -> sparse.csr_array:
     """Return columns (2 F N, 9 boards) of a bend of each board in proportion to its normal.
 
     A board that sags by its own weight bends by b (n . g), n its normal and g the direction of
-    gravity, which stands still beside a camera that does.  The bend of the mean normal is one that
-    all frames share, and no part of it.
+    gravity, which stands still beside a camera that does.
     """
-    bend, frames = _bend_columns(points), len(points.normals)
-    boards = points.normals.shape[1]
-    there = ((points.slot >= 0)[..., None] & (points.board[..., None] == np.arange(boards))).sum(1)
-    mean = np.einsum('fb,fba->ba', there, points.normals) / np.maximum(there.sum(0), 1)[:, None]
-    slope = points.normals - mean
-    columns = bend.reshape(*bend.shape[:3], boards, 3)[..., None] * slope[:, None, None, :, None]
+    bend, (frames, boards, _) = _bend_columns(points), points.normals.shape
+    parts = bend.reshape(*bend.shape[:3], boards, 3)[..., None]
+    columns = parts * points.normals[:, None, None, :, None]
     return sparse.csr_array(columns.reshape(frames * bend.shape[1] * 2, -1))
 
 

@@ -30,7 +30,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, i
 MAX_LENS_ITERATIONS = 200
 _UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 _STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
-_MAX_RISE = 1.5  # of the sum of squares in a Gauss-Newton step: random effects may take up as much
+_MAX_RISE = 1.5  # of the sum of squares in a Gauss-Newton step, over what is expected of it
 _GAUSS_NEWTON_STEPS = 4
 
 
@@ -87,11 +87,13 @@ def gauss_newton(
     step moves predictions by, root mean square, whitened.
     """
     data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
-    limit = _MAX_RISE * float((residual**2).sum())
+    before = float((residual**2).sum())
     for _ in range(_GAUSS_NEWTON_STEPS):
         frame, shared = solve(residual, state)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
         after = partial(_partial_step, state, free, frame, shared)
+        # Random effects take up what the residuals rise by: no more than the columns say.
+        limit = _MAX_RISE * max(before, float(((residual - change) ** 2).sum()))
         state, residual = shorten_step(data, free, after, limit)
         if np.sqrt((change**2).mean()) < tolerance:
             break

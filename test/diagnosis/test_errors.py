@@ -8,14 +8,18 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
-from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import (
+    cluster_frames,
+    model_uncertainty,
+    total_errors,
+)
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.rig_state import group_by_frame
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 from fisheye_svp_ros.study.lens_trust import assess_lens, calibrate_without_outliers
 
 SIGMA, SHIFT = 0.1, 0.004
@@ -213,3 +217,33 @@ def test_a_calibration_does_without_gross_errors():
     assert sorted(gross.rows.tolist()) == far.tolist()
     assert len(kept) == len(table) - len(far)
     assert found.adjusted.lens.parameters == clean.adjusted.lens.parameters
+
+
+def bursts(seed, copies):
+    """Return ten photographs, each taken so many times: what errs, errs alike in all of a pose."""
+    rng = np.random.default_rng(seed)
+    pose, views = scene(rng, frames=40)
+    chosen = np.repeat(np.arange(0, 40, 4), copies)
+    moved = pose.take(chosen).retract(2e-3 * rng.normal(size=(len(chosen), 6)))
+    table = observe(lens(), (), moved, views.take(chosen)._replace(frame=np.arange(len(chosen))),
+                    SIGMA / 2, rng)
+    own = rng.normal(size=(10, table.landmark.max() + 1, 2)) * SIGMA
+    return replace(table, uv=table.uv + own[table.frame // copies, table.landmark])
+
+
+def test_photographs_of_one_pose_are_left_out_together(monkeypatch):
+    data, free = group_by_frame(bursts(1, 4)), ('fx', 'fy', 'cx', 'cy')
+    null = NullModel.estimate(data, adjust(data, initial_state(data, lens()), free), free)
+    pose = cluster_frames(null.linear).reshape(10, 4)
+    assert (pose == pose[:, :1]).all() and len(np.unique(pose)) == 10
+    together = standard_errors(null)
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.uncertainty.cluster_frames',
+                        lambda linear: np.arange(linear.data.frames))
+    assert (together / standard_errors(null)).max() > 1.3
+
+
+def test_two_poses_are_no_sample():
+    data = group_by_frame(bursts(0, 4))
+    data = data.select(data.frame_of < 8)
+    linear = Linearization(data, initial_state(data, lens()), ())
+    assert cluster_frames(linear).tolist() == [*range(8)]
