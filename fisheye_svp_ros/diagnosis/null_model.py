@@ -26,6 +26,7 @@ from fisheye_svp_ros.diagnosis.random_effects import (
     RandomEffects,
     make_random_effects,
 )
+from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.mixed_model import (
@@ -225,16 +226,20 @@ class NullModel:
         return leave_groups_out(self.factorization, self.active_effects.columns,
                                 self.linear.frame_columns, self.fixed.border)
 
-    def information_without_frames(self, at: Index, cluster: Index | None = None) -> Array:
-        """Return the information (C, m, m) of all frames but one, of some of the border (m,).
-
-        cluster (F,): of each frame, 0 to C - 1, whose frames are left out together, as if what
-        they tell did not depend on each other.
-        """
+    def information_without_frames(self, at: Index) -> Array:
+        """Return the information (F, m, m) of all frames but one, of some of the border (m,)."""
         frames = self.leave_one_out.information[:, at[:, None], at]
-        if cluster is not None:
-            frames = np.stack([frames[cluster == i].sum(axis=0) for i in range(cluster.max() + 1)])
         return self.information[at[:, None], at] - frames / self.variances.sigma**2
+
+    def information_without_poses(self, at: Index) -> Array:
+        """Return the information (C, m, m) of all but the frames of one pose (`cluster_frames`).
+
+        As if what these tell did not depend on each other.
+        """
+        whole, cluster = self.information[at[:, None], at], cluster_frames(self.linear)
+        lost = np.zeros((cluster.max() + 1, *whole.shape))
+        np.add.at(lost, cluster, whole - self.information_without_frames(at))
+        return np.asarray(whole - lost)
 
     @property
     def terms(self) -> list[PlacedEffect]:

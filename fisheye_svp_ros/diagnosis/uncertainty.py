@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import special
-from scipy.cluster import hierarchy
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
@@ -20,7 +19,6 @@ from fisheye_svp_ros.mixed_model import (
 
 _MAX_MODELS = 40
 _MIN_FRAMES = 3
-_SIMILAR_POSE = 0.1  # of the distance, or rad
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
 
 
@@ -45,9 +43,8 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
     own, reported = null.included_columns, _reporting_matrix(null)
     estimate, variance, open_ = _estimate(null.information, own, reported)
     if jackknife and null.linear.data.frames > 2:
-        cluster = cluster_frames(null.linear)
         changed, allowed = np.zeros(null.column_count), np.zeros(null.column_count)
-        for part in null.information_without_frames(np.append(own, len(null.scale)), cluster):
+        for part in null.information_without_poses(np.append(own, len(null.scale))):
             other, wider, lost = _estimate(part, own, reported)
             changed += np.where(lost, 0.0, (other - estimate) ** 2)
             allowed += np.where(lost, 0.0, wider - variance)
@@ -55,24 +52,6 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
         variance = variance * np.maximum(changed / np.maximum(allowed, least), 1.0)
     errors = np.sqrt(variance) / null.scale[: null.column_count]
     return np.where(open_, np.nan, errors)
-
-
-def cluster_frames(linear: Linearization) -> Index:
-    """Return the cluster (F,) of each frame: those in which the target is seen in one pose.
-
-    Two poses of a cluster differ by at most a tenth: of the distance, or of a radian.  Each frame
-    has its own where there are fewer than three clusters, which would be no sample.
-    """
-    pose, points = linear.state.pose, linear.data.views.points[linear.data.views.used]
-    center = pose.into_body(np.broadcast_to(points.mean(axis=0), (len(pose.position), 1, 3)))[:, 0]
-    away = np.maximum(np.linalg.norm(center, axis=1, keepdims=True), 1e-300)
-    place = np.concatenate([center / away, np.log(away)], axis=1)
-    turn = pose.rotation.reshape(-1, 9) / np.sqrt(2)  # a distance of small angles
-    tree = hierarchy.linkage(np.concatenate([place, turn], axis=1), 'complete')
-    cluster = hierarchy.fcluster(tree, _SIMILAR_POSE, 'distance')
-    if cluster.max() < _MIN_FRAMES:
-        return np.arange(len(place))
-    return cluster.astype(np.int64) - 1
 
 
 def _reporting_matrix(null: NullModel) -> Array:

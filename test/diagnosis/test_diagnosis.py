@@ -458,7 +458,7 @@ def test_frames_that_scatter_more_than_their_noise_widen_the_standard_error(spre
     values = spread * np.random.default_rng(27).normal(size=40)
     null = SimpleNamespace(
         column_count=1, included_columns=np.arange(1), terms=[], scale=np.array([2.0]),
-        information=information(values), information_without_frames=lambda at: [
+        information=information(values), information_without_poses=lambda at: [
             information(np.delete(values, i)) for i in range(40)],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     expected = 1 if spread == 1 else values.std(ddof=1)
@@ -474,7 +474,7 @@ def test_what_one_frame_alone_tells_is_as_sure_as_that_frame():
     null = SimpleNamespace(
         column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
         information=rows.T @ rows,
-        information_without_frames=lambda at: [w.T @ w for w in without],
+        information_without_poses=lambda at: [w.T @ w for w in without],
         linear=SimpleNamespace(data=SimpleNamespace(frames=40)))
     assert standard_errors(null) == pytest.approx([39**-0.5, (1 + 1 / 39) ** 0.5])
 

@@ -8,11 +8,8 @@ import pytest
 from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
-from fisheye_svp_ros.diagnosis.uncertainty import (
-    cluster_frames,
-    model_uncertainty,
-    total_errors,
-)
+from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
+from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.optics.lens import parameter_values
@@ -140,7 +137,7 @@ def test_what_no_frame_tells_of_has_no_error():
     null = SimpleNamespace(
         column_count=2, included_columns=np.arange(2), terms=[], scale=np.ones(2),
         information=information,
-        information_without_frames=lambda at: np.stack([0.9 * information] * 3),
+        information_without_poses=lambda at: np.stack([0.9 * information] * 3),
         linear=SimpleNamespace(data=SimpleNamespace(frames=3)))
     np.testing.assert_allclose(standard_errors(null), [np.nan, 0.5])
 
@@ -237,7 +234,7 @@ def test_photographs_of_one_pose_are_left_out_together(monkeypatch):
     pose = cluster_frames(null.linear).reshape(10, 4)
     assert (pose == pose[:, :1]).all() and len(np.unique(pose)) == 10
     together = standard_errors(null)
-    monkeypatch.setattr('fisheye_svp_ros.diagnosis.uncertainty.cluster_frames',
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.null_model.cluster_frames',
                         lambda linear: np.arange(linear.data.frames))
     assert (together / standard_errors(null)).max() > 1.3
 
