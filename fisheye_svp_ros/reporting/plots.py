@@ -56,7 +56,8 @@ def drawing(file: BytesIO, width: float, height: float, form: str = 'png') -> It
         assert engine is not None
         engine.execute(figure)
         figure.set_layout_engine(None)
-        figure.savefig(file, format=form, pil_kwargs=_COMPRESSION if form == 'png' else None)
+        options = {'pil_kwargs': _COMPRESSION} if form == 'png' else {}  # a PDF takes none
+        figure.savefig(file, format=form, **options)
 
 
 def round_number(value: float) -> float:
