@@ -56,7 +56,7 @@ def drawing(file: BytesIO, width: float, height: float, form: str = 'png') -> It
         assert engine is not None
         engine.execute(figure)
         figure.set_layout_engine(None)
-        options = {'pil_kwargs': _COMPRESSION} if form == 'png' else {}  # a PDF takes none
+        options: Any = {'pil_kwargs': _COMPRESSION} if form == 'png' else {}  # a PDF takes none
         figure.savefig(file, format=form, **options)
 
 
