@@ -38,23 +38,37 @@ _DELIVERY_TIMEOUT = 20.0  # s for which the end waits for subscribers that are h
 
 
 class CameraTopics:
-    """The topics of one camera; name: its namespace, empty for the only camera."""
+    """The topics of one camera; name: its namespace, empty for the only camera.
 
-    def __init__(self, node: CameraNode, name: str, photographs: bool) -> None:
+    has_truth: whether true poses are known; a solver waits for them if they are announced.
+    """
+
+    def __init__(
+        self, node: CameraNode, name: str, photographs: bool, has_truth: bool
+    ) -> None:
         prefix, settings = f'{name}/' if name else '', node.settings
+        self._prefix, self._photographs = prefix, photographs
         self._world, self._transforms = settings.world_frame, node.transforms
         # Cameras in several namespaces are several cameras, also for tf2.
         space = [] if settings.camera_frame else node.get_namespace().strip('/').split('/')
         words = [*space, name, settings.camera_frame or _CAMERA_FRAME]
         self.frame = '_'.join(filter(None, words))
         self._info = node.announce(CameraInfo, f'{prefix}camera_info', LATCHED_SETS)
-        # Who solves listens to the true pose, but not to images.
-        self._pose = node.announce(PoseStamped, f'{prefix}true_pose', wait=photographs)
+        self._pose: Any = None
+        if has_truth:
+            self.announce_truth(node)
         self._images = self._points = None
         if photographs:
             self._images = node.announce(Image, f'{prefix}image', SENSOR)
         else:
             self._points = node.announce(PointCloud2, f'{prefix}image_points', wait=True)
+
+    def announce_truth(self, node: CameraNode) -> None:
+        """Announce true poses, unless they are."""
+        if self._pose is None:
+            # Who solves listens to the true pose, but not to images.
+            self._pose = node.announce(
+                PoseStamped, f'{self._prefix}true_pose', wait=self._photographs)
 
     @property
     def is_watched(self) -> bool:
@@ -134,10 +148,12 @@ class CameraNode(BaseNode):
             self.destroy_timer(self._timer)
         self._timer = self.start_timer(1 / self.settings.rate, self._tick, self.get_clock())
 
-    def camera(self, name: str) -> CameraTopics:
-        """Return the topics of a camera."""
+    def camera(self, name: str, has_truth: bool = True) -> CameraTopics:
+        """Return the topics of a camera; has_truth: whether its true poses are known."""
         if name not in self._cameras:
-            self._cameras[name] = CameraTopics(self, name, self.photographs)
+            self._cameras[name] = CameraTopics(self, name, self.photographs, has_truth)
+        elif has_truth:
+            self._cameras[name].announce_truth(self)
         return self._cameras[name]
 
     def tag(self, stamp: int, values: Mapping[str, Any], text: str = '') -> None:

@@ -88,7 +88,7 @@ class MeasuredCamera(CameraNode):
     def configure(self, recording: Recording) -> None:
         """Start over with another recording."""
         for name in recording.observations.cameras:
-            self.camera(name)
+            self.camera(name, bool(recording.poses))
         self._recording = recording
         self.publish_landmarks(recording.landmarks, 0)
         frames = recording.observations.frames.tolist()
@@ -108,7 +108,8 @@ class MeasuredCamera(CameraNode):
             rows = recording.rows.get((step, name))
             if rows is not None:
                 seen = recording.observations.take(rows)
-                self.camera(name).publish(stamp, seen, recording.poses.get(step), recording.lens)
+                self.camera(name, bool(recording.poses)).publish(
+                    stamp, seen, recording.poses.get(step), recording.lens)
 
 
 def frame_stamps(table: Observations) -> dict[int, int]:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.graph import LATCHED, Graph
+from helpers.graph import LATCHED, Graph, set_parameter
 
 from diagnostic_msgs.msg import DiagnosticArray  # isort: skip
 from geometry_msgs.msg import PoseStamped  # isort: skip
@@ -17,13 +18,17 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.decoding import read_key_values, stamp_of
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.io.lens_files import load_lens
+from fisheye_svp_ros.io.observations_csv import write_observations
+from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
+from fisheye_svp_ros.nodes.measured_camera import MeasuredCamera
 from fisheye_svp_ros.nodes.stereo_depth import StereoDepth
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.rigs import paper_pose
+from fisheye_svp_ros.simulate.scenario import Scenario, simulate_scenario
 
 MS = 10**6
 LENS = load_lens(lens_path('fish214')).svp()
@@ -96,6 +101,23 @@ def test_a_true_pose_that_nobody_publishes_is_not_waited_for(
     told.publish(messages.landmarks_message(LANDMARKS, 0, 'world'))
     points.publish(points_message(moved(1.0), 1000 * MS))
     assert not g.until(lambda: results)[0].status[0].message
+
+
+def test_a_measured_camera_announces_true_poses_that_it_has(
+    graph: Callable[..., Graph], tmp_path: Path
+) -> None:
+    """A solver would wait for others, before its first set."""
+    write_observations(tmp_path / 'seen.csv', simulate_scenario(Scenario()).observations)
+    write_poses(tmp_path / 'poses.csv', np.array([0]), moved(0.0).reshape(1))
+    g = graph(f'observations:={tmp_path}/seen.csv', 'lens:=fish214', 'patience:=3600.0',
+              f'folder:={tmp_path}', 'rate:=20.0')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    g.start(Localizer)
+    camera = g.start(MeasuredCamera)
+    g.until(lambda: results)
+    assert not g.probe.count_publishers('/true_pose')
+    assert set_parameter(camera, 'true_poses', f'{tmp_path}/poses.csv').successful
+    g.until(lambda: 'position_error_m' in read_key_values(results[-1]))
 
 
 def test_poses_that_are_too_far_apart_give_no_error_and_no_delay(
