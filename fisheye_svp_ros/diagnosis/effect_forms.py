@@ -54,7 +54,7 @@ class EffectForms:
 def effect_forms(linear: Linearization, left_out: Sequence[str] = ()) -> EffectForms:
     """Return the columns of the catalogue, without the effects left out."""
     effects, richest, untestable = _catalogue_effects(linear, left_out)
-    alike = _look_alikes(linear) if effects else []
+    alike = _look_alikes(linear, left_out) if effects else []
     ends = np.cumsum([0, *(len(effect.parameters) for effect in (*effects, *alike))])
     at = [np.arange(*ends[i : i + 2]) for i in range(len(ends) - 1)]
     blocks = [linear.effect_columns(effect) for effect in (*effects, *alike)]
@@ -99,9 +99,9 @@ def _catalogue_effects(
     return effects, richest, untestable
 
 
-def _look_alikes(linear: Linearization) -> list[Effect]:
+def _look_alikes(linear: Linearization, left_out: Sequence[str]) -> list[Effect]:
     """Return effects that are not tested, of each camera, as others may be mistaken for them."""
-    return [form for kind in CATALOGUE.unlisted.values()
+    return [form for name, kind in CATALOGUE.unlisted.items() if name not in left_out
             for own in _forms(kind, linear) for form in own]
 
 

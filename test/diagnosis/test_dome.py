@@ -5,11 +5,14 @@ import pytest
 from helpers.water import AIR, photographs
 
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.effect_forms import effect_forms
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.dome_port import DomePortEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 
 DOME = DomeGlass(0.05, 1.0, 0.003, -0.008, 0.002, 0.005)
 STATED = DomePortEffect(DOME.radius, DOME.thickness, DOME.glass_index)
@@ -43,5 +46,11 @@ def test_a_stated_dome_is_named_and_its_place_measured(seen):
         STATED.extend(found.lens, np.zeros(2))
 
 
-def test_a_look_alike_is_no_effect_to_be_tested():
+def test_a_look_alike_is_no_effect_to_be_tested(seen):
     assert 'dome_port' in CATALOGUE and 'dome_port' not in list(CATALOGUE)
+    table, lens = seen
+    data = group_by_frame(table)
+    linear = Linearization(data, initial_state(data, lens), ())
+    (effect, _), = effect_forms(linear).look_alikes
+    assert effect.name == 'dome_port'
+    assert not effect_forms(linear, ('dome_port',)).look_alikes
