@@ -30,7 +30,9 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, i
 MAX_LENS_ITERATIONS = 200
 _UNDETERMINED_EIGENVALUE = 1e-13  # of the information, relative; rounding leaves about 1e-15
 _STEP_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.0)
-_MAX_RISE = 1.5  # of the sum of squares in a Gauss-Newton step, over what is expected of it
+# Of the sum of squares in a Gauss-Newton step: random effects may take up as much, and more where
+# the columns say so and predictions move as they say, but for this share of the squares.
+_MAX_RISE, _LINEAR_SHARE = 1.5, 1e-3
 _GAUSS_NEWTON_STEPS = 4
 
 
@@ -87,14 +89,19 @@ def gauss_newton(
     step moves predictions by, root mean square, whitened.
     """
     data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
-    before = float((residual**2).sum())
+    limit = _MAX_RISE * float((residual**2).sum())
+
+    def is_sound(before: Array, change: Array, part: float, after: Array) -> bool:
+        expected = before - part * change
+        apart = float(((after - expected) ** 2).sum())
+        return (float((after**2).sum()) <= limit
+                or apart <= _LINEAR_SHARE * float(((part * change) ** 2).sum()))
+
     for _ in range(_GAUSS_NEWTON_STEPS):
         frame, shared = solve(residual, state)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
         after = partial(_partial_step, state, free, frame, shared)
-        # Random effects take up what the residuals rise by: no more than the columns say.
-        limit = _MAX_RISE * max(before, float(((residual - change) ** 2).sum()))
-        state, residual = shorten_step(data, free, after, limit)
+        state, residual = shorten_step(data, free, after, partial(is_sound, residual, change))
         if np.sqrt((change**2).mean()) < tolerance:
             break
     return state
@@ -108,18 +115,18 @@ def _partial_step(
 
 def shorten_step(
     data: RigViews, free: Sequence[str], after: Callable[[float], RigState],
-    limit: float = np.inf,
+    is_sound: Callable[[float, Array], bool] = lambda *_: True,
 ) -> tuple[RigState, Array]:
     """Return the state after so much of a step that all points are seen, and its residual (F, M).
 
     A step far beyond where the columns hold may take points out of sight, or lead away from them.
-    after: makes a state of a fraction of the step; limit: of the sum of squares.
+    after: makes a state of a fraction of the step; is_sound: whether a fraction may be taken that
+    leads to such a residual.
     """
     for part in _STEP_FRACTIONS:
         state = after(part)
         residual = Linearization(data, state, free).residual
-        squares = float((residual**2).sum())
-        if np.isfinite(squares) and squares <= limit:
+        if np.isfinite(residual).all() and is_sound(part, residual):
             break
     return state, residual
 
