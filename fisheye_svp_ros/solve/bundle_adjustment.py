@@ -91,17 +91,16 @@ def gauss_newton(
     data, state, free, residual = linear.data, linear.state, linear.free, linear.residual
     limit = _MAX_RISE * float((residual**2).sum())
 
-    def is_sound(before: Array, change: Array, part: float, after: Array) -> bool:
-        expected = before - part * change
-        apart = float(((after - expected) ** 2).sum())
-        return (float((after**2).sum()) <= limit
-                or apart <= _LINEAR_SHARE * float(((part * change) ** 2).sum()))
+    def is_linear(before: Array, change: Array, part: float, after: Array) -> bool:
+        apart = after - (before - part * change)
+        return float((apart**2).sum()) <= _LINEAR_SHARE * float(((part * change) ** 2).sum())
 
     for _ in range(_GAUSS_NEWTON_STEPS):
         frame, shared = solve(residual, state)
         change = (linear.frame_columns @ frame[..., None])[..., 0] + linear.shared_columns @ shared
         after = partial(_partial_step, state, free, frame, shared)
-        state, residual = shorten_step(data, free, after, partial(is_sound, residual, change))
+        state, residual = shorten_step(
+            data, free, after, limit, partial(is_linear, residual, change))
         if np.sqrt((change**2).mean()) < tolerance:
             break
     return state
@@ -115,18 +114,19 @@ def _partial_step(
 
 def shorten_step(
     data: RigViews, free: Sequence[str], after: Callable[[float], RigState],
-    is_sound: Callable[[float, Array], bool] = lambda *_: True,
+    limit: float = np.inf, is_linear: Callable[[float, Array], bool] = lambda *_: False,
 ) -> tuple[RigState, Array]:
     """Return the state after so much of a step that all points are seen, and its residual (F, M).
 
     A step far beyond where the columns hold may take points out of sight, or lead away from them.
-    after: makes a state of a fraction of the step; is_sound: whether a fraction may be taken that
-    leads to such a residual.
+    after: makes a state of a fraction of the step; limit: of the sum of squares, unless is_linear:
+    whether a fraction leads to the residual that it ought to.
     """
     for part in _STEP_FRACTIONS:
         state = after(part)
         residual = Linearization(data, state, free).residual
-        if np.isfinite(residual).all() and is_sound(part, residual):
+        squares = float((residual**2).sum())
+        if np.isfinite(squares) and (squares <= limit or is_linear(part, residual)):
             break
     return state, residual
 
