@@ -16,6 +16,7 @@ from fisheye_svp_ros.diagnosis.fitted_model import MIN_PAIRS, FittedModel
 
 _LARGEST_SQUARE = 20.0  # of a standardized residual: an outlier counts no more
 _LANDMARK_SIGMAS = 2.6  # standard errors of the growth, within landmarks
+_ACROSS_SIGMAS, _ACROSS_SHARE = 2.0, 0.5  # of that across the radius; its share of the growth
 _CLOSEST_PAIRS = 500
 _RING = 10  # points of nearly the same height
 _MIN_REST = 0.2  # of a variance, beside the leverage
@@ -36,6 +37,7 @@ def noise_growth(fitted: FittedModel) -> NoiseGrowth:
 
     There is none where the same landmarks do not scatter more at larger angles, or points of
     different frames on the same place do not: some landmarks, or places, err more than others.
+    Nor where they do so along the radius alone, as ripples of a lens and its colors make them.
     """
     linear = fitted.linear
     used = linear.row_mask
@@ -43,24 +45,31 @@ def noise_growth(fitted: FittedModel) -> NoiseGrowth:
     theta = linear.data.blocks(np.nan_to_num(linear.scene.theta)[..., None] * np.ones(2))
     every = theta**2 - (theta[used] ** 2).mean()
     z, e2 = every[used], np.minimum(errors.ravel() ** 2, _LARGEST_SQUARE)
+    value, gain = _fit_growth(e2, z)
+    # Heavier tails than the normal distribution's scatter the squares more.
+    tails = max(float(e2.var()) / 2, 1.0)
+    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
+    sign, pairs = np.sign(value), fitted.point_pairs()
+    frame, across = np.nonzero(used)[0], _fit_growth(e2[1::2], z[1::2])[0]
+    confirmed = (
+        sign * across > _ACROSS_SHARE * abs(value)
+        and sign * _growth_within(e2, z, np.repeat(landmark, 2), frame) > _LANDMARK_SIGMAS
+        and sign * _growth_within(e2[1::2], z[1::2], landmark, frame[1::2]) > _ACROSS_SIGMAS
+        and sign * _growth_on_places(errors, z[::2], *pairs) > _PLACE_SIGMAS)
+    p = float(special.chdtrc(1, max(gain / tails, 0.0))) if confirmed else 1.0
+    level = float(np.mean(e2 * np.exp(-2 * value * z)))
+    return NoiseGrowth(value, stderr, p, level * np.exp(2 * value * every))
+
+
+def _fit_growth(e2: Array, z: Array) -> tuple[float, float]:
+    """Return the likeliest growth of squares (M,) with centered z (M,), and twice its log odds."""
 
     def deviance(growth: float) -> float:
-        # With z centred the mean of log sigma does not change: only the scale is profiled out.
+        # The mean of log sigma does not change: only the scale is profiled out.
         return float(len(z) * np.log(np.mean(e2 * np.exp(-2 * growth * z))))
 
     best = optimize.minimize_scalar(deviance, bounds=(-3.0, 3.0), method='bounded')
-    # Heavier tails than the normal distribution's scatter the squares more.
-    tails = max(float(e2.var()) / 2, 1.0)
-    gain = (deviance(0.0) - float(best.fun)) / tails
-    stderr = float(np.sqrt(tails / 2 / (z**2).sum()))
-    sign, pairs = np.sign(best.x), fitted.point_pairs()
-    confirmed = (
-        sign * _growth_within(e2, z, np.repeat(landmark, 2), np.nonzero(used)[0])
-        > _LANDMARK_SIGMAS
-        and sign * _growth_on_places(errors, z[::2], *pairs) > _PLACE_SIGMAS)
-    p = float(special.chdtrc(1, max(gain, 0.0))) if confirmed else 1.0
-    level = float(np.mean(e2 * np.exp(-2 * best.x * z)))
-    return NoiseGrowth(float(best.x), stderr, p, level * np.exp(2 * best.x * every))
+    return float(best.x), deviance(0.0) - float(best.fun)
 
 
 def _scatter(fitted: FittedModel) -> tuple[Array, Index]:
