@@ -26,7 +26,7 @@ def test_a_rig_is_calibrated_and_posed() -> None:
 
 
 def test_cameras_that_nothing_holds_are_refused() -> None:
-    with pytest.raises(fsvp.FisheyeSvpError, match='nothing holds cam3 to cam0, cam1, cam2'):
+    with pytest.raises(fsvp.FisheyeSvpError, match='cam3 cannot be related to cam0, cam1, cam2'):
         fsvp.calibrate_rig(photographs(3, (45.0, 135.0)), LENSES)
 
 
