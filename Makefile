@@ -11,7 +11,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out
 # One more than there are cores: tests of nodes wait for messages most of the time.
-WORKERS ?= $(shell expr $$(nproc) + 1)
+WORKERS ?= $(shell expr $$(env -u OMP_NUM_THREADS nproc) + 1)
 # Further arguments of pytest, for example PYTEST='-k lens'.
 PYTEST ?=
 # Rooms whose tests start no process, nor diagnose whole sets.
@@ -20,14 +20,18 @@ QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve 
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test coverage lint paper paper-search blind blind-independent blind-images averaging image-field guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test tests coverage lint paper paper-search blind blind-independent blind-images averaging image-field guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
 
 # One thread each for NumPy, since the tests are spread over all cores.
-check test coverage test-oldest: export OMP_NUM_THREADS := 1
-test: $(VENV)/ready lint
+check tests coverage test-oldest: export OMP_NUM_THREADS := 1
+# The linters run beside the first tests.
+test: $(VENV)/ready
+	$(MAKE) --no-print-directory -j2 lint tests
+
+tests: $(VENV)/ready
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
 
 # For every save: lint, and the tests that take under two minutes on two cores.
