@@ -15,7 +15,12 @@ from fisheye_svp_ros.diagnosis.advice import advise, turn_advice
 from fisheye_svp_ros.diagnosis.causes import Cause, growth_cause, outlier_rows, table_causes
 from fisheye_svp_ros.diagnosis.checks.medium import behind_port, find_medium
 from fisheye_svp_ros.diagnosis.checks.robot_poses import find_hand_eye, prepare_problem
-from fisheye_svp_ros.diagnosis.checks.turned_boards import find_turned_frames, turn_frames
+from fisheye_svp_ros.diagnosis.checks.turned_boards import (
+    TurnedFrame,
+    find_turned_frames,
+    find_turned_views,
+    turn_frames,
+)
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TwoCameras, agree_on_target
 from fisheye_svp_ros.diagnosis.checks.two_datasets import DatasetModel, compare_datasets
 from fisheye_svp_ros.diagnosis.conclusion import advice_on_lens, conclude
@@ -110,24 +115,31 @@ def diagnose_against(
 
 
 class _Evaluated(NamedTuple):
-    """What the stages up to the evaluation return; of_robot: the poses are those of a flange."""
+    """What the stages up to the evaluation return.
+
+    of_robot: the poses are those of a flange; turned: views that were put in the order of the
+    other cameras.
+    """
 
     evaluation: Evaluation
     candidates: list[UnconfirmedCause]
     cameras: list[TwoCameras]
     of_robot: bool
+    turned: tuple[TurnedFrame, ...]
 
 
 def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     """Take checked inputs through all stages, twice where frames were in another order."""
     evaluated = _evaluate(inputs, progress)
+    inputs = evaluated.evaluation.selection.problem.inputs
+    views = evaluated.turned
     turned = [] if inputs.poses is not None else find_turned_frames(
         evaluated.evaluation.null, evaluated.evaluation.fitted)
     if any(one.corrected for one, _ in turned):
         table = turn_frames(inputs.observations, turned)
         evaluated = _evaluate(replace(inputs, observations=table), progress)
     found = _conclude(evaluated.evaluation, evaluated.candidates, evaluated.cameras)
-    frames = tuple(one for one, _ in turned)
+    frames = (*views, *(one for one, _ in turned))
     found = replace(found, advice=[*turn_advice(frames), *found.advice],
                     record=found.record._replace(turned=frames))
     if inputs.poses is None or not evaluated.of_robot:
@@ -140,6 +152,10 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
     """Take checked inputs through the stages up to the evaluation of confirmed causes."""
     progress('fitting the simulation as it is', 0.0)
     problem, of_robot = prepare_problem(inputs)
+    turned = find_turned_views(problem) if problem.inputs.poses is None else []
+    if turned:
+        table = turn_frames(inputs.observations, turned)
+        problem, of_robot = prepare_problem(replace(inputs, observations=table))
     medium = find_medium(problem, progress)
     if medium is not None:
         problem = behind_port(problem, medium)
@@ -152,7 +168,7 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
         one, FittedModel.solve_null_model(one.null), medium))
-    return _Evaluated(evaluation, candidates, cameras, of_robot)
+    return _Evaluated(evaluation, candidates, cameras, of_robot, tuple(one for one, _ in turned))
 
 
 def _conclude(

@@ -42,6 +42,15 @@ def test_cameras_bear_each_other_out():
     assert 'agree' in sections(found)[0].sentence
 
 
+def test_reversed_views_are_put_in_the_order_of_the_other_camera():
+    seen = pair(replace(SMALL, reversed_frames=2), 3)
+    found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
+    assert [one['frame'] for one in found.to_dict()['turned']] == seen.reversed_frames
+    assert all(one.corrected and one.degrees == 180 for one in found.record.turned)
+    assert not torn_frames(found) and found.figures.extended.rms_px < 0.11
+    assert 'numbered from another end of the board' in verdict_sentences(found)[2]
+
+
 def test_cameras_that_see_different_boards_contradict_each_other():
     seen = pair(replace(SMALL, apart=True, bend=2e-3, reversed_frames=0), 1)
     found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))

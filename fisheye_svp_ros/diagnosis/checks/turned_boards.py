@@ -16,19 +16,24 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
 from fisheye_svp_ros.diagnosis.null_model import NullModel
+from fisheye_svp_ros.diagnosis.problem import Problem
 from fisheye_svp_ros.diagnosis.random_effects import MILLIMETRE, NAMES
 from fisheye_svp_ros.effects.target_map import KnownTarget
 from fisheye_svp_ros.scene.board_turns import BoardTurn, board_turns
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.solve.initial_rig import localize_cameras
+from fisheye_svp_ros.solve.outliers import FRAME, cross_camera_offsets
 from fisheye_svp_ros.solve.rig_checks import is_unpaired
+from fisheye_svp_ros.solve.rig_state import RigViews, group_by_frame
 
 _PRIOR = 0.01  # how probable it is, before any data, that a photograph is numbered otherwise
 SUSPECT_ODDS, CERTAIN_ODDS = 20.0, 1000.0
 _MAX_LOG_ODDS = 27.6  # odds beyond 1e12 rest on the tails of no data
 _MIN_FRAMES, _MIN_POINTS = 4, 6
 _START_MM, _EM_STEPS = 0.3, 8
+_CONSISTENT_RATIO = 3.0  # times the median offset between cameras: within it they agree
 _MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, in standard deviations
 
 
@@ -36,7 +41,7 @@ _MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, in standard deviations
 class TurnedFrame:
     """A frame whose board is numbered from another end than in the others.
 
-    camera: of a view that is posed by itself, else ''; photograph: what it is called; odds: that
+    camera: of a single view, '' for the whole frame; photograph: what it is called; odds: that
     it is so; corrected: whether it is diagnosed in the order of the others.
     """
 
@@ -134,6 +139,48 @@ def _restricted_likelihood(rows: Array, covariance: Array, fixed: Array) -> tupl
     square = np.einsum('fni,fnij,fnj->f', rows, inverse, rows) - taken
     logs = np.log(np.linalg.det(covariance)).sum(axis=1) + np.linalg.slogdet(normal)[1]
     return -(logs + square) / 2, square
+
+
+def find_turned_views(problem: Problem) -> list[tuple[TurnedFrame, BoardTurn]]:
+    """Return the views that contradict the other cameras of their frame, but do not when turned.
+
+    Of two views either may be the one, and both are named; `find_turned_frames` tests the whole
+    frame afterwards.
+    """
+    table, outliers = problem.observations, problem.outliers
+    rows = outliers.rows[[why == FRAME for why in outliers.why]]
+    if not len(rows) or is_unpaired(problem.data):
+        return []
+    torn = np.unique(table.frame[rows])
+    agreed = _cross_camera_misfits(problem, problem.data).values()
+    usual = float(np.median([misfit for misfit in agreed if np.isfinite(misfit)] or [np.inf]))
+    target = KnownTarget.from_views(problem.table.views)
+    trials = []
+    for turn in board_turns(Landmarks(target.landmark, target.points), target.board):
+        for camera in range(len(table.cameras)):
+            data = group_by_frame(turn.apply(
+                table, np.isin(table.frame, torn) & (table.camera == camera)))
+            data = data.select(np.isin(data.views.frame, torn))
+            trials.append((camera, turn, _cross_camera_misfits(problem, data)))
+    before, found = _cross_camera_misfits(problem, problem.table), []
+    for frame in torn.tolist() if trials else ():
+        camera, turn, misfits = min(trials, key=lambda one: one[2][frame])
+        if misfits[frame] > _CONSISTENT_RATIO * usual:
+            continue
+        gain = (before[frame]**2 - misfits[frame]**2) / (2 * usual**2) + np.log(_PRIOR)
+        name, views = table.cameras[camera], int((problem.table.views.frame == frame).sum())
+        found.append((TurnedFrame(
+            frame, name, frame_name(table, frame, name if views > 2 else None), turn.degrees,
+            float(np.exp(min(gain, _MAX_LOG_ODDS))), bool(gain > np.log(CERTAIN_ODDS))), turn))
+    return found
+
+
+def _cross_camera_misfits(problem: Problem, data: RigViews) -> dict[int, float]:
+    """Return how far off, px, a view of each frame is at most from where the rig has it."""
+    alone = localize_cameras(problem.base.model, data.views)
+    misfit = cross_camera_offsets(data, problem.base, alone)[0]
+    return {frame: float(misfit[data.views.frame == frame].max())
+            for frame in np.unique(data.views.frame).tolist()}
 
 
 def find_turned_frames(
