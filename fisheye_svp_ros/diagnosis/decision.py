@@ -248,5 +248,5 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
         return Decision('more', f'{len(facts.unlike)} of {facts.frames} are not predicted by the '
                                 'others',
                         figure, None)
-    return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times the noise',
-                    figure, None)
+    return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times what '
+                              'noise and scatter between frames leave', figure, None)

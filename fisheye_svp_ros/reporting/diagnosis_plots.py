@@ -82,8 +82,8 @@ def _draw_field(axes: Any, points: PointResiduals, name: str, lens: Lens) -> Non
     for kind, row in enumerate(axes):
         typical = float(np.quantile(np.linalg.norm(fields[0][kind][1], axis=1), 0.9))
         for axis, field, (_, colour) in zip(row, fields, _SIDES, strict=True):
-            _image_frame(axis, lens)
-            _arrows(axis, *field[kind], typical, cell, colour)
+            draw_image_frame(axis, lens)
+            draw_arrows(axis, *field[kind], typical, cell, colour)
             axis.label_outer()
     for axis, (side, colour) in zip(axes[0], _SIDES, strict=True):
         rms = rms_px(getattr(points, side))
@@ -213,7 +213,7 @@ def draw_groups(
         _legend(figure, axis)
 
 
-def _image_frame(axis: Axes, lens: Lens) -> None:
+def draw_image_frame(axis: Axes, lens: Lens) -> None:
     """Draw the border of the image and circles of equal incidence angle."""
     axis.set_aspect('equal')
     axis.grid(visible=False)
@@ -230,7 +230,7 @@ def _image_frame(axis: Axes, lens: Lens) -> None:
     axis.set(xlim=(-1, lens.width), ylim=(lens.height, -1))
 
 
-def _arrows(
+def draw_arrows(
     axis: Axes, uv: Array, residual: Array, typical: float, cell: float, colour: str
 ) -> None:
     """Draw residuals, the typical one (px) as long as a cell, and the key to their scale."""

@@ -13,8 +13,8 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
+from fisheye_svp_ros.reporting import cause_text, external_text, shot_list
 from fisheye_svp_ros.reporting import diagnosis_text as text
-from fisheye_svp_ros.reporting import external_text, shot_list
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
@@ -72,7 +72,8 @@ def write_report(
         shot_list.draw_shots(pictures[-1], ForwardModel(state.lens, state.terms), wanted)
     report = inputs.folder / 'report.html'
     write_text(report, page(
-        'diagnosis.html', d=diagnosis, inputs=inputs, percent=text.percent, significance=NAMED_P,
+        'diagnosis.html', d=diagnosis, inputs=inputs, percent=cause_text.percent,
+        significance=NAMED_P,
         screen=first_screen(diagnosis, inputs.observations, known),
         command=command_to_go_on(diagnosis, inputs), verdict=VERDICTS[diagnosis.verdict],
         sentences=text.verdict_sentences(diagnosis, known),
@@ -129,17 +130,17 @@ def _free(inputs: ReportInputs, diagnosis: Diagnosis) -> str:
 
 def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
     causes = []
-    for cause, row in zip(diagnosis.causes, text.cause_rows(diagnosis), strict=True):
+    for cause, row in zip(diagnosis.causes, cause_text.cause_rows(diagnosis), strict=True):
         fields = dict(zip(
             ('effect', 'size', 'p', 'share', 'rms', 'gain', 'same'), row, strict=True
         ))
         shown = list(cause.parameters.items())[:_ROWS]
         causes.append({
-            **fields, 'what': text.describe_effect(cause.effect),
+            **fields, 'what': cause_text.describe_effect(cause.effect),
             'to_separate': cause.to_separate if cause.indistinguishable_from else '',
             'refuted': text.frame_ranges(diagnosis, cause.refuted_by_frames),
             'parameters': [
-                (name, text.quantity(entry),
+                (name, cause_text.quantity(entry),
                  f'{entry["value"]:.6g} {entry["unit"]}'.removesuffix(' 1'))
                 for name, entry in shown
             ],
@@ -165,7 +166,7 @@ def _step(step: TraceStep) -> dict[str, Any]:
         'effect': step.effect, 'accepted': step.accepted, 'why': step.why,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
-        'p': text.bare_probability(step.corrected) if tried else '',
+        'p': cause_text.bare_probability(step.corrected) if tried else '',
         'held_out': held_out,
     }
 
@@ -182,7 +183,7 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
         'total_px2': f'{total:.3g}',
         'budget_rows': list(text.budget_rows(diagnosis)),
         'intrinsics': list(text.intrinsic_rows(diagnosis)),
-        'advice': [(text.advice_text(one), text.percent(one.gain) if one.gain > 0 else '')
+        'advice': [(text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
                    for one in diagnosis.advice],
     }
 
@@ -194,8 +195,8 @@ def _remaining_structures(diagnosis: Diagnosis) -> dict[str, Any]:
             {
                 'words': text.remaining_text(diagnosis, s.variable),
                 'link': _PICTURE_OF.get(s.variable),
-                'p': text.bare_probability(s.p_value),
-                'share': text.percent(s.share) if s.variable in text.VARIABLES else '',
+                'p': cause_text.bare_probability(s.p_value),
+                'share': cause_text.percent(s.share) if s.variable in text.VARIABLES else '',
                 'width': round(_BAR * min(s.share, 1.0)),
             }
             for s in {s.variable: s for s in strongest}.values()

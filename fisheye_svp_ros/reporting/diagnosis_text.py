@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
-
-import numpy as np
 
 from fisheye_svp_ros.diagnosis import (
     DIAGNOSE_AIR,
@@ -18,6 +15,13 @@ from fisheye_svp_ros.diagnosis import (
     Diagnosis,
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.reporting.cause_text import (
+    bare_probability,
+    describe_effect,
+    percent,
+    probability,
+    size,
+)
 from fisheye_svp_ros.reporting.tables import UNITS, with_error
 from fisheye_svp_ros.scene.photograph_names import frame_name
 
@@ -45,10 +49,6 @@ _STRUCTURE_TEXTS = {
     'scatter_vs_theta': 'the scatter changes with the incidence angle',
     'scatter_vs_frame': 'the scatter differs from frame to frame',
     'size': 'the residuals do not match the stated sigma',
-}
-_HUMAN = {
-    'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
-    '1': (1e2, '%'), '1/rad^2': (1.0, '/rad²'),
 }
 _MEASURES = {
     'position_error_m': ('position error', 1e3, 'mm'),
@@ -83,11 +83,8 @@ STAGE_WORDS = {
     'frame': 'frames (motion, detector, light)', 'noise': 'noise',
 }
 _MAX_CAUSES = 3  # causes that one sentence can bear
-_UNDETERMINED_RATIO = 1e-6  # of its standard error: a parameter of which the data know nothing
-_ZERO_TOLERANCE = 1e-12  # what rounding leaves of a parameter that does nothing
 _MAX_NAMES = 6  # names in one sentence
 _NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
-_MAX_PARAMETERS = 4  # parameters that are read one by one
 
 
 def lens_words(d: Diagnosis) -> str:
@@ -105,67 +102,6 @@ def refusal_reason(d: Diagnosis) -> str:
 def only_gross(d: Diagnosis) -> bool:
     """Say whether all that remains is points that were rejected, by name."""
     return bool(d.gross) and {one.variable for one in d.remaining} == {'outliers'}
-
-
-def describe_effect(effect: str) -> str:
-    """Return what an effect is, as the end of a sentence."""
-    text = CATALOGUE[effect].summary()
-    return text[0].lower() + text[1:].rstrip('.')
-
-
-def quantity(entry: Mapping[str, Any]) -> str:
-    """Return a parameter's value and standard error in the unit that people read."""
-    factor, unit = _HUMAN.get(entry['unit'], (1.0, entry['unit']))
-    value, error = with_error(factor * entry['value'], factor * entry['stderr'])
-    return (f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}').rstrip()
-
-
-def size(diagnosis: Diagnosis, cause: Cause) -> str:
-    """Return how large a cause is: its parameters, or what many of them amount to."""
-    shown = cause.effect_class.target_map
-    if shown == 'smooth':
-        maps = diagnosis.board_maps((cause.effect,))
-        return '; '.join(
-            (f'board {m.board}: ' if len(maps) > 1 else '')
-            + f'{1e3 * m.peak_to_valley:.2f} mm peak to valley'
-            for m in maps if m.peak_to_valley > 0
-        )
-    if shown == 'single':
-        return _landmarks(diagnosis, cause)
-    named = [
-        f'{name} = {quantity(entry)}' for name, entry in cause.parameters.items()
-        if abs(entry['value']) > max(_ZERO_TOLERANCE, _UNDETERMINED_RATIO * entry['stderr'])
-        or (math.isnan(entry['stderr']) and abs(entry['value']) > _ZERO_TOLERANCE)
-    ]
-    if len(named) <= _MAX_PARAMETERS:
-        return ', '.join(named)
-    return ', '.join(named[:_MAX_PARAMETERS]) + f' and {len(named) - _MAX_PARAMETERS} more'
-
-
-def _landmarks(diagnosis: Diagnosis, cause: Cause) -> str:
-    names = list(dict.fromkeys(name.partition('.')[0] for name in cause.parameters))
-    if len(names) <= _MAX_PARAMETERS:
-        values = np.array([entry['value'] for entry in cause.parameters.values()]).reshape(-1, 3)
-        far = 1e3 * np.linalg.norm(values, axis=1)
-        return ', '.join(f'landmark {n} by {d:.2f} mm' for n, d in zip(names, far, strict=True))
-    maps = diagnosis.board_maps((cause.effect,))
-    squares = np.concatenate([m.height**2 + (m.slide**2).sum(axis=1) for m in maps])
-    return f'{len(names)} landmarks by {1e3 * np.sqrt(squares.mean()):.2f} mm rms'
-
-
-def probability(p_value: float) -> str:
-    """Return a p-value; the smallest ones rest on more normal tails than any data have."""
-    return f'p = {p_value:.1g}' if p_value > 1e-12 else 'p < 1e-12'
-
-
-def bare_probability(p_value: float) -> str:
-    """Return a p-value under a head that says p."""
-    return probability(p_value).removeprefix('p ').removeprefix('= ')
-
-
-def percent(share: float) -> str:
-    """Return a share in percent."""
-    return f'{100 * share:.0f} %'
 
 
 def remains(diagnosis: Diagnosis, most: int = 3) -> str:
@@ -400,17 +336,6 @@ def compared_row(name: str, compared: Comparison) -> tuple[str, str, str, str]:
     return (label, f'{factor * compared.before:.3g} {unit}',
             f'{factor * compared.after:.3g} {unit}',
             f'{percent(compared.value)} ({percent(compared.low)} to {percent(compared.high)})')
-
-
-def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
-    """Yield the table of causes: effect, size, p-value, share, held-out rms, gain, its class."""
-    for c in diagnosis.causes:
-        rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
-        same = ', '.join(c.indistinguishable_from) or '-'
-        p_value = bare_probability(c.p_value)
-        same += '' if c.survives else ' (not significant without one of the other causes)'
-        share = percent(c.share) if c.share else '-'
-        yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
 
 
 def join_names(names: Sequence[str], word: str = 'and') -> str:

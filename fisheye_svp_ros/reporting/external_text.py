@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.diagnosis import Comparison, Diagnosis, Transfer, TwoCameras, TwoDatasets
-from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names, quantity
+from fisheye_svp_ros.reporting.cause_text import quantity
+from fisheye_svp_ros.reporting.diagnosis_text import compared_row, join_names
 from fisheye_svp_ros.reporting.hand_eye_text import (
     HEADER,
     hand_eye_rows,

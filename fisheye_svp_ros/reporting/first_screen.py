@@ -19,7 +19,8 @@ from fisheye_svp_ros.diagnosis import (
     frames_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.diagnosis_text import frame_ranges, known_rows, lens_words, size
+from fisheye_svp_ros.reporting.cause_text import size
+from fisheye_svp_ros.reporting.diagnosis_text import frame_ranges, known_rows, lens_words
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 

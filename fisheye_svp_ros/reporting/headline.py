@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 from fisheye_svp_ros.diagnosis import Cause, Diagnosis
-from fisheye_svp_ros.reporting.diagnosis_text import (
-    LENS_FILE,
-    describe_effect,
-    lens_words,
-    only_gross,
-    size,
-)
+from fisheye_svp_ros.reporting.cause_text import describe_effect, most_significant, size
+from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, lens_words, only_gross
 
 VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -58,9 +53,17 @@ def target_words(d: Diagnosis) -> str:
 
 
 def largest_cause(d: Diagnosis) -> str:
-    """Return the cause of the largest share of the variance, or what stands in its place."""
-    if d.causes:
-        return _sentence(d, max(d.causes, key=lambda cause: (cause.share, -cause.p_value)))
+    """Return the causes of the largest shares of the variance, or what stands in their place.
+
+    Two where the lens and the target each have one.
+    """
+    causes = sorted(d.causes, key=lambda cause: (-cause.share, cause.p_value))
+    if causes:
+        first, stage = causes[0], causes[0].effect_class.budget_stage()
+        other = next((one for one in causes if {stage, one.effect_class.budget_stage()}
+                      == {'lens', 'target'}), None)
+        second = _sentence(d, other) if other else ''
+        return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
     if d.decision['lens'].say == 'recalibrate':
         return _capital(d.decision['lens'].why)
     if only_gross(d):
@@ -83,7 +86,8 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
         which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
     words = _HEADLINES.get(cause.effect, _capital(describe_effect(cause.effect)))
-    how = size(d, cause).partition(', ')[0]
+    # Of several parameters, the most significant one.
+    how = size(d, cause) if cause.effect_class.target_map else most_significant(cause.parameters)
     return f'{words} ({how})' if how else words
 
 

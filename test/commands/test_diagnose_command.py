@@ -31,13 +31,9 @@ from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
+from fisheye_svp_ros.reporting.cause_text import cause_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
-from fisheye_svp_ros.reporting.diagnosis_text import (
-    advice_text,
-    cause_rows,
-    intrinsic_rows,
-    verdict_sentences,
-)
+from fisheye_svp_ros.reporting.diagnosis_text import advice_text, intrinsic_rows, verdict_sentences
 from fisheye_svp_ros.reporting.headline import headline
 from fisheye_svp_ros.reporting.point_residuals import point_residuals
 from fisheye_svp_ros.scene.landmarks import Landmarks
@@ -302,7 +298,7 @@ class TestTerminal:
 
     @pytest.mark.parametrize(('more', 'said'), [
         (['--poses', 'few.csv'], 'frame 3 of'),
-        (['--poses', 'lens.yaml'], "column 'frame' is missing"),
+        (['--poses', 'lens.yaml'], "columns 'frame', "),
         (['--held-out', 'nothing.csv'], 'nothing.csv'),
         (['--lens', 'nothing.yaml'], 'nothing.yaml'),
     ])
@@ -379,6 +375,17 @@ class TestWords:
             extended=extended))
         assert '2 points are outliers, the largest frame 4 landmark 17 (12.3 px)' in wrong
         assert 'the residuals are 3 times as large as sigma states' in wrong
+
+    def test_the_headline_names_a_cause_in_lens_and_target(self, found):
+        """Of several parameters the most significant one, whatever their order."""
+        first = found.causes[0]
+        entry = next(iter(first.parameters.values()))
+        board = replace(first, effect='board_pose', share=2 * first.share, parameters={
+            f'board1.{name}': entry | {'value': 1e-3 * value, 'stderr': 1e-4, 'unit': 'm'}
+            for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)})
+        words = headline(with_changes(found, causes=[first, board]))
+        assert words.startswith('The relative poses of the boards are wrong (board1.z = 0.60 ± '
+                                '0.10 mm), and the viewpoint of the lens moves (e0 = ')
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2

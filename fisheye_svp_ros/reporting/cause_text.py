@@ -1,0 +1,108 @@
+"""A cause in words and human units: what it is, how large, how certain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from fisheye_svp_ros.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.reporting.tables import with_error
+
+_HUMAN = {
+    'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
+    '1': (1e2, '%'), '1/rad^2': (1.0, '/rad²'),
+}
+_UNDETERMINED_RATIO = 1e-6  # of its standard error: a parameter of which the data know nothing
+_ZERO_TOLERANCE = 1e-12  # what rounding leaves of a parameter that does nothing
+_MAX_PARAMETERS = 4  # parameters that are read one by one
+
+
+def describe_effect(effect: str) -> str:
+    """Return what an effect is, as the end of a sentence."""
+    text = CATALOGUE[effect].summary()
+    return text[0].lower() + text[1:].rstrip('.')
+
+
+def quantity(entry: Mapping[str, Any]) -> str:
+    """Return a parameter's value and standard error in the unit that people read."""
+    factor, unit = _HUMAN.get(entry['unit'], (1.0, entry['unit']))
+    value, error = with_error(factor * entry['value'], factor * entry['stderr'])
+    return (f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}').rstrip()
+
+
+def size(diagnosis: Diagnosis, cause: Cause) -> str:
+    """Return how large a cause is: its parameters, or what many of them amount to."""
+    target_map = cause.effect_class.target_map
+    if target_map == 'smooth':
+        maps = diagnosis.board_maps((cause.effect,))
+        return '; '.join(
+            (f'board {m.board}: ' if len(maps) > 1 else '')
+            + f'{1e3 * m.peak_to_valley:.2f} mm peak to valley'
+            for m in maps if m.peak_to_valley > 0
+        )
+    if target_map == 'single':
+        return _landmarks(diagnosis, cause)
+    shown = {name: entry for name, entry in cause.parameters.items() if _is_determined(entry)}
+    largest = sorted(shown, key=lambda name: -_significance(shown[name]))[:_MAX_PARAMETERS]
+    text = ', '.join(f'{name} = {quantity(shown[name])}' for name in shown if name in largest)
+    return text + (f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else '')
+
+
+def most_significant(parameters: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the parameter that is most standard errors from zero, and its value; '' of none."""
+    name = max(parameters, key=lambda one: _significance(parameters[one]), default='')
+    return f'{name} = {quantity(parameters[name])}' if name else ''
+
+
+def _is_determined(entry: Mapping[str, Any]) -> bool:
+    limit = _ZERO_TOLERANCE
+    if not math.isnan(entry['stderr']):
+        limit = max(limit, _UNDETERMINED_RATIO * entry['stderr'])
+    return bool(abs(entry['value']) > limit)
+
+
+def _significance(entry: Mapping[str, Any]) -> float:
+    """Return a parameter in standard errors; 0 where it was not estimated."""
+    ratio = abs(entry['value']) / entry['stderr'] if entry['stderr'] else math.nan
+    return 0.0 if math.isnan(ratio) else float(ratio)
+
+
+def _landmarks(diagnosis: Diagnosis, cause: Cause) -> str:
+    names = list(dict.fromkeys(name.partition('.')[0] for name in cause.parameters))
+    if len(names) <= _MAX_PARAMETERS:
+        values = np.array([entry['value'] for entry in cause.parameters.values()]).reshape(-1, 3)
+        far = 1e3 * np.linalg.norm(values, axis=1)
+        return ', '.join(f'landmark {n} by {d:.2f} mm' for n, d in zip(names, far, strict=True))
+    maps = diagnosis.board_maps((cause.effect,))
+    squares = np.concatenate([m.height**2 + (m.slide**2).sum(axis=1) for m in maps])
+    return f'{len(names)} landmarks by {1e3 * np.sqrt(squares.mean()):.2f} mm rms'
+
+
+def probability(p_value: float) -> str:
+    """Return a p-value; the smallest ones rest on more normal tails than any data have."""
+    return f'p = {p_value:.1g}' if p_value > 1e-12 else 'p < 1e-12'
+
+
+def bare_probability(p_value: float) -> str:
+    """Return a p-value under a head that says p."""
+    return probability(p_value).removeprefix('p ').removeprefix('= ')
+
+
+def percent(share: float) -> str:
+    """Return a share in percent."""
+    return f'{100 * share:.0f} %'
+
+
+def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
+    """Yield the table of causes: effect, size, p-value, share, held-out rms, gain, its class."""
+    for c in diagnosis.causes:
+        rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
+        same = ', '.join(c.indistinguishable_from) or '-'
+        p_value = bare_probability(c.p_value)
+        same += '' if c.survives else ' (not significant without one of the other causes)'
+        share = percent(c.share) if c.share else '-'
+        yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
