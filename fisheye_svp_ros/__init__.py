@@ -40,6 +40,9 @@ _HOMES = {
     'budget': 'library',
     'undistort_maps': 'library',
     'rectify_maps': 'library',
+    'plot_lens': 'library_plots',
+    'plot_residuals': 'library_plots',
+    'plot_budget': 'library_plots',
 }
 __all__ = [*_HOMES]
 

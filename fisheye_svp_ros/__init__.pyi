@@ -22,6 +22,9 @@ from fisheye_svp_ros.library_boards import observations as observations
 from fisheye_svp_ros.library_boards import plan as plan
 from fisheye_svp_ros.library_boards import render as render
 from fisheye_svp_ros.library_boards import write_lens as write_lens
+from fisheye_svp_ros.library_plots import plot_budget as plot_budget
+from fisheye_svp_ros.library_plots import plot_lens as plot_lens
+from fisheye_svp_ros.library_plots import plot_residuals as plot_residuals
 from fisheye_svp_ros.library_rigs import calibrate_rig as calibrate_rig
 from fisheye_svp_ros.library_rigs import localize_rig as localize_rig
 from fisheye_svp_ros.optics.lens import Lens as Lens

@@ -34,6 +34,13 @@ class Pose(_Pose, Batch):
 
     __slots__ = ()
 
+    def __repr__(self) -> str:
+        if self.position.ndim > 1:
+            return f'Pose{self.position.shape[:-1]}'
+        x, y, z = self.position
+        turn = ', '.join(f'{part:.4g}' for part in np.degrees(vector_from_rotation(self.rotation)))
+        return f'Pose({x:.6g}, {y:.6g}, {z:.6g} m; rotation vector {turn} degree)'
+
     def inverse(self) -> Pose:
         """Return the reference frame in the body."""
         rotation = np.swapaxes(self.rotation, -1, -2)

@@ -13,6 +13,7 @@ import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands import notes
 from fisheye_svp_ros.commands.watch import _display_unit
+from fisheye_svp_ros.library import Budgeted
 
 
 def test_photographs_are_searched_as_by_the_command(tmp_path: Path) -> None:
@@ -35,6 +36,35 @@ def test_a_table_from_image_points_and_landmarks_alone() -> None:
     for wrong in ((u[:3], v, np.arange(30)), (u, v, np.arange(1, 31))):
         with pytest.raises(fsvp.FisheyeSvpError, match=r'one length|landmarks are 0 to 29'):
             fsvp.observations(*wrong, BOARD)
+
+
+def test_pictures_are_figures_with_units() -> None:
+    height, shift = fsvp.plot_lens('fish214', LENS).axes
+    assert height.get_ylabel() == 'image height / px'
+    assert [len(axis.lines) for axis in (height, shift)] == [2, 2]
+    # 12.7 mm to 88 degrees, as README has it.
+    degrees, moved = shift.lines[0].get_data()
+    assert np.interp(88, degrees, moved) - moved[0] == pytest.approx(12.7, abs=0.1)
+    u, v = true_corners(poses(4).take(0)).T
+    table = fsvp.observations(u, v + 0.1 * (-1) ** np.arange(30), np.arange(30), BOARD)
+    axis, = fsvp.plot_residuals(table, LENS).axes
+    assert axis.get_title(loc='left') == f'{LENS.name}: 0.0977 px rms'
+    budget = Budgeted(np.radians([30, 80]), np.array([0.5, 1, 2]),
+                           {'position': np.ones((2, 3))}, {'position': np.ones((2, 3))}, {})
+    axis, = fsvp.plot_budget(budget).axes
+    assert axis.get_ylabel() == 'position error / mm' and len(axis.lines) == 4
+    with pytest.raises(fsvp.FisheyeSvpError, match='known are position'):
+        fsvp.plot_budget(budget, 'depht')
+
+
+def test_what_is_printed_is_short() -> None:
+    assert repr(poses(4)) == 'Pose(4,)'
+    assert repr(fsvp.Pose(np.eye(3), np.array([0.1, 0, 2]))) == (
+        'Pose(0.1, 0, 2 m; rotation vector 0, 0, 0 degree)')
+    assert repr(fsvp.undistort_maps('fish214')) == (
+        "Rectification('fish214' to pinhole 1536x1536 px, at 2 m)")
+    assert repr(fsvp.plan('fish180', BOARD, (0.1, 0.3), count=1)).startswith(
+        'PhotographPlan(1 views; fx ')
 
 
 def test_render_plan_and_lens_files(tmp_path: Path) -> None:

@@ -167,6 +167,10 @@ class PhotographPlan(NamedTuple):
     wanted: NextViews
     stderr: dict[str, float]
 
+    def __repr__(self) -> str:
+        errors = ', '.join(f'{name} {error:.2g}' for name, error in self.stderr.items())
+        return f'PhotographPlan({len(self.wanted.shots.camera.position)} views; {errors})'
+
 
 def plan(
     lens: Lens, points: Array, room: ViewLimits, count: int, number: str | None, noise: float

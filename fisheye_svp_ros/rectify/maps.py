@@ -66,6 +66,11 @@ class Rectification:
             raise ParameterError(f'range is {self.range:g} m; lens {self.lens.name!r} needs more '
                                  f'than {self.min_range:.3g} m')
 
+    def __repr__(self) -> str:
+        camera = self.camera
+        return (f'Rectification({self.lens.name!r} to {camera.projection} '
+                f'{camera.width}x{camera.height} px, at {self.range:g} m)')
+
     @property
     def min_range(self) -> float:
         """The range, m, beyond which every point has at most one image."""

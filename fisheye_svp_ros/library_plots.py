@@ -1,0 +1,80 @@
+"""The library's part about pictures: each function returns a matplotlib figure.
+
+A notebook shows it; `figure.savefig('picture.png')` writes it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.readers import read_observations
+from fisheye_svp_ros.library import AnyLens, AnyObservations, Budgeted, load_lens, localize
+from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
+from fisheye_svp_ros.solve.measured_poses import rms_px
+
+_ANGLES = 181
+_CELLS = 16  # over the width of the image: the typical arrow is as long as one
+_UNITS = {'position': (1e3, 'mm'), 'axis': (180 / np.pi, 'deg'), 'depth': (1e3, 'mm')}
+
+
+def plot_lens(*lenses: AnyLens) -> Figure:
+    """Draw image height (px) and viewpoint shift (mm) of lenses over the incidence angle."""
+    figure = Figure(figsize=(10, 4), layout='constrained')
+    height, shift = figure.subplots(1, 2)
+    for lens in map(load_lens, lenses):
+        theta = np.linspace(0, lens.max_incidence, _ANGLES)
+        degrees, curve = np.degrees(theta), lens.viewpoint_shift
+        height.plot(degrees, lens.fx * lens.image_height.value_and_slope(theta)[0],
+                    label=lens.name)
+        values = np.zeros_like(theta) if curve is None else curve.value_and_slope(
+            theta, np.tan(theta / 2))[0]
+        shift.plot(degrees, 1e3 * values, label=lens.name)
+    height.set(xlabel='incidence angle / degree', ylabel='image height / px')
+    shift.set(xlabel='incidence angle / degree', ylabel='viewpoint shift / mm')
+    height.legend()
+    return figure
+
+
+def plot_residuals(observations: AnyObservations, lens: AnyLens) -> Figure:
+    """Draw the residuals of one camera over the image, every frame localized with the lens.
+
+    Outliers are not drawn.  Raises what `localize` raises.
+    """
+    lens = load_lens(lens)
+    table = observations if not isinstance(observations, str | Path) else read_observations(
+        observations)
+    residual = localize(table, lens).residual
+    used = np.isfinite(residual).all(axis=1)
+    figure = Figure(figsize=(8, 1 + 8 * lens.height / lens.width), layout='constrained')
+    axis = figure.subplots()
+    draw_image_frame(axis, lens)
+    typical = float(np.quantile(np.linalg.norm(residual[used], axis=1), 0.9))
+    draw_arrows(axis, table.uv[used], residual[used], typical, lens.width / _CELLS, 'C0')
+    axis.set(xlabel='u / px', ylabel='v / px')
+    axis.set_title(f'{lens.name}: {rms_px(residual[used]):.3g} px rms', loc='left')
+    return figure
+
+
+def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
+    """Draw an SVP error over the range, one line for each spread of landmarks; dashed: noise.
+
+    quantity: position, axis, residual, epipolar or depth.
+    Raises ParameterError for another one.
+    """
+    if quantity not in budget.error:
+        raise ParameterError(f'{quantity!r} is no quantity of a budget; known are '
+                             f'{", ".join(budget.error)}')
+    factor, unit = _UNITS.get(quantity, (1.0, 'px'))
+    figure = Figure(figsize=(8, 5), layout='constrained')
+    axis = figure.subplots()
+    for spread, error, noise in zip(np.degrees(budget.spreads), budget.error[quantity],
+                                    budget.noise[quantity], strict=True):
+        line, = axis.loglog(budget.ranges, factor * error, label=f'{spread:.0f}°')
+        axis.loglog(budget.ranges, factor * noise, '--', color=line.get_color())
+    axis.set(xlabel='range / m', ylabel=f'{quantity} error / {unit}')
+    axis.legend(title='spread; dashed: noise', ncols=2)
+    return figure
