@@ -110,6 +110,7 @@ def _run(arguments: Sequence[str]) -> None:
     parsed, unknown = parser.parse_known_args(arguments)
     if unknown:
         _refuse(commands.choices[named], unknown[0])
+    import_module('fisheye_svp_ros.commands.outputs').check_output(parsed)
     if named in _SOLVING and parsed.engine:
         import_module('fisheye_svp_ros.optics.engines').use(parsed.engine)
     with _tidy(named):

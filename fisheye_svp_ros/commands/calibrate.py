@@ -14,6 +14,7 @@ import numpy as np
 from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
+from fisheye_svp_ros.commands.outputs import output_path
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
@@ -63,11 +64,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--poses', metavar='POSES.csv',
                         help='poses of the robot flange that carries the camera, in the robot '
                         'base; also fits the pose of the camera in the flange')
-    parser.add_argument('-o', '--output', type=Path, metavar='LENS.yaml',
+    parser.add_argument('-o', '--output', type=output_path, metavar='LENS.yaml',
                         help='lens file to write; covariances are written next to it as '
-                        '.calibrate.json, the report as calibration.html; for a rig, a '
-                        'folder: one lens per camera, rig.yaml, rig.json, rig.urdf, '
-                        'tf_static.yaml and camchain.yaml')
+                        '.calibrate.json, the report as .calibrate.html; for a rig, a '
+                        'folder: one lens per camera, calibration.html, rig.yaml, rig.json, '
+                        'rig.urdf, tf_static.yaml and camchain.yaml')
 
 
 def run(args: argparse.Namespace) -> None:
@@ -106,7 +107,8 @@ def run(args: argparse.Namespace) -> None:
                 alone = not camera or (len(found) == 1 and args.output.suffix)
                 paths[camera] = args.output if alone else args.output / f'{camera}.yaml'
                 _write(one, paths[camera])
-            report = next(iter(paths.values())).parent / 'calibration.html'
+            report = (args.output / 'calibration.html' if len(paths) > 1 else
+                      next(iter(paths.values())).with_suffix('.calibrate.html'))
             write_calibration_report(report, found, _next_command(args, paths))
     for one in found.values():
         _print(one)

@@ -11,6 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lock_step import start_in_step, values
 from fisheye_svp_ros.commands.notes import note_formats
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.processes import Processes
 from fisheye_svp_ros.commands.ros import missing_rclpy
 from fisheye_svp_ros.errors import OutputError
@@ -52,7 +53,7 @@ _PATIENCE = 900.0  # s; only a hang takes this long
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=Path, default=Path('demo'), metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, default=Path('demo'), metavar='DIR',
                         help='folder to write the recording (replaces an earlier one), demo.json, '
                         'table.csv, table.parquet and pictures to; default: demo')
     parser.add_argument('--lenses', nargs='+', default=list(LENSES), choices=LENSES,

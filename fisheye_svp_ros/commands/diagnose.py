@@ -11,6 +11,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     check_sizes,
@@ -73,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--room', type=float, nargs=2, metavar='M',
                         help='with --next: nearest and furthest distance at which the board is '
                         'sharp; default: slightly beyond the distances in OBS')
-    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
                         help='folder to write report.html and its pictures, diagnosis.json, '
                         'extended_lens.yaml and residuals.csv to; for a rig, also rig.yaml '
                         'and a subfolder for the lens of each camera')

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 import numpy as np
 
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.render import parabola, write_photographs
 from fisheye_svp_ros.io.files import write_text, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
@@ -33,7 +33,7 @@ fisheye-svp diagnose observations.csv --lens lens.yaml -o diagnosis
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
                         help='folder to write the photographs, the truth and a README to')
 
 

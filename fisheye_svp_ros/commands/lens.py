@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_path
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('lens', metavar='LENS',
                         help='lens file of this package or of another tool (FILE#cam1: another '
                         'camera than the first), or the name of a lens of this package')
-    parser.add_argument('-o', '--output', type=Path, metavar='FILE', help='file to write')
+    parser.add_argument('-o', '--output', type=output_path, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
                         help='format of the file to write; default: a lens file of this package')
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
@@ -78,6 +78,8 @@ def run(args: argparse.Namespace) -> None:
         _convert(lens, args)
     elif args.output:
         save_lens(lens, args.output)
+    if args.output:
+        print(f'{args.output}: {args.format or "lens file of this package"}')
 
 
 def _convert(lens: Lens, args: argparse.Namespace) -> None:

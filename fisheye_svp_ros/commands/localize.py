@@ -10,6 +10,7 @@ import numpy as np
 from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_lenses
 from fisheye_svp_ros.commands.localize_rig import AXES, MAX_TABLE_ROWS, localize_cameras
 from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes
 from fisheye_svp_ros.commands.photographs import read_input as read
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='poses of the cameras of a rig: rig.yaml from `calibrate`, its '
                         'folder, or a camchain; gives one pose per frame from all cameras, '
                         'that of the first camera')
-    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
                         help='folder to write localize.json, poses.csv, residuals.csv and '
                         'covariance.csv to; for several cameras without --rig, one subfolder '
                         'each')

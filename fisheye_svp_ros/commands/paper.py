@@ -6,13 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fisheye_svp_ros.commands.outputs import output_folder
+
 if TYPE_CHECKING:
     from fisheye_svp_ros.paper.results import Results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=Path, default=Path('paper'), metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, default=Path('paper'), metavar='DIR',
                         help='folder to write paper.json, paper.md, paper.html and the pictures '
                         'to; default: paper')
 

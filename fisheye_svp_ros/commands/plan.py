@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         'whole lens')
     parser.add_argument('--noise', type=float, default=0.1, metavar='PX',
                         help='standard deviation of u and of v of a corner; default: 0.1')
-    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
                         help='folder to write plan.pdf (to print), plan.json and poses.csv (for '
                         '`render`) to')
 

@@ -8,6 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 from shutil import rmtree
 
+from fisheye_svp_ros.commands.outputs import output_path
+
 # What the nodes tell, and what they were told; markers and diagnostics are left out.
 TOPICS = (
     r'.*/(scenario|landmarks|camera_info|image_points|true_pose|pose|position_error'
@@ -17,7 +19,7 @@ TOPICS = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('-o', '--output', type=Path, required=True, metavar='BAG',
+    parser.add_argument('-o', '--output', type=output_path, required=True, metavar='BAG',
                         help='folder to create; it must not exist')
     parser.add_argument('--topics', type=_pattern, default=TOPICS, metavar='REGEX',
                         help='pattern of full topic names; default: all topics of the nodes '

@@ -12,6 +12,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_bytes, write_together
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--target', choices=('board', 'cube', 'room'), default='board',
                         help='one board, or six boards: on the faces of a cube, or on the walls '
                         'of a room')
-    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
                         help='folder to write the photographs (of a rig, one subfolder per '
                         'camera), observations.csv (the true corners) and poses.csv to')
     parser.add_argument('--poses', metavar='POSES.csv',

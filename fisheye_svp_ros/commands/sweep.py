@@ -8,6 +8,7 @@ from pathlib import Path
 
 from fisheye_svp_ros.commands.executors import dask, process_pool
 from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io.columns import TableParts, as_numbers, read_columns
@@ -30,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('file', type=Path, metavar='FILE',
                         help='ROS parameter file in which sweep.PARAMETER is a list, or the name '
                         'of one in config/sweeps')
-    parser.add_argument('-o', '--output', type=Path, default=Path('sweep'), metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, default=Path('sweep'), metavar='DIR',
                         help='folder to write sweep.parquet, sweep.csv and sweep.json to; '
                         'default: sweep')
     where = parser.add_mutually_exclusive_group()

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.errors import BagError
 from fisheye_svp_ros.io.bags import Bag
 from fisheye_svp_ros.io.columns import write_columns
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('bag', metavar='BAG',
                         help='rosbag2 recording: its folder, or its .mcap or .db3 file')
-    parser.add_argument('-o', '--output', type=Path, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, metavar='DIR',
                         help='folder to write table.csv, table.parquet and table.json to')
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lenses import Lenses, lenses_of, load_lenses
 from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
@@ -60,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rig', metavar='FILE',
                         help='pose of the left camera in the right one, if the lens files do not '
                         'hold it')
-    parser.add_argument('-o', '--output', type=Path, required=True, metavar='DIR',
+    parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
                         help='folder to write the photographs, maps.npz and maps.yml (map1 and '
                         'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
                         'pictures of the remaining errors and undistort.json to; for a rig, '

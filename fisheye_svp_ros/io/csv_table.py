@@ -117,12 +117,15 @@ class CsvTable:
         if not any(self._header):
             raise ObservationError(
                 f'{self.path}: it is empty; a header with {wanted or "names"} is needed')
-        for name in required:
-            if name not in self._header:
-                raise ObservationError(
-                    f'{self.path}: column {name!r} is missing from its header, '
-                    f'{there[:_MAX_HEADER]!r}; needed are {wanted}'
-                )
+        missing = [name for name in required if name not in self._header]
+        if missing and all(map(_is_number, self._header)):
+            raise ObservationError(
+                f'{self.path}: its first line holds numbers; a header with {wanted} is needed')
+        if missing:
+            names = ', '.join(map(repr, missing))
+            which = f'column {names} is' if len(missing) == 1 else f'columns {names} are'
+            raise ObservationError(f'{self.path}: {which} missing from its header, '
+                                   f'{there[:_MAX_HEADER]!r}; needed are {wanted}')
         twice = [name for name, count in Counter(self._header).items() if name and count > 1]
         if twice:
             raise ObservationError(f'{self.path}: its header has {twice[0]!r} twice')

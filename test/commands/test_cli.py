@@ -198,7 +198,23 @@ class TestLocalize:
         arguments = [folder / 'observations.csv', '--lens', folder / 'lens.yaml']
         code = cli.main(['localize', *map(str, arguments), '-o', str(tmp_path / 'file' / 'out')])
         assert code == 2
-        assert 'cannot be written' in capsys.readouterr().err
+        assert 'file is not a folder; choose another' in capsys.readouterr().err
+
+    @pytest.mark.parametrize('command', [
+        'localize {0}/observations.csv --lens {0}/lens.yaml -o {0}/lens.yaml',
+        'calibrate {0}/observations.csv --image-size 1280x960 -o {0}/observations.csv',
+        'lens {0}/lens.yaml -o {0}/lens.yaml', 'undistort fish180 {0} -o {0}',
+        'undistort fish180 {0}/a.png -o {0}',
+    ])
+    def test_no_input_is_overwritten(self, scene, capsys, tmp_path, command):
+        for name in ('observations.csv', 'lens.yaml'):
+            (tmp_path / name).write_bytes((scene[0] / name).read_bytes())
+        (tmp_path / 'a.png').write_bytes(b'a photograph')
+        before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+        assert cli.main(command.format(tmp_path).split()) == 2
+        assert re.search('would overwrite the input|is a file; name a folder',
+                         capsys.readouterr().err)
+        assert before == {path: path.read_bytes() for path in tmp_path.iterdir()}
 
 
 def test_frames_that_are_doubtful_alike_are_one_line(scene, capsys):
@@ -285,7 +301,7 @@ class TestCalibrate:
         observations = str(folder / 'observations.csv')
         assert cli.main(['calibrate', observations, '--model', 'equidistant', '--image-size',
                          '1280x960', '--free', 'f,cx,cy', '-o', str(tmp_path / 'mine.yaml')]) == 0
-        page = (tmp_path / 'calibration.html').read_text()
+        page = (tmp_path / 'mine.calibrate.html').read_text()
         for heading in ('Parameters', 'Coverage', 'Residuals', 'Uncertainty'):
             assert f'<h2>{heading}</h2>' in page
         assert page.count('data:image/png;base64,') == 4 and '<script' not in page

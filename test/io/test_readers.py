@@ -194,7 +194,9 @@ class TestObservationsCsv:
         (f'{HEADER},u\n{ROWS}', "its header has 'u' twice"),
         (HEADER.replace(',', ';'), 'no row below the header'),
         (HEADER.replace(',', ' '),
-         "column 'frame' is missing from its header, 'frame landmark u v x y z'"),
+         "columns 'frame', 'landmark', 'u', 'v', 'x', 'y', 'z' are missing from its header, "
+         "'frame landmark u v x y z'"),
+        (ROWS, f'its first line holds numbers; a header with {HEADER} is needed'),
         (f'{HEADER}\n{ROWS}'.replace(',', ';').replace('.', ','),
          "line 2: u is '10,5'; a number, with a decimal point, is needed"),
         (b'\xff\xfe\x00\x01', 'not a text file'),

@@ -51,7 +51,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.skipif(BROWSER is None, reason='no Chromium is installed')
-@pytest.mark.parametrize('name', ['out/report.html', 'calibration.html'])
+@pytest.mark.parametrize('name', ['out/report.html', 'lens.calibrate.html'])
 @pytest.mark.parametrize(('width', 'height'), SIZES)
 def test_nothing_is_cut_and_what_matters_is_above_the_fold(
     folder: Path, name: str, width: int, height: int
