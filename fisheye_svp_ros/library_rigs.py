@@ -25,6 +25,8 @@ def calibrate_rig(
 ) -> RigCalibration:
     """Fit where the cameras of a table stand, in the first of them; lenses by camera, as they are.
 
+    Cameras whose views no relative pose explains as those of one target see boards of their own:
+    these stand still, and the motion of the rig relates them.
     Raises ObservationError for a camera without a lens, for cameras that no frame holds to the
     others, and where no rig explains most frames; GeometryError where it is not determined.
     """

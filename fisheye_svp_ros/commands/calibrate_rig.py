@@ -42,8 +42,9 @@ def calibrate_cameras(
         for group in groups:
             if group != largest:
                 say(f'rig: {" and ".join(group)} cannot be related to {", ".join(largest)}: no '
-                    'frame shows the target in both; photograph it where two cameras see it, and '
-                    'give simultaneous photographs the same frame number')
+                    'frame shows the target in both; photograph it where two cameras see it, or '
+                    'turn the rig while each sees a board of its own, and give simultaneous '
+                    'photographs the same frame number')
         if len(largest) < 2:
             return
         pair = rig_cameras(largest)
@@ -103,6 +104,7 @@ def _document(found: RigCalibration) -> dict[str, Any]:
             'position': found.rig.position[i].tolist(), 'quaternion': turns[i].tolist(),
             'covariance': found.covariance[i - 1].tolist() if i else None,
             'rms_px': float(found.rms_px[i]), 'frames': int(found.shared[i]),
+            'board': found.boards[i] if found.boards else 0,
         } for i, name in enumerate(found.cameras)},
     }
 
@@ -113,6 +115,11 @@ def _print(found: RigCalibration) -> None:
         print(f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '
               f'{y:.3f}, {z:.3f} mm, from {len(found.frame)} frames, '
               f'rms {found.total_rms_px:.4f} px')
+    if found.boards:
+        each = [' and '.join(name for name, board in zip(found.cameras, found.boards, strict=True)
+                             if board == one) for one in sorted(set(found.boards))]
+        print('rig: boards apart, related by the motion of the rig: one seen by '
+              f'{", another by ".join(each)}')
     sigma = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     rows = []
     for i, name in enumerate(found.cameras):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
@@ -153,6 +154,21 @@ def group_views(observations: Observations) -> Views:
     row = np.full(shape, -1, dtype=np.int64)
     row[view, slot] = np.arange(len(view))
     return _views(observations, row, groups[:, 0], groups[:, 1], 1.0)
+
+
+def select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
+    """Return the rows of some cameras, numbered in their order."""
+    number = np.full(len(table.cameras), -1)
+    number[[table.cameras.index(name) for name in cameras]] = np.arange(len(cameras))
+    rows = table.take(number[table.camera] >= 0)
+    return replace(rows, cameras=tuple(cameras), camera=number[rows.camera])
+
+
+def select_shared(table: Observations) -> Observations:
+    """Return the rows of frames that several cameras saw."""
+    pairs = np.unique(np.stack([table.frame, table.camera], axis=-1), axis=0)
+    frames, counts = np.unique(pairs[:, 0], return_counts=True)
+    return table.take(np.isin(table.frame, frames[counts >= 2]))
 
 
 def rig_cameras(cameras: tuple[str, ...]) -> tuple[str, str] | None:

@@ -200,14 +200,16 @@ def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
     Raises GeometryError where the frames do not determine the rig.
     """
     cameras = linear.data.cameras - 1
-    count = 6 * cameras
-    names = [f'the place of camera {i + 2}' for i in range(cameras) for _ in range(6)]
+    bodies = len(linear.state.rig.position) - 1  # and boards
+    count = 6 * bodies
+    names = [f'the place of {f"camera {i + 2}" if i < cameras else f"board {i - cameras + 2}"}'
+             for i in range(bodies) for _ in range(6)]
     _check_determined(_equations(linear, linear.shared_columns[..., :count])[1], names)
     information = arrow_information(_equations(linear, linear.shared_columns)[1])[0]
     inverse = np.linalg.inv(information[:count, :count])
     moved = inverse @ information[:count, count:count + len(lenses)]
     shared = sigma**2 * inverse + moved @ lenses @ moved.T
-    blocks = shared.reshape(cameras, 6, cameras, 6)
+    blocks = shared.reshape(bodies, 6, bodies, 6)
     return np.stack([blocks[i, :, i] for i in range(cameras)])
 
 
@@ -226,7 +228,7 @@ class Adjustment:
         self._poses_alone = held is None
         moving = [np.zeros(0, dtype=bool)]
         if held is not None:
-            moving += [np.ones(6 * (data.cameras - 1) + len(self._free), dtype=bool)]
+            moving += [np.ones(6 * (len(template.rig.position) - 1) + len(self._free), dtype=bool)]
             moving += [np.full(len(values), effect.name not in held)
                        for effect, values in template.terms if is_shared(effect)]
         self._moving = np.concatenate(moving)
@@ -256,13 +258,13 @@ class Adjustment:
         rotation, position, rig_rotation, rig_position, values = state
         if self._poses_alone:
             return (*Pose(rotation, position).retract(frame), *state[2:])
-        cameras = 6 * (self._data.cameras - 1)
-        move = np.zeros((len(shared), self._data.cameras, 6))
-        move[:, 1:] = shared[:, :cameras].reshape(len(shared), -1, 6)
+        bodies = rig_position.shape[1]
+        move = np.zeros((len(shared), bodies, 6))
+        move[:, 1:] = shared[:, : 6 * (bodies - 1)].reshape(len(shared), -1, 6)
         return (
             *Pose(rotation, position).retract(frame),
             *Pose(rig_rotation, rig_position).retract(move),
-            values + shared[:, cameras:],
+            values + shared[:, 6 * (bodies - 1):],
         )
 
     def _system(self, state: RigState) -> tuple[Array, Arrays]:

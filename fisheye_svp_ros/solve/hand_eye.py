@@ -99,12 +99,12 @@ class HandEye:
         }
 
 
-def solve_hand_eye(camera: Pose, flange: Pose) -> Transforms:
+def solve_hand_eye(camera: Pose, flange: Pose, scale: float | None = None) -> Transforms:
     """Solve both transforms and the scale from poses (F,) alone, without start values.
 
-    camera: in the target; flange: in the base.  Rotations by the Kronecker product (Shah, Solving
-    the robot-world/hand-eye calibration problem using the Kronecker product, 2013), then the
-    rest, which is linear.
+    camera: in the target; flange: in the base; scale: where it is known.  Rotations by the
+    Kronecker product (Shah, Solving the robot-world/hand-eye calibration problem using the
+    Kronecker product, 2013), then the rest, which is linear.
     Raises GeometryError where the flange does not turn about two axes.
     """
     _check_turns(flange)
@@ -116,17 +116,23 @@ def solve_hand_eye(camera: Pose, flange: Pose) -> Transforms:
     base, mount = nearest_rotation(sign * first), nearest_rotation(sign * second)
     if np.linalg.det(second) * sign < 0:
         raise GeometryError('no hand-eye transform explains the rotations of the robot')
-    return _solve_lengths(camera, flange, base, mount)
+    return _solve_lengths(camera, flange, base, mount, scale)
 
 
-def _solve_lengths(camera: Pose, flange: Pose, base: Array, mount: Array) -> Transforms:
+def _solve_lengths(
+    camera: Pose, flange: Pose, base: Array, mount: Array, scale: float | None
+) -> Transforms:
     """Return the transforms of known rotations: scale p_f = R_b p_c + t_b - R_f t_m is linear."""
     frames = len(flange.position)
     columns = np.concatenate([
         np.broadcast_to(np.eye(3), (frames, 3, 3)), -flange.rotation,
         -flange.position[..., None]], axis=-1).reshape(-1, 7)
-    solved = np.linalg.lstsq(columns, -(camera.position @ base.T).ravel(), rcond=None)[0]
-    return Transforms(Pose(mount, solved[3:6]), Pose(base, solved[:3]), float(solved[6]))
+    right = -(camera.position @ base.T).ravel()
+    if scale is not None:
+        columns, right = columns[:, :6], right - scale * columns[:, 6]
+    solved = np.linalg.lstsq(columns, right, rcond=None)[0]
+    return Transforms(Pose(mount, solved[3:6]), Pose(base, solved[:3]),
+                      float(solved[6]) if scale is None else scale)
 
 
 def _check_turns(flange: Pose) -> None:

@@ -9,27 +9,27 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.errors import GeometryError, ObservationError
+from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.pose import Pose, identity
+from fisheye_svp_ros.scene.observations import Observations, select_cameras, select_shared
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, rig_covariance
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import sigma_known
+from fisheye_svp_ros.solve.moving_rig import PlacedBoards, place_boards
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.reliability import misfit_fails, misfit_reason
-from fisheye_svp_ros.solve.rig_checks import is_unrelated
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
-
-_MIN_CAMERAS = 2  # that a frame must show the target to
 
 
 class RigCalibration(NamedTuple):
     """A rig of C cameras: rig (C,) in the first of them, m.
 
+    boards (C,): which board each camera sees, where these stand apart and only the motion of the
+    rig relates them; empty where all see one.
     covariance (C - 1, 6, 6), m and rad, of the change in `Pose.retract`, of each camera but the
     first, with the errors that its lenses state of themselves; frame (F,); pose (F,) of the first
-    camera in the target; rms_px (C,), and over all: total_rms_px; sigma_px: noise of u and v,
+    camera in its target; rms_px (C,), and over all: total_rms_px; sigma_px: noise of u and v,
     estimated, None where the observations bring their own; shared (C,): frames that a camera
     shares with others; left_out: frames that no rig explains; reason: why it should not be relied
     on, '' for a reliable one.
@@ -46,6 +46,7 @@ class RigCalibration(NamedTuple):
     shared: Index
     left_out: tuple[int, ...]
     reason: str
+    boards: tuple[int, ...] = ()
 
     def steps(self) -> tuple[Pose, ...]:
         """Return each camera in the next one (C - 1 poses), as rig files have them."""
@@ -78,17 +79,19 @@ def calibrate_rig(
 
     cameras: connected ones, in the order in which they are wanted; the first is the frame of all.
     Outliers are rejected, and frames in which the cameras contradict each other.
+    Cameras that see boards of their own are related by the motion of the rig.
     Raises ObservationError where no rig explains most frames; GeometryError, naming the frame, for
     a view that does not fix a pose, and where the rig is not determined.
     """
     order = connected_cameras(select_cameras(table, cameras))[0]
     ordered = [lenses[name] for name in order]
-    rows, torn = _without_outliers(_select_shared(select_cameras(table, order)), ordered)
-    linear = _fit_rig(rows, ordered)
+    placed = place_boards(select_shared(select_cameras(table, order)), ordered)
+    rows, torn = _without_outliers(placed)
+    linear = _fit_rig(rows, ordered, placed.boards)
     # Cameras stand in the order in which frames hold them together; the first one stays the first.
     place = [order.index(name) for name in cameras if name in order]
     data, state = linear.data, linear.state
-    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + data.cameras - 1)
+    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
     if freedom < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
     chi2 = float((linear.residual**2).sum()) / freedom
@@ -105,32 +108,29 @@ def calibrate_rig(
         float(np.sqrt(np.nanmean(squares))), sigma,
         np.bincount(data.camera_of, minlength=len(order))[place], torn,
         misfit_reason(chi2, freedom) if fails else '',
+        tuple(placed.boards[i] for i in place if placed.boards),
     )
 
 
-def _without_outliers(
-    rows: Observations, lenses: Sequence[Lens]
-) -> tuple[Observations, tuple[int, ...]]:
+def _without_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ...]]:
     """Return the rows without outliers, and the frames that no rig explains."""
-    data = group_by_frame(rows)
-    state = initial_state(data, lenses[0], lenses[1:])
-    if is_unrelated(data, state):
-        raise ObservationError(
-            f'{rows.source}: no relative pose of {" and ".join(rows.cameras)} explains most '
-            'frames; give simultaneous photographs the same frame number, others different ones, '
-            'and number points from the same end')
-    _, found = find_outliers(data, state)
+    rows = placed.rows
+    _, found = find_outliers(placed.data, placed.state)
     torn = {int(rows.frame[row]) for row, why in zip(found.rows, found.why, strict=True)
             if why == FRAME}
     kept = ~np.isin(np.arange(len(rows)), found.rows) & ~np.isin(rows.frame, sorted(torn))
-    return _select_shared(rows.take(kept)), tuple(sorted(torn))
+    return select_shared(rows.take(kept)), tuple(sorted(torn))
 
 
-def _fit_rig(rows: Observations, lenses: Sequence[Lens]) -> Linearization:
-    """Return the rig and the poses of its frames, fitted, with the lenses as they are."""
+def _fit_rig(
+    rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]
+) -> Linearization:
+    """Return rig, boards of the cameras' own and poses of the frames, fitted, the lenses known."""
     data = group_by_frame(rows)
     start = initial_state(data, lenses[0], lenses[1:])
-    state = replace(start, lens=lenses[0], others=tuple(lenses[1:]), terms=(), corrected=True)
+    rig = Pose.concatenate([start.rig, identity(max(boards, default=0))])
+    state = replace(start, rig=rig, lens=lenses[0], others=tuple(lenses[1:]), terms=(),
+                    corrected=True, boards=boards)
     return Linearization(data, adjust(data, state, ()), ())
 
 
@@ -149,18 +149,3 @@ def _with_lenses(
 
     stated_by_all = block_diag(*parts) if parts else np.zeros((0, 0))
     return Linearization(linear.data, linear.state, free), sigma, stated_by_all
-
-
-def select_cameras(table: Observations, cameras: Sequence[str]) -> Observations:
-    """Return the rows of some cameras, numbered in their order."""
-    number = np.full(len(table.cameras), -1)
-    number[[table.cameras.index(name) for name in cameras]] = np.arange(len(cameras))
-    rows = table.take(number[table.camera] >= 0)
-    return replace(rows, cameras=tuple(cameras), camera=number[rows.camera])
-
-
-def _select_shared(table: Observations) -> Observations:
-    """Return the rows of frames that several cameras saw."""
-    pairs = np.unique(np.stack([table.frame, table.camera], axis=-1), axis=0)
-    frames, counts = np.unique(pairs[:, 0], return_counts=True)
-    return table.take(np.isin(table.frame, frames[counts >= _MIN_CAMERAS]))

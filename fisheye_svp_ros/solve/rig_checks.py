@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Mask
 from fisheye_svp_ros.effects.base import Untestable
 from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
 from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
@@ -65,11 +66,16 @@ def is_unrelated(data: RigViews, state: RigState) -> bool:
     """Whether no rig explains where the cameras stand in most frames that several of them saw."""
     if data.cameras < 2 or data.poses is not None:
         return False
+    several, contradicted = contradicted_views(data, state)
+    return bool(several.any() and 2 * contradicted.sum() >= several.sum())
+
+
+def contradicted_views(data: RigViews, state: RigState) -> tuple[Mask, Mask]:
+    """Return which views (S,) other cameras share, and which of them a rig does not explain."""
     misfit, _ = cross_camera_offsets(data, state, localize_cameras(state.model, data.views))
     several = np.isfinite(misfit)
     extent = float(np.ptp(data.views.uv[data.views.used], axis=0).max())
-    return bool(several.any() and
-                np.quantile(misfit[several], 0.5, method='higher') > _UNRELATED_SHARE * extent)
+    return several, several & (misfit > _UNRELATED_SHARE * extent)
 
 
 def rig_is_inconsistent(

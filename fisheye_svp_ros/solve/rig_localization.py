@@ -11,12 +11,11 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, identity
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, select_cameras
 from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.measured_poses import posable_observations, sigma_known
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
 from fisheye_svp_ros.solve.reliability import noise_sigma
-from fisheye_svp_ros.solve.rig_calibration import select_cameras
 from fisheye_svp_ros.solve.rig_checks import rig_differs
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 

@@ -93,6 +93,8 @@ def group_by_frame(
 class RigState:
     """Poses (F,) of the rig's body, rig (C,) of the cameras in it, lens, effects.
 
+    boards (C,): which board a camera sees, where each board has a pose that is estimated: the
+    poses of boards 1 ... in the frame of board 0 follow those of the cameras in `rig`.
     others: the lenses of the further cameras of a rig, by whose names (`labels`) parameters and
     effects are told apart; without them every camera has the same lens.  terms: the effects and
     their values; corrected: whether the lens's own corrections act in place of them, unchanged.
@@ -105,6 +107,7 @@ class RigState:
     others: tuple[Lens, ...] = ()
     labels: tuple[str, ...] = ('',)
     corrected: bool = False
+    boards: tuple[int, ...] = ()
 
     @property
     def lenses(self) -> tuple[Lens, ...]:
@@ -154,7 +157,7 @@ class RigState:
     def retract(self, free: Sequence[str], frame: Array, shared: Array) -> RigState:
         """Return the state after a step of poses (F, 6) and of what all frames share.
 
-        shared (6 (C - 1) + K,): of the rig, the free intrinsics and the effects.
+        shared (6 (C - 1) + K,): of the rig with its boards, free intrinsics and effects.
         """
         move = np.zeros((*self.rig.shape, 6))
         turned = move[1:].size
@@ -168,7 +171,14 @@ class RigState:
 
     def view_poses(self, data: RigViews) -> Pose:
         """Return the camera's pose in each view (S,)."""
-        return self.pose.take(data.frame_of).compose(self.rig.take(data.camera_of))
+        pose = self.pose.take(data.frame_of).compose(self.rig.take(data.camera_of))
+        return self.board_poses(data).inverse().compose(pose) if self.boards else pose
+
+    def board_poses(self, data: RigViews) -> Pose:
+        """Return the pose (S,) of the board of each view, in the frame of the first board."""
+        board = np.array(self.boards)[data.camera_of]
+        # The first board is where the body of the rig is in itself: the identity.
+        return self.rig.take(np.where(board > 0, data.cameras - 1 + board, 0))
 
 
 class Linearization:
@@ -196,12 +206,20 @@ class Linearization:
             offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
         self.residual = data.blocks(offset * self.weight[..., None])
         self._d_pose = self._through_corrections(self.linear.d_pose)
-        self.frame_columns = self.whiten(self._frame_columns(pose))
+        if state.boards:
+            board = state.board_poses(data)
+            pose = board.compose(pose)
+            turn = np.kron(np.eye(2), np.swapaxes(board.rotation, -1, -2))
+            self._d_pose = self._d_pose @ turn[:, None]
+        self._camera = pose  # (S,) in the frame of the first board, as the derivatives by it
+        self.frame_columns = self.whiten(self._frame_columns())
 
     @cached_property
     def shared_columns(self) -> Array:
         """Whitened columns (F, M, K) of what all frames share."""
-        shared = [self._rig_columns(), self._lens_columns()]
+        shared = [self._rig_columns()]
+        shared += [self._board_columns()] if self.state.boards else []
+        shared.append(self._lens_columns())
         shared += [
             self.model.effect_columns(effect, self.scene, self.linear)
             for effect, _ in self.state.terms if is_shared(effect)
@@ -233,10 +251,10 @@ class Linearization:
             return columns
         return self.model.through(self.linear, self.data.views, columns)
 
-    def _frame_columns(self, pose: Pose) -> Array:
+    def _frame_columns(self) -> Array:
         d_place, d_turn = self._d_pose[..., :3], self._d_pose[..., 3:]
         # The frame turns about the rig's body: a camera off its origin also moves.
-        arm = pose.position - self.state.pose.position[self.data.frame_of]
+        arm = self._camera.position - self.state.pose.position[self.data.frame_of]
         lever = d_place @ -cross_matrix(arm)[:, None]
         frame = np.concatenate([d_place, d_turn + lever], axis=-1)
         return frame if self.data.poses is None else np.zeros_like(frame)
@@ -248,6 +266,17 @@ class Linearization:
         mine = self.data.camera_of[:, None] == np.arange(1, self.data.cameras)
         columns = rig[..., None, :] * mine[:, None, None, :, None]
         return np.asarray(columns.reshape(*rig.shape[:3], -1))
+
+    def _board_columns(self) -> Array:
+        """Return columns (S, N, 2, 6 (B - 1)) by the poses of the boards but the first."""
+        d_place, d_turn = self._d_pose[..., :3], self._d_pose[..., 3:]
+        board = np.array(self.state.boards)[self.data.camera_of]
+        arm = self._camera.position - self.state.board_poses(self.data).position
+        columns = np.concatenate(
+            [-d_place, d_place @ cross_matrix(arm)[:, None] - d_turn], axis=-1)
+        mine = board[:, None] == np.arange(1, max(self.state.boards) + 1)
+        columns = columns[..., None, :] * mine[:, None, None, :, None]
+        return np.asarray(columns.reshape(*d_place.shape[:-1], -1))
 
     def _lens_columns(self) -> Array:
         columns = self.model.lens_columns(self.linear, self.state.lens_names(self.free))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.moving_rig import moving_rig
 from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
 from fisheye_svp_ros import cli
@@ -80,6 +81,18 @@ def test_cameras_that_nothing_holds_are_named(
     assert 'rig: cam3 cannot be related to cam0, cam1, cam2: no frame shows the target' in said.err
     assert 'cam3' not in said.out
     assert len(load_rigs(tmp_path / 'rig.yaml')) == 2
+
+
+def test_boards_of_the_cameras_own_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table, _ = moving_rig(1, cameras=2)
+    calibrate_cameras(table, dict.fromkeys(CAMERAS[:2], LENS), tmp_path)
+    assert 'related by the motion of the rig: one seen by cam0, another by cam1' in (
+        capsys.readouterr().out)
+    cameras = json.loads((tmp_path / 'rig.json').read_text())['cameras']
+    assert [camera['board'] for camera in cameras.values()] == [0, 1]
+    assert cameras['cam1']['position'] == pytest.approx(RIG.position[1], abs=1e-3)
 
 
 def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
