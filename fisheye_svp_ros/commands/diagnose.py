@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fisheye_svp_ros.commands.lenses import Lenses, add_lens_argument, lenses_of, load_lenses
-from fisheye_svp_ros.commands.notes import note_copies, note_huge, note_left_out
+from fisheye_svp_ros.commands.notes import (
+    note_copies,
+    note_huge,
+    note_left_out,
+    note_unconnected,
+)
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
@@ -131,6 +136,8 @@ def run(args: argparse.Namespace) -> None:
             with write_together():
                 _write(args, diagnosis, known, bool(names), wanted)
     _print(diagnosis, known, args, wanted)
+    if not args.poses:
+        note_unconnected(observations)
     if impossible is not None:
         raise impossible
 

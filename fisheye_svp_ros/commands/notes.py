@@ -101,3 +101,14 @@ def note_doubtful(
             say(f'{frame_name(table, frame)}: {reason}')
         if rest := [frame for frame, _ in doubtful[shown:]]:
             say(f'{list_frames(table, rest)}: likewise')
+
+
+def note_unconnected(table: Observations) -> None:
+    """Say which cameras share no frame with others, so that nothing relates them."""
+    from fisheye_svp_ros.solve.rig_calibration import connected_cameras
+
+    first, *others = connected_cameras(table)
+    for group in others:
+        say(f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their relative '
+            'pose is not estimated, and no rig.yaml is written')
+        first += group

@@ -20,8 +20,8 @@ from fisheye_svp_ros.solve.hand_eye import HandEye
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
 _SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
 _NO_RIG_NOTE = (
-    '; their relative pose is not constant, or the photographs are not simultaneous, so each view '
-    'has its own pose and no result depends on the rig')
+    '; their relative pose is not constant, the photographs are not simultaneous, or the two see '
+    'different boards, so each view has its own pose and no result depends on the rig')
 ROBOT_TITLE = 'Poses of the robot'
 SETS_TITLE = 'Another data set of this camera'
 CAMERAS_TITLE = 'Cross-camera validation'

@@ -12,6 +12,7 @@ from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
+from fisheye_svp_ros.commands.notes import note_unconnected
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.io.rig_files import cameras_in_first, load_rigs, save_rig
@@ -81,6 +82,12 @@ def test_cameras_that_nothing_holds_are_named(
     assert 'rig: cam3 cannot be related to cam0, cam1, cam2: no frame shows the target' in said.err
     assert 'cam3' not in said.out
     assert len(load_rigs(tmp_path / 'rig.yaml')) == 2
+
+
+def test_diagnosis_names_cameras_that_share_no_frame(capsys: pytest.CaptureFixture[str]) -> None:
+    note_unconnected(photographs(3, (45.0, 225.0), 8))
+    assert ('cam2 and cam3: no frame shared with cam0 and cam1, so their relative pose is not '
+            'estimated') in capsys.readouterr().err
 
 
 def test_boards_of_the_cameras_own_are_named(
