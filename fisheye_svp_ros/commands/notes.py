@@ -109,6 +109,6 @@ def note_unconnected(table: Observations) -> None:
 
     first, *others = connected_cameras(table)
     for group in others:
-        say(f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their relative '
-            'pose is not estimated, and no rig.yaml is written')
+        say(f'{" and ".join(group)}: no frame shared with {" and ".join(first)}, so their '
+            'relative pose is not estimated, and no rig.yaml is written')
         first += group
