@@ -7,11 +7,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 import pytest
 from helpers.graph import LATCHED, Graph, set_parameter
+from helpers.nodes import ROOT
 from helpers.photographs import LENS, PRINTED, photograph, poses
 from numpy.typing import NDArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -219,3 +221,12 @@ def test_a_topic_that_would_be_heard_and_published_is_refused(ros_domain: int) -
             g.start(Rectifier)
     finally:
         g.close()
+
+
+def test_shared_memory_holds_images() -> None:
+    """As docs/reference/nodes.md tells to use it: several color images of 1280 x 800 px."""
+    profile = ElementTree.parse(ROOT / 'config' / 'fastdds' / 'images.xml')
+    sizes = {name: int(profile.findtext(f'.//{{*}}{name}') or 0)
+             for name in ('segment_size', 'maxMessageSize')}
+    image = 3 * 1280 * 800
+    assert sizes['segment_size'] > 10 * image and sizes['maxMessageSize'] > image
