@@ -119,9 +119,15 @@ compare: .venv-compare/ready
 rectification: .venv-compare/ready
 	.venv-compare/bin/python -m benchmark.rectification
 
-# Rigs of four cameras beside OpenCV's multiview calibration, into docs/results/rigs.md; five minutes.
-rigs: $(VENV)/ready
+# Rigs of four cameras beside OpenCV's multiview calibration, multical and pycolmap, into
+# docs/results/rigs.md; ten minutes.
+rigs: $(VENV)/ready .venv-rigs/ready
 	$(BIN)/python -m benchmark.rigs
+
+.venv-rigs/ready:
+	$(PYTHON) -m venv .venv-rigs
+	.venv-rigs/bin/pip install --quiet multical==0.4.0 pycolmap 'numpy<2'
+	touch $@
 
 # Cameras on robots beside OpenCV's hand-eye calibration, which OpenCV 5 has no more, into
 # docs/results/hand_eye.md; ten minutes.

@@ -2,17 +2,22 @@
 
 Cameras of 180 degrees, 90 degrees apart, see a board between two of them and before each.  Each
 trial is calibrated by ours (lenses, then rig) and by OpenCV 5's `calibrateMultiview`, which starts
-at our lenses: without a start it refuses these views.  Writes docs/results/rigs.md.
+at our lenses: without a start it refuses these views.  multical and pycolmap start there too,
+where .venv-rigs has them (`benchmark.rig_peers`).  Then the cameras see a board each while the
+rig moves.  Writes docs/results/rigs.md.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import process_time
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,8 +32,10 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.scene.rigs import surround_rig
+from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.lens_calibration import calibrate
-from fisheye_svp_ros.solve.rig_calibration import calibrate_rig
+from fisheye_svp_ros.solve.rig_calibration import RigCalibration, calibrate_rig
+from fisheye_svp_ros.solve.rig_state import group_by_frame
 from fisheye_svp_ros.study.lens_trust import assess_lens, with_covariance
 
 TRIALS = 60
@@ -38,6 +45,8 @@ _LENS = Lens('around', 1280, 800, 400.0, 400.0, 639.5, 399.5, KannalaBrandt(-0.0
 _CAMERAS = tuple(f'cam{i}' for i in range(4))
 _RIG = surround_rig(4, 0.1)
 _SEAMS, _FRAMES, _NOISE_PX = 32, 64, 0.2  # photographs between two cameras, all, px
+_MOVING, _TURN = 24, 0.35  # photographs of each camera, rad
+_PEERS = Path(__file__).parents[1] / '.venv-rigs' / 'bin' / 'python'
 _Y, _X = np.mgrid[:6, :9]
 _BOARD = 0.05 * np.stack([_X.ravel() - 4.0, _Y.ravel() - 2.5, np.zeros(54)], axis=-1)
 
@@ -45,14 +54,13 @@ _BOARD = 0.05 * np.stack([_X.ravel() - 4.0, _Y.ravel() - 2.5, np.zeros(54)], axi
 class Outcome(NamedTuple):
     """What came of a trial.
 
-    z (18,): errors of three cameras over their standard errors; ours, opencv: rms errors of place,
-    m, and turn, rad; seconds: of both.
+    z (18,): errors of three cameras over their standard errors; errors: by whom, rms of place, m,
+    and of turn, rad, and processor time, s; why: what kept a peer from an answer.
     """
 
     z: list[float]
-    ours: tuple[float, float]
-    opencv: tuple[float, float]
-    seconds: tuple[float, float]
+    errors: dict[str, tuple[float, float, float]]
+    why: dict[str, str]
 
 
 def draw_points(seed: int) -> Array:
@@ -96,19 +104,70 @@ def run_trial(seed: int) -> Outcome:
         lens = found.adjusted.lens
         lenses[name] = with_covariance(lens, assess_lens(rows, lens, found.adjusted.names))
     rig = calibrate_rig(table, lenses, _CAMERAS)
-    between = process_time()
+    errors = {'ours': (*_sizes(rig.rig), process_time() - start)}
+    start = process_time()
     theirs = _opencv(uv, list(lenses.values()))
-    end = process_time()
-    off = np.stack([rig.rig.take(i).difference(_RIG.take(i)) for i in range(1, 4)])
-    stderr = np.sqrt(np.diagonal(rig.covariance, axis1=1, axis2=2))
-    other = np.stack([theirs.take(i).difference(_RIG.take(i)) for i in range(1, 4)])
-    return Outcome((off / stderr).ravel().tolist(), _sizes(off), _sizes(other),
-                   (between - start, end - between))
+    errors['OpenCV'] = (*_sizes(theirs), process_time() - start)
+    why = {}
+    for peer, answer in _peers(table, uv, list(lenses.values())).items():
+        if 'why' in answer:
+            why[peer] = answer['why']
+        else:
+            found = np.array(answer['rig'])
+            errors[peer] = (*_sizes(Pose(found[:, :3, :3], found[:, :3, 3])), answer['seconds'])
+    return Outcome(_z_scores(rig), errors, why)
 
 
-def _sizes(off: Array) -> tuple[float, float]:
+def _z_scores(found: RigCalibration) -> list[float]:
+    off = found.rig.difference(_RIG)[1:]
+    return (off / np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))).ravel().tolist()
+
+
+def run_moving(seed: int) -> list[float]:
+    """Return the errors (18,) over their standard errors of cameras that see a board each."""
+    rng = np.random.default_rng(seed)
+    boards = [_RIG.take(camera).compose(Pose(rotation_from_vector(rng.normal(0, 0.2, 3)),
+                                             np.array([0.0, 0.0, rng.uniform(0.5, 0.7)])))
+              for camera in range(4)]
+    uv = np.full((4, _MOVING, len(_BOARD), 2), np.nan)
+    for frame in range(_MOVING):
+        body = Pose(rotation_from_vector(rng.uniform(-_TURN, _TURN, 3)),
+                    rng.uniform(-0.08, 0.08, 3))
+        for camera, board in enumerate(boards):
+            place = body.compose(_RIG.take(camera))
+            image = project(_LENS, place.inverse().transform(board.transform(_BOARD)))
+            uv[camera, frame] = image.uv
+    uv += rng.normal(0, _NOISE_PX, uv.shape)
+    return _z_scores(calibrate_rig(as_table(uv), dict.fromkeys(_CAMERAS, _LENS), _CAMERAS))
+
+
+def _sizes(rig: Pose) -> tuple[float, float]:
+    off = rig.difference(_RIG)[1:]
     place, turn = np.sqrt((off.reshape(3, 2, 3) ** 2).sum(axis=-1).mean(axis=0)).tolist()
     return place, turn
+
+
+def _peers(table: Observations, uv: Array, lenses: Sequence[Lens]) -> dict[str, Any]:
+    """Return what the peers of .venv-rigs answer; they start where we do."""
+    if not _PEERS.exists():
+        return {}
+    start = initial_state(group_by_frame(table), lenses[0], lenses[1:])
+    with TemporaryDirectory() as folder:
+        path = Path(folder, 'problem.npz')
+        np.savez(path, uv=uv[:, table.frames], board=_BOARD, size=[_LENS.width, _LENS.height],
+                 lenses=[[one.fx, one.fy, one.cx, one.cy,
+                          *(one.parameters[f'k{i}'] for i in range(1, 5))] for one in lenses],
+                 body=_matrices(start.pose), rig=_matrices(start.rig))
+        answer = subprocess.run(
+            [_PEERS, Path(__file__).with_name('rig_peers.py')], input=f'{path}\n',
+            capture_output=True, text=True, check=True)
+    return dict(json.loads(answer.stdout))
+
+
+def _matrices(pose: Pose) -> Array:
+    matrix = np.tile(np.eye(4), (*pose.shape, 1, 1))
+    matrix[..., :3, :3], matrix[..., :3, 3] = pose
+    return matrix
 
 
 def _opencv(uv: Array, lenses: Sequence[Lens]) -> Pose:
@@ -128,34 +187,48 @@ def _opencv(uv: Array, lenses: Sequence[Lens]) -> Pose:
     return Pose(rotation, np.array(places, dtype=float).reshape(4, 3)).inverse()
 
 
-def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
+def write_results(
+    outcomes: Sequence[Outcome], moving: Sequence[list[float]], path: Path = _DOC
+) -> None:
     """Write the page of the results."""
-    z = np.array([one.z for one in outcomes])
-    inside = (np.abs(z) < stats.norm.ppf(0.975)).mean()
     lines = [
         '# Rigs of four cameras', '',
         'Written by `python -m benchmark.rigs` (`make rigs`). Four cameras of 1280 x 800 px and '
         '180 deg stand 90 deg apart on a circle of 0.1 m. They photograph a board of 9 x 6 '
         f'corners: {_SEAMS} photographs between two cameras, {_FRAMES - _SEAMS} before one. '
         f'{_NOISE_PX} px of noise, unknown lenses, {len(outcomes)} trials. OpenCV '
-        f'{cv2.__version__} is `cv2.calibrateMultiview` with fisheye models. It starts at our '
-        'lenses, since it refuses these views without a start.', '',
-        '| | place, mm | turn, deg | processor time, s |', '|---|---|---|---|',
+        f'{cv2.__version__} is `cv2.calibrateMultiview` with fisheye models; it, multical and '
+        "pycolmap (COLMAP's bundle adjustment of a rig, OPENCV_FISHEYE, points known) start at "
+        'our lenses, pycolmap at our start of the poses too.', '',
+        '| | trials | place, mm | turn, deg | processor time, s |', '|---|---|---|---|---|',
     ]
-    for name, errors, which in (('ours', [one.ours for one in outcomes], 0),
-                                ('OpenCV', [one.opencv for one in outcomes], 1)):
-        place, turn = np.median(np.array(errors), axis=0)
-        took = np.median([one.seconds[which] for one in outcomes])
-        lines.append(f'| {name} | {1e3 * place:.3f} | {np.degrees(turn):.4f} | {took:.1f} |')
-    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. OpenCV '
-              'states no standard errors.', '',
-              f'Of the {z.size} numbers of the transforms, {100 * inside:.1f} % lie within 1.96 '
-              'of their standard errors. That is more than 95 %, since the errors of the lenses '
-              'count every shape of the target that the data admit.', '']
+    for name in sorted({name for one in outcomes for name in one.errors}, key='ours'.__ne__):
+        errors = np.array([one.errors[name] for one in outcomes if name in one.errors])
+        place, turn, took = np.median(errors, axis=0)
+        lines.append(f'| {name} | {len(errors)} | {1e3 * place:.3f} | {np.degrees(turn):.4f} | '
+                     f'{took:.1f} |')
+    why = {f'{name}: {text}' for one in outcomes for name, text in one.why.items()}
+    if not _PEERS.exists():
+        why.add('multical, pycolmap: not installed (`make rigs`)')
+    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. Only '
+              'ours states standard errors.', *(f'\nLeft out: {one}.' for one in sorted(why)), '',
+              _within('the transforms', [one.z for one in outcomes]), '',
+              '## A board for each camera', '',
+              f'The same cameras, lenses known, see a board each, {_MOVING} photographs; the rig '
+              f'turns by up to {np.degrees(_TURN):.0f} deg about each axis. '
+              + _within('the transforms, from the motion of the rig,', moving), '']
     write_text(path, '\n'.join(textwrap.fill(line, 100, break_on_hyphens=False)
                                for line in lines))
 
 
+def _within(what: str, scores: Sequence[list[float]]) -> str:
+    z = np.array(scores)
+    inside = (np.abs(z) < stats.norm.ppf(0.975)).mean()
+    return (f'Of the {z.size} numbers of {what} {100 * inside:.1f} % lie within 1.96 of their '
+            'standard errors.')
+
+
 if __name__ == '__main__':
     todo = list(range(int(sys.argv[1]) if len(sys.argv) > 1 else TRIALS))
-    write_results(in_processes('rigs', run_trial, todo, 2))
+    write_results(in_processes('rigs', run_trial, todo, 2),
+                  in_processes('moving rigs', run_moving, todo, 2))
