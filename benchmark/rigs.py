@@ -210,8 +210,9 @@ def write_results(
     why = {f'{name}: {text}' for one in outcomes for name, text in one.why.items()}
     if not _PEERS.exists():
         why.add('multical, pycolmap: not installed (`make rigs`)')
-    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. Only '
-              'ours states standard errors.', *(f'\nLeft out: {one}.' for one in sorted(why)), '',
+    lines += ['', 'Medians of the rms errors of the other three cameras in the first one. The '
+              'time of the others is without that of their start. Only ours states standard '
+              'errors.', *(f'\nLeft out: {one}.' for one in sorted(why)), '',
               _within('the transforms', [one.z for one in outcomes]), '',
               '## A board for each camera', '',
               f'The same cameras, lenses known, see a board each, {_MOVING} photographs; the rig '

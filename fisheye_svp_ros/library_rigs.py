@@ -23,8 +23,10 @@ from fisheye_svp_ros.threads import single_threaded
 def calibrate_rig(
     observations: AnyObservations, lenses: Mapping[str, AnyLens]
 ) -> RigCalibration:
-    """Fit where the cameras of a table stand, in the first of them; lenses by camera, as they are.
+    """Fit where the cameras of a table stand, in the first of them; lenses by camera.
 
+    A lens that states its standard errors (`calibrate`) is fitted, too, with these as its prior;
+    the rig goes with the lenses of the result.
     Cameras whose views no relative pose explains as those of one target see boards of their own:
     these stand still, and the motion of the rig relates them.
     Raises ObservationError for a camera without a lens, for cameras that no frame holds to the

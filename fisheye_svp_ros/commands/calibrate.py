@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
+from fisheye_svp_ros.commands.calibrate_rig import fit_rig, print_rig, write_rig
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
 from fisheye_svp_ros.commands.outputs import output_path
@@ -97,6 +97,13 @@ def run(args: argparse.Namespace) -> None:
         name = camera or (args.output.stem if args.output else args.model)
         size = sizes.get(camera) or sizes['']
         found[camera] = _calibrate_camera(table, args, size, name)
+    rig = None
+    if len(found) > 1:
+        rig = fit_rig(_join_tables([one.table for one in found.values()]),
+                      {camera: one.lens for camera, one in found.items()})
+    if rig and not args.poses:  # the robot's transforms are those of the lenses as they are
+        for camera, lens in zip(rig.cameras, rig.lenses, strict=True):
+            found[camera] = found[camera].with_lens(lens)
     # Written before a word is printed: nobody may be reading.
     if args.output:
         from fisheye_svp_ros.reporting.calibration_report import write_calibration_report
@@ -110,15 +117,16 @@ def run(args: argparse.Namespace) -> None:
             report = (args.output / 'calibration.html' if len(paths) > 1 else
                       next(iter(paths.values())).with_suffix('.calibrate.html'))
             write_calibration_report(report, found, _next_command(args, paths))
+            if rig:
+                write_rig(rig, args.output)
     for one in found.values():
         _print(one)
         for warning in one.warnings:
             say(warning)
     if args.output:
         print(f'{", ".join(map(str, paths.values()))}; report: {report}')
-    lenses = {camera: one.lens for camera, one in found.items()}
-    if len(lenses) > 1:
-        calibrate_cameras(_join_tables([one.table for one in found.values()]), lenses, args.output)
+    if rig:
+        print_rig(rig)
 
 
 def _join_tables(tables: Sequence[Observations]) -> Observations:

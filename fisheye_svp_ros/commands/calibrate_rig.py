@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.io.files import write_json, write_text, write_together
+from fisheye_svp_ros.io.files import write_json, write_text
 from fisheye_svp_ros.io.lens_formats import kalibr, transforms
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.lens import Lens
@@ -28,10 +28,8 @@ from fisheye_svp_ros.solve.rig_calibration import (
 from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
 
 
-def calibrate_cameras(
-    table: Observations, lenses: Mapping[str, Lens], folder: Path | None
-) -> None:
-    """Fit the rig of all cameras that frames hold together; print it, write it to a folder.
+def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration | None:
+    """Fit the rig of all cameras that frames hold together, None where there is none; say why.
 
     lenses: from `calibrate`.
     """
@@ -46,18 +44,15 @@ def calibrate_cameras(
                     'turn the rig while each sees a board of its own, and give simultaneous '
                     'photographs the same frame number')
         if len(largest) < 2:
-            return
+            return None
         pair = rig_cameras(largest)
         found = calibrate_rig(table, lenses, pair or largest)
     except FisheyeSvpError as cause:
         say(f'rig: {cause}')
-        return
+        return None
     for warning in _warnings(found, table, lenses):
         say(f'rig: {warning}')
-    if folder:
-        with write_together():
-            _write(found, [lenses[name] for name in found.cameras], folder)
-    _print(found)
+    return found
 
 
 def _warnings(
@@ -82,14 +77,15 @@ def _warnings(
                 return
 
 
-def _write(found: RigCalibration, lenses: Sequence[Lens], folder: Path) -> None:
+def write_rig(found: RigCalibration, folder: Path) -> None:
+    """Write a rig as tools read it, its lenses apart."""
     save_rig(found.steps(), folder / 'rig.yaml', found.cameras)
     write_json(folder / 'rig.json', _document(found))
     write_text(folder / 'rig.urdf', transforms.urdf_text(found.cameras, found.rig))
     write_text(folder / 'tf_static.yaml',
                transforms.static_transforms_text(found.cameras, found.rig))
     try:
-        write_text(folder / 'camchain.yaml', kalibr.write_chain(lenses, found.steps()))
+        write_text(folder / 'camchain.yaml', kalibr.write_chain(found.lenses, found.steps()))
     except FisheyeSvpError as cause:
         say(f'camchain.yaml of Kalibr is not written: {cause}')
 
@@ -109,7 +105,8 @@ def _document(found: RigCalibration) -> dict[str, Any]:
     }
 
 
-def _print(found: RigCalibration) -> None:
+def print_rig(found: RigCalibration) -> None:
+    """Print a rig."""
     if len(found.cameras) == 2:
         x, y, z = 1000 * found.steps()[0].position
         print(f'rig: camera {found.cameras[0]} in {found.cameras[1]} at {x:.3f}, '

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.reporting.hand_eye_text import hand_eye_warnings
 from fisheye_svp_ros.reporting.tables import UNITS, interval, with_error
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.photograph_names import list_frames
+from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.measured_poses import rms_px
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.solve.hand_eye import HandEye
@@ -35,6 +38,15 @@ class CalibratedCamera:
     table: Observations
     model: str
     hand_eye: HandEye | None = None
+
+    def with_lens(self, lens: Lens) -> CalibratedCamera:
+        """Return the camera with a lens fitted to more, and the poses of its views by it."""
+        adjusted, views = self.result.adjusted, self.result.views
+        solved = localize(ForwardModel(lens), views, adjusted.pose)
+        lens = replace(lens, calibration={
+            **(lens.calibration or {}), 'rms_px': rms_px(solved.residual)})
+        return replace(self, lens=lens, result=self.result._replace(adjusted=adjusted._replace(
+            lens=lens, pose=solved.pose, residual=solved.residual)))
 
     def parameter_rows(self) -> list[tuple[str, str, str, str, str]]:
         """Return name, value, standard error, range over targets ('': settled) and unit.

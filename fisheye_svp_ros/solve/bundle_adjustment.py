@@ -195,8 +195,8 @@ def adjust_lens_from(
 def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
     """Return the covariances (C - 1, 6, 6) of the cameras but the first, m and rad, poses free.
 
-    Of the change in `Pose.retract`, for noise of sigma / weight, and of lenses that were held at
-    values of a covariance (K, K): of the free parameters of the linearization.
+    Of the change in `Pose.retract`, for noise of sigma / weight; the free parameters of the
+    linearization were fitted with a prior of an information (K, K), lenses.
     Raises GeometryError where the frames do not determine the rig.
     """
     cameras = linear.data.cameras - 1
@@ -206,10 +206,10 @@ def rig_covariance(linear: Linearization, sigma: float, lenses: Array) -> Array:
              for i in range(bodies) for _ in range(6)]
     _check_determined(_equations(linear, linear.shared_columns[..., :count])[1], names)
     information = arrow_information(_equations(linear, linear.shared_columns)[1])[0]
-    inverse = np.linalg.inv(information[:count, :count])
-    moved = inverse @ information[:count, count:count + len(lenses)]
-    shared = sigma**2 * inverse + moved @ lenses @ moved.T
-    blocks = shared.reshape(bodies, 6, bodies, 6)
+    information[count:, count:] += sigma**2 * lenses
+    scale = np.sqrt(np.diag(information))
+    inverse = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    blocks = sigma**2 * inverse[:count, :count].reshape(bodies, 6, bodies, 6)
     return np.stack([blocks[i, :, i] for i in range(cameras)])
 
 

@@ -10,29 +10,33 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import GeometryError
-from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.optics.lens import Lens, monotone_limit, parameter_values
 from fisheye_svp_ros.pose import Pose, identity
 from fisheye_svp_ros.scene.observations import Observations, select_cameras, select_shared
-from fisheye_svp_ros.solve.bundle_adjustment import adjust, rig_covariance
+from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust, rig_covariance
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import sigma_known
 from fisheye_svp_ros.solve.moving_rig import PlacedBoards, place_boards
 from fisheye_svp_ros.solve.outliers import FRAME, find_outliers
 from fisheye_svp_ros.solve.reliability import misfit_fails, misfit_reason
-from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
+from fisheye_svp_ros.solve.rig_state import (
+    Linearization,
+    RigState,
+    RigViews,
+    group_by_frame,
+)
 
 
 class RigCalibration(NamedTuple):
     """A rig of C cameras: rig (C,) in the first of them, m.
 
-    boards (C,): which board each camera sees, where these stand apart and only the motion of the
-    rig relates them; empty where all see one.
     covariance (C - 1, 6, 6), m and rad, of the change in `Pose.retract`, of each camera but the
-    first, with the errors that its lenses state of themselves; frame (F,); pose (F,) of the first
-    camera in its target; rms_px (C,), and over all: total_rms_px; sigma_px: noise of u and v,
-    estimated, None where the observations bring their own; shared (C,): frames that a camera
-    shares with others; left_out: frames that no rig explains; reason: why it should not be relied
-    on, '' for a reliable one.
+    first; frame (F,); pose (F,) of the first camera in its target; rms_px (C,), and over all:
+    total_rms_px; sigma_px: noise of u and v, estimated, None where the observations bring their
+    own; shared (C,): frames that a camera shares with others; left_out: frames that no rig
+    explains; reason: why it should not be relied on, '' for a reliable one; lenses (C,): fitted
+    with the rig; boards (C,): which board each camera sees, where these stand apart and only the
+    motion of the rig relates them; empty where all see one.
     """
 
     cameras: tuple[str, ...]
@@ -46,6 +50,7 @@ class RigCalibration(NamedTuple):
     shared: Index
     left_out: tuple[int, ...]
     reason: str
+    lenses: tuple[Lens, ...]
     boards: tuple[int, ...] = ()
 
     def steps(self) -> tuple[Pose, ...]:
@@ -75,8 +80,9 @@ def connected_cameras(table: Observations) -> list[tuple[str, ...]]:
 def calibrate_rig(
     table: Observations, lenses: Mapping[str, Lens], cameras: Sequence[str]
 ) -> RigCalibration:
-    """Fit the rig and the poses of its frames to what the cameras saw, their lenses known.
+    """Fit the rig and the poses of its frames to what the cameras saw, and their lenses.
 
+    What a lens states of its errors is its prior; one that states none stays as it is.
     cameras: connected ones, in the order in which they are wanted; the first is the frame of all.
     Outliers are rejected, and frames in which the cameras contradict each other.
     Cameras that see boards of their own are related by the motion of the rig.
@@ -87,18 +93,24 @@ def calibrate_rig(
     ordered = [lenses[name] for name in order]
     placed = place_boards(select_shared(select_cameras(table, order)), ordered)
     rows, torn = _without_outliers(placed)
-    linear = _fit_rig(rows, ordered, placed.boards)
+    data, state = _fit_rig(rows, ordered, placed.boards)
     # Cameras stand in the order in which frames hold them together; the first one stays the first.
     place = [order.index(name) for name in cameras if name in order]
-    data, state = linear.data, linear.state
-    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
+    known = sigma_known(rows)
+    free, mean, information = _stated_errors(order, ordered)
+    held, freedom = _sum_of_squares(data, state)
     if freedom < 1:
         raise GeometryError(f'{rows.source}: too few points for a rig of {len(order)} cameras')
-    chi2 = float((linear.residual**2).sum()) / freedom
-    known = sigma_known(rows)
-    fails = known and bool(misfit_fails(np.array(chi2 * freedom), np.array(freedom)))
-    sigma = None if known else float(np.sqrt(chi2))
-    covariance = rig_covariance(*_with_lenses(linear, order, sigma or 1.0))
+    if free:
+        noise = 1.0 if known else np.sqrt(held / freedom)
+        values, vectors = np.linalg.eigh(information)
+        root = noise * np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+        state = adjust(data, state, free, Prior(mean, root))
+    squared, freedom = _sum_of_squares(data, state)
+    fails = known and bool(misfit_fails(np.array(squared), np.array(freedom)))
+    sigma = None if known else float(np.sqrt(squared / freedom))
+    linear = Linearization(data, state, free)
+    covariance = rig_covariance(linear, sigma or 1.0, information)
     squares = ((data.views.uv - linear.linear.uv) ** 2).sum(axis=-1)
     squares = np.where(data.views.used, squares, np.nan)
     return RigCalibration(
@@ -107,7 +119,8 @@ def calibrate_rig(
         np.array([np.sqrt(np.nanmean(squares[data.camera_of == i])) for i in place]),
         float(np.sqrt(np.nanmean(squares))), sigma,
         np.bincount(data.camera_of, minlength=len(order))[place], torn,
-        misfit_reason(chi2, freedom) if fails else '',
+        misfit_reason(squared / freedom, freedom) if fails else '',
+        tuple(_within_curve(state.lenses[i]) for i in place),
         tuple(placed.boards[i] for i in place if placed.boards),
     )
 
@@ -124,28 +137,42 @@ def _without_outliers(placed: PlacedBoards) -> tuple[Observations, tuple[int, ..
 
 def _fit_rig(
     rows: Observations, lenses: Sequence[Lens], boards: tuple[int, ...]
-) -> Linearization:
+) -> tuple[RigViews, RigState]:
     """Return rig, boards of the cameras' own and poses of the frames, fitted, the lenses known."""
     data = group_by_frame(rows)
     start = initial_state(data, lenses[0], lenses[1:])
     rig = Pose.concatenate([start.rig, identity(max(boards, default=0))])
     state = replace(start, rig=rig, lens=lenses[0], others=tuple(lenses[1:]), terms=(),
                     corrected=True, boards=boards)
-    return Linearization(data, adjust(data, state, ()), ())
+    return data, adjust(data, state, ())
 
 
-def _with_lenses(
-    linear: Linearization, cameras: Sequence[str], sigma: float
-) -> tuple[Linearization, float, Array]:
-    """Return what `rig_covariance` needs: with what the lenses state of their own errors."""
+def _within_curve(lens: Lens) -> Lens:
+    """Return the lens with a field of view that its curve, which has moved, still allows."""
+    return replace(lens, max_incidence=min(lens.max_incidence, monotone_limit(lens)))
+
+
+def _sum_of_squares(data: RigViews, state: RigState) -> tuple[float, int]:
+    """Return the whitened sum of squares and its degrees of freedom."""
+    linear = Linearization(data, state, ())
+    freedom = int(linear.row_mask.sum()) - 6 * (data.frames + len(state.rig.position) - 1)
+    return float((linear.residual**2).sum()), freedom
+
+
+def _stated_errors(
+    cameras: Sequence[str], lenses: Sequence[Lens]
+) -> tuple[list[str], Array, Array]:
+    """Return what the lenses state of their errors: names, values (K,) and information (K, K)."""
+    from scipy.linalg import block_diag  # not while --help waits
+
     free: list[str] = []
-    parts = []
-    for name, lens in zip(cameras, linear.state.lenses, strict=True):
+    mean: list[float] = []
+    parts = [np.zeros((0, 0))]
+    for name, lens in zip(cameras, lenses, strict=True):
         stated = lens.calibration or {}
         if 'covariance' in stated and 'stderr' in stated:
             free += [f'{name}.{parameter}' for parameter in stated['stderr']]
-            parts.append(np.array(stated['covariance'], dtype=float))
-    from scipy.linalg import block_diag  # not while --help waits
-
-    stated_by_all = block_diag(*parts) if parts else np.zeros((0, 0))
-    return Linearization(linear.data, linear.state, free), sigma, stated_by_all
+            mean += parameter_values(lens, list(stated['stderr']))
+            parts.append(np.linalg.pinv(np.array(stated['covariance'], dtype=float),
+                                        hermitian=True))
+    return free, np.array(mean), block_diag(*parts)

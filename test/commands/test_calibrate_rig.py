@@ -11,19 +11,28 @@ from helpers.moving_rig import moving_rig
 from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.commands.calibrate_rig import calibrate_cameras
+from fisheye_svp_ros.commands.calibrate_rig import fit_rig, print_rig, write_rig
 from fisheye_svp_ros.commands.notes import note_unconnected
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
 from fisheye_svp_ros.io.rig_files import cameras_in_first, load_rigs, save_rig
+from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.observations import Observations
+
+
+def write_fitted(table: Observations, lenses: dict[str, Lens], folder: Path) -> None:
+    found = fit_rig(table, lenses)
+    assert found is not None
+    write_rig(found, folder)
+    print_rig(found)
 
 
 @pytest.fixture(scope='module')
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp('rig')
     table = photographs(1, (45.0, 135.0, 225.0, 315.0))
-    calibrate_cameras(table, dict.fromkeys(CAMERAS, LENS), folder)
+    write_fitted(table, dict.fromkeys(CAMERAS, LENS), folder)
     return folder
 
 
@@ -77,7 +86,7 @@ def test_cameras_that_nothing_holds_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table = photographs(3, (45.0, 135.0))
-    calibrate_cameras(table, dict.fromkeys(CAMERAS, LENS), tmp_path)
+    write_fitted(table, dict.fromkeys(CAMERAS, LENS), tmp_path)
     said = capsys.readouterr()
     assert 'rig: cam3 cannot be related to cam0, cam1, cam2: no frame shows the target' in said.err
     assert 'cam3' not in said.out
@@ -94,7 +103,7 @@ def test_boards_of_the_cameras_own_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table, _ = moving_rig(1, cameras=2)
-    calibrate_cameras(table, dict.fromkeys(CAMERAS[:2], LENS), tmp_path)
+    write_fitted(table, dict.fromkeys(CAMERAS[:2], LENS), tmp_path)
     assert 'related by the motion of the rig: one seen by cam0, another by cam1' in (
         capsys.readouterr().out)
     cameras = json.loads((tmp_path / 'rig.json').read_text())['cameras']
