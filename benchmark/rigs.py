@@ -202,7 +202,7 @@ def write_results(
         'our lenses, pycolmap at our start of the poses too.', '',
         '| | trials | place, mm | turn, deg | processor time, s |', '|---|---|---|---|---|',
     ]
-    for name in sorted({name for one in outcomes for name in one.errors}, key='ours'.__ne__):
+    for name in dict.fromkeys(name for one in outcomes for name in one.errors):
         errors = np.array([one.errors[name] for one in outcomes if name in one.errors])
         place, turn, took = np.median(errors, axis=0)
         lines.append(f'| {name} | {len(errors)} | {1e3 * place:.3f} | {np.degrees(turn):.4f} | '

@@ -69,7 +69,8 @@ def localize_rig(
     if not np.isfinite(linear.residual).all() or (
             np.linalg.eigvalsh(information)[:, 0] <= 0).any():
         raise GeometryError(f'{table.source}: the rig does not determine the pose of a frame; '
-                            'check that lenses, rig and observations belong together')
+                            'check that lenses, rig and observations belong together, and that '
+                            'all cameras see one target')
     known = sigma_known(rows)
     sigma = None if known else noise_sigma(
         float((linear.residual**2).sum()), int(linear.row_mask.sum()), 6 * data.frames)

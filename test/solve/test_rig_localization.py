@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers.moving_rig import moving_rig
 from helpers.surround import BOARD, CAMERAS, LENS, NOISE, RIG, board_pose, photographs
 
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.solve.rig_localization import localize_rig
 
@@ -56,3 +57,9 @@ def test_a_camera_that_is_not_in_the_rig_is_refused() -> None:
     table = replace(photographs(1, SEAMS), cameras=('cam0', 'cam1', 'cam2', 'up'))
     with pytest.raises(ObservationError, match='camera up is not in the rig, which has cam0'):
         localize_rig(table, LENSES | {'up': LENS}, CAMERAS, RIG)
+
+
+def test_boards_of_the_cameras_own_are_refused() -> None:
+    table, _ = moving_rig(1, frames=6, cameras=2)
+    with pytest.raises(GeometryError, match='that all cameras see one target'):
+        localize_rig(table, LENSES, CAMERAS, RIG)
