@@ -36,6 +36,7 @@ from fisheye_svp_ros.mixed_model import (
     FactoredEquations,
     Solution,
     Variances,
+    combine_offsets,
     factor_equations,
     make_equations,
     multiply_rows,
@@ -316,19 +317,9 @@ class FittedModel:
 
     def _landmark_offsets(self, e: Array, r: Array) -> Array:
         """Return what coefficients (E, k, C), (R, C) displace each landmark by: (L, 3, C)."""
-        eq, random = self.factored.equations, self.random
+        eq = self.factored.equations
         _, landmark, shared = eq.split(e, r)
-        offset = np.zeros((len(random.landmark), 3, r.shape[-1]))
-        if len(eq.units):
-            present = random.columns.unit_label[eq.units] >= 0
-            offset[eq.units] = np.where(present[..., None], landmark, 0.0)
-        at = random.grid_columns
-        for field in random.fields:
-            for axis in field.axes:
-                count = field.values.shape[1]
-                offset[:, axis] += field.values @ shared[at : at + count]
-                at += count
-        return offset
+        return combine_offsets(self.random.columns, landmark, shared, eq.units)
 
 
 def _without_motion(square: Array, motions: Array) -> Array:

@@ -95,9 +95,9 @@ class ModelErrors:
         own = maps @ random.group
         misfit = (own * variance[random.group_label]) @ np.swapaxes(own, -1, -2)
         misfit = misfit + self._landmark_covariances(random, maps)
-        rows = maps.shape[-1]
+        rows, columns = maps.shape[-1], random.shared_columns
         for f in range(len(maps)):
-            field = (random.shared[f * rows:(f + 1) * rows].T @ turned[f]).T
+            field = (columns[f * rows:(f + 1) * rows].T @ turned[f]).T
             misfit[f] += (field * variance[random.shared_label]) @ field.T
         return ErrorParts(self.variances.sigma**2 * maps @ turned, parameters, misfit)
 
@@ -115,8 +115,9 @@ class ModelErrors:
             columns.shape)
         random, variance = self._random_columns(linear)
         misfit = random.group**2 @ variance[random.group_label]
+        label = random.shared_label[: random.shared.shape[1]]
         fields = random.shared.power(2) @ np.where(
-            np.isin(random.shared_label, _image_components()), variance[random.shared_label], 0.0)
+            np.isin(label, _image_components()), variance[label], 0.0)
         misfit = misfit + np.asarray(fields).reshape(misfit.shape)
         px = np.where(weight > 0, weight, np.nan) ** -2.0
         parameters = np.einsum(

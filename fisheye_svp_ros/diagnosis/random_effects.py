@@ -60,7 +60,7 @@ class RandomEffects(NamedTuple):
     """The random columns of a state, and what they stand for.
 
     landmark (L,): ids of the units; grids, fields: what the shared columns are of, grids first (u
-    and v of each bump), then fields (axis by axis); axes (L, 3, 3): of the board of each landmark.
+    and v of each bump), fields last (axis by axis); axes (L, 3, 3): of the board of each landmark.
     """
 
     columns: RandomColumns
@@ -232,12 +232,13 @@ def make_random_effects(
     grids, fields = [grid for grid, _ in static], _board_fields(points)
     weight = points.weight.reshape(-1, 1)
     parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
-    parts += [_field_columns(points, field) for field in fields]
-    names = [*(grid.name for grid in grids), *(field.name for field in fields)]
+    names = [grid.name for grid in grids]
     if linear.data.poses is None:  # else the camera moves, and gravity beside it
         parts.append(_sag_columns(points))
         names.append(SAG)
-    of = [np.full(part.shape[1], NAMES.index(n)) for n, part in zip(names, parts, strict=True)]
+    combinations = [_combine_offsets(field) for field in fields]
+    of = [np.full(part.shape[1], NAMES.index(name)) for name, part in zip(
+        [*names, *(field.name for field in fields)], [*parts, *combinations], strict=True)]
     in_plane, normal, free = (
         NAMES.index(name) for name in ('landmark_in_plane', 'landmark_normal', 'landmark')
     )
@@ -246,8 +247,8 @@ def make_random_effects(
              for one in landmarks.boards]
     columns = RandomColumns(
         frame, label, points.place, points.slot, np.array(kinds)[landmarks.board_of],
-        sparse.hstack(
-            [sparse.csr_array((points.weight.size * 2, 0)), *parts], format='csr'),
+        _join_columns(points.weight.size * 2, parts),
+        _join_columns(landmarks.ids.size * 3, combinations),
         np.concatenate([np.zeros(0, dtype=np.int64), *of]),
         Components(OF_LANDMARKS, _NUMEROUS),
     )
@@ -388,10 +389,16 @@ def _remove_polynomial(values: Array, at: Array, degree: int) -> Array:
     return np.asarray(values - powers @ np.linalg.lstsq(powers, values, rcond=1e-9)[0])
 
 
-def _field_columns(points: GatheredPoints, field: BoardField) -> sparse.csr_array:
-    values = np.where(points.slot[..., None] >= 0, field.values[points.slot], 0.0)
-    columns = [values[..., None, :] * points.place[..., axis, None] for axis in field.axes]
-    return sparse.csr_array(np.concatenate(columns, axis=-1).reshape(points.used.size * 2, -1))
+def _combine_offsets(field: BoardField) -> sparse.csr_array:
+    """Return a field as combinations (3 L, K axes) of the offsets of landmarks."""
+    count, width = field.values.shape
+    columns = np.zeros((count, 3, len(field.axes), width))
+    columns[:, field.axes, np.arange(len(field.axes))] = field.values[:, None]
+    return sparse.csr_array(columns.reshape(3 * count, -1))
+
+
+def _join_columns(rows: int, parts: list[sparse.csr_array]) -> sparse.csr_array:
+    return sparse.csr_array(sparse.hstack([sparse.csr_array((rows, 0)), *parts], format='csr'))
 
 
 def _compact_columns(columns: Array) -> Array:

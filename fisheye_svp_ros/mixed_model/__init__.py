@@ -29,6 +29,7 @@ from fisheye_svp_ros.mixed_model.equations import (
 from fisheye_svp_ros.mixed_model.model_columns import (
     Components,
     RandomColumns,
+    combine_offsets,
     multiply_rows,
     predict_rows,
 )
@@ -65,11 +66,10 @@ from fisheye_svp_ros.mixed_model.solution import (
 __all__ = [
     'IDENTIFIABLE', 'LAMBDA_ABSENT', 'Components', 'Equations', 'FactoredEquations',
     'LeaveOneOut', 'Posterior', 'RandomColumns', 'Score', 'Solution', 'Variances',
-    'component_p_values', 'component_traces', 'eliminate', 'estimate_variances',
-    'factor_equations', 'find_variances', 'group_basis', 'identifiable_basis',
-    'initial_variances', 'integrate_columns', 'is_called_for', 'leave_groups_out',
-    'make_equations', 'multiply_rows', 'no_variances', 'posterior_covariance', 'predict_rows',
-    'pseudo_inverse', 'satterthwaite_freedom', 'score_columns', 'score_components',
-    'score_each',
-    'solve_equations', 'solve_lower', 'unit_covariances', 'unit_labels',
+    'combine_offsets', 'component_p_values', 'component_traces', 'eliminate', 'estimate_variances',
+    'factor_equations', 'find_variances', 'group_basis', 'identifiable_basis', 'initial_variances',
+    'integrate_columns', 'is_called_for', 'leave_groups_out', 'make_equations', 'multiply_rows',
+    'no_variances', 'posterior_covariance', 'predict_rows', 'pseudo_inverse',
+    'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each', 'solve_equations',
+    'solve_lower', 'unit_covariances', 'unit_labels',
 ]

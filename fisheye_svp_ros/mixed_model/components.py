@@ -238,7 +238,7 @@ def _component_columns(eq: Equations, alive: Mask, kind: int) -> _ComponentColum
     if len(in_r):
         return _ComponentColumns(
             b.rr[np.ix_(in_r, in_r)][None], np.arange(int(keep.sum())),
-            b.er[keep][:, columns][..., in_r], b.rr[np.ix_(rest, in_r)][:, None],
+            b.er[..., in_r][keep][:, columns], b.rr[np.ix_(rest, in_r)][:, None],
             b.rx[in_r].T[:, None])
     mine = b.e_label == kind
     block = np.flatnonzero(mine.any(axis=1))

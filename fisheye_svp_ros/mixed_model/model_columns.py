@@ -3,23 +3,21 @@
 Rows are whitened and come in G groups of M rows (padded with zeros); in each group they are N
 points of p rows.  Fixed columns X are of two kinds: those that each group has for itself, and
 those that all groups share.  Random columns Z are of three: each group's own, offsets of units
-that points of all groups belong to (a crossed factor), and shared ones.
+that points of all groups belong to (a crossed factor), and shared ones.  A shared column that is a
+combination of offsets (a smooth field over the units) is kept as that: its products follow from
+those of the units, which are far fewer than rows.
 Source: Searle, Casella, McCulloch, Variance Components (1992), chapters 4 and 7.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-
-_DENSE_SIZE = 4_000_000  # numbers of shared columns that are made dense at a time
 
 
 @dataclass(frozen=True)
@@ -44,8 +42,9 @@ class RandomColumns(NamedTuple):
 
     group (G, M, B): of coefficients that each group has for itself, group_label (B,);
     offset (G, N, p, w): of offsets of units, by point; unit (G, N): the unit of each point, -1
-    for none; unit_label (U, w); shared: sparse (G M, Q), shared_label (Q,); components: what the
-    labels count.
+    for none; unit_label (U, w); shared: sparse (G M, S); fields: sparse (U w, Q - S), shared
+    columns that are combinations of offsets, whether or not these have a label; shared_label (Q,):
+    of both, in this order; components: what the labels count.
     """
 
     group: Array
@@ -54,35 +53,37 @@ class RandomColumns(NamedTuple):
     unit: Index
     unit_label: Index
     shared: sparse.csr_array
+    fields: sparse.csr_array
     shared_label: Index
     components: Components
 
     @property
-    def point_label(self) -> Index:
-        """Components (G, N, w) of the offsets of each point's unit, -1 for none."""
-        none = np.full((1, self.unit_label.shape[1]), -1)
-        return np.asarray(np.concatenate([self.unit_label, none])[self.unit])
+    def unit_columns(self) -> sparse.csr_array:
+        """Columns (G M, U w) of the offsets of units, with a label or without."""
+        rows, width = self.offset.shape[2:]
+        present = self.unit >= 0
+        unit, values = self.unit[present], self.offset[present]
+        column = np.repeat(width * unit[:, None] + np.arange(width), rows, axis=0)
+        ends = np.cumsum(np.repeat(width * present, rows))
+        return sparse.csr_array((values.ravel(), column.ravel(), np.append(0, ends)),
+                                (self.unit.size * rows, self.unit_label.size))
 
     @property
-    def unit_columns(self) -> sparse.csr_array:
-        """Columns (G M, U w) of the offsets of units, sparse; zero for what is absent."""
-        rows, width = self.offset.shape[2:]
-        group, point, axis = np.nonzero(self.point_label >= 0)
-        values = self.offset[group, point, :, axis]
-        row = rows * (self.unit.shape[1] * group + point)[:, None] + np.arange(rows)
-        column = np.repeat(width * self.unit[group, point] + axis, rows)
+    def shared_columns(self) -> sparse.csr_array:
+        """All shared columns (G M, Q), fields last."""
         return sparse.csr_array(
-            (values.ravel(), (row.ravel(), column)), (self.unit.size * rows, self.unit_label.size)
-        )
+            sparse.hstack([self.shared, self.unit_columns @ self.fields], format='csr'))
 
     def select(self, alive: Mask) -> RandomColumns:
         """Return the columns of some of the components (K,) only."""
         present = np.append(alive, False)
         columns, shared = present[self.group_label], present[self.shared_label]
+        count = self.shared.shape[1]
         return self._replace(
             group=self.group[..., columns], group_label=self.group_label[columns],
             unit_label=np.where(present[self.unit_label], self.unit_label, -1),
-            shared=self.shared[:, shared], shared_label=self.shared_label[shared],
+            shared=self.shared[:, shared[:count]], fields=self.fields[:, shared[count:]],
+            shared_label=self.shared_label[shared],
         )
 
 
@@ -126,54 +127,53 @@ class Products(NamedTuple):
 def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -> Products:
     """Multiply out random columns, those that are fixed in each group and a border."""
     groups, height, _ = group_fixed.shape
-    (units, width), shared, edge = random.unit_label.shape, random.shared, border.shape[-1]
+    shared, fields, offsets = random.shared, random.fields.T, random.unit_columns
     own = np.concatenate([group_fixed, random.group], axis=-1)
-    across, flat = np.swapaxes(own, -1, -2), border.reshape(groups * height, edge)
-    offsets = random.unit_columns
-    ug = np.zeros((width * units, groups, own.shape[-1]))
+    across, flat = np.swapaxes(own, -1, -2), border.reshape(groups * height, border.shape[-1])
+    uu, ux = _square_offsets(random), offsets.T @ flat
+    ug = np.zeros((offsets.shape[1], groups, own.shape[-1]))
     for g in range(groups):
         ug[:, g] = offsets[g * height : (g + 1) * height].T @ own[g]
-    rows = random.offset.shape[2]
-    with ThreadPoolExecutor(2) as pool:  # NumPy lets go of the interpreter
-        of_rows = pool.map(
-            lambda row: _multiply_shared(shared, own, border, row, rows), range(rows))
-        ss, sg, sx = (reduce(np.add, parts) for parts in zip(*of_rows, strict=True))
-    offset, of_unit = random.offset[random.unit >= 0], random.unit[random.unit >= 0]
-    uu = np.zeros((units, width, width))
-    np.add.at(uu, of_unit, np.swapaxes(offset, -1, -2) @ offset)
+    us = np.concatenate([(offsets.T @ shared).toarray(), _multiply_units(uu, random)], axis=1)
+    # A field is a combination of units, and so are its products.
+    fs, fx, fg = fields @ us, fields @ ux, fields @ ug.reshape(len(ug), groups * own.shape[-1])
+    ss = np.block([[(shared.T @ shared).toarray(), fs[:, : shared.shape[1]].T], [fs]])
+    sg = np.concatenate([_multiply_groups(shared, own), fg.reshape(len(fg), *ug.shape[1:])])
     present = random.unit_label >= 0
+    for part in (us, ux, ug):
+        part[~present.ravel()] = 0.0
     uu *= present[:, :, None] & present[:, None, :]
-    return Products(
-        across @ own, uu, ug.reshape(units, width, groups, own.shape[-1]),
-        ss, sg,
-        (offsets.T @ shared).toarray().reshape(units, width, shared.shape[1]), across @ border,
-        (offsets.T @ flat).reshape(units, width, edge), sx, flat.T @ flat,
-    )
+    of_units = [part.reshape(*present.shape, *part.shape[1:]) for part in (ug, us, ux)]
+    return Products(across @ own, uu, of_units[0], ss, sg, of_units[1], across @ border,
+                    of_units[2], np.concatenate([shared.T @ flat, fx]), flat.T @ flat)
 
 
-def _multiply_shared(
-    shared: sparse.csr_array, own: Array, border: Array, row: int, step: int
-) -> tuple[Array, Array, Array]:
-    """Return the products of shared columns with themselves, groups' own and the border.
+def _square_offsets(random: RandomColumns) -> Array:
+    """Return the products (U, w, w) of the offsets of each unit with each other."""
+    units, width = random.unit_label.shape
+    offset, unit = random.offset[random.unit >= 0], random.unit[random.unit >= 0]
+    squares = np.zeros((units, width, width))
+    np.add.at(squares, unit, np.swapaxes(offset, -1, -2) @ offset)
+    return squares
 
-    Over one of the `step` rows of every point: a shared column fills one of them, a group a part.
-    Several groups at a time are made dense, as many as `_DENSE_SIZE` has room for.
-    """
-    (groups, height, _), count = own.shape, shared.shape[1]
-    ss, sg, sx = (np.zeros((count, *shape)) for shape in (
-        (count,), (groups, own.shape[-1]), (border.shape[-1],)))
-    rows, points = shared[row::step], height // step
-    parts = 1 + groups * points * count // _DENSE_SIZE
-    for some in np.array_split(np.arange(groups), min(parts, groups)):
-        part = rows[some[0] * points : (some[-1] + 1) * points]
-        touched = np.flatnonzero(np.bincount(part.indices, minlength=count))
-        dense = part[:, touched].toarray()
-        by_group = dense.reshape(len(some), points, len(touched))
-        products = np.swapaxes(by_group, -1, -2) @ own[some, row::step]
-        sg[np.ix_(touched, some)] = np.moveaxis(products, 0, 1)
-        sx[touched] += dense.T @ border[some, row::step].reshape(len(dense), -1)
-        ss[np.ix_(touched, touched)] += dense.T @ dense
-    return ss, sg, sx
+
+def _multiply_units(squares: Array, random: RandomColumns) -> Array:
+    """Return the products (U w, P) of the offsets of units with the fields."""
+    units, width, _ = squares.shape
+    blocks = sparse.bsr_array((squares, np.arange(units), np.arange(units + 1)),
+                              shape=(units * width, units * width))
+    return np.asarray((blocks @ random.fields).toarray())
+
+
+def _multiply_groups(shared: sparse.csr_array, own: Array) -> Array:
+    """Return the products (S, G, W) of shared columns with those of each group (G, M, W)."""
+    groups, height, width = own.shape
+    count = shared.shape[1]
+    group = np.repeat(np.arange(groups * height) // height, np.diff(shared.indptr))
+    apart = sparse.csr_array((shared.data, shared.indices + count * group, shared.indptr),
+                             (groups * height, groups * count))
+    products = apart.T @ own.reshape(groups * height, width)
+    return np.moveaxis(products.reshape(groups, count, width), 0, 1)
 
 
 def multiply_rows(
@@ -181,10 +181,11 @@ def multiply_rows(
 ) -> tuple[Array, Array, Array]:
     """Multiply rows (G, M, C) by columns: by group (G, B, C), unit (U, w, C), shared (Q, C)."""
     own = np.concatenate([group_fixed, random.group], axis=-1)
-    count = rows.shape[-1]
-    flat = rows.reshape(-1, count)
-    unit = (random.unit_columns.T @ flat).reshape(*random.unit_label.shape, count)
-    return np.swapaxes(own, -1, -2) @ rows, unit, random.shared.T @ flat
+    flat = rows.reshape(-1, rows.shape[-1])
+    unit = random.unit_columns.T @ flat
+    shared = np.concatenate([random.shared.T @ flat, random.fields.T @ unit])
+    unit = unit.reshape(*random.unit_label.shape, flat.shape[1])
+    return np.swapaxes(own, -1, -2) @ rows, _without_absent(random, unit), shared
 
 
 def predict_rows(
@@ -196,10 +197,26 @@ def predict_rows(
     Those of groups (G, B, C), of some units (m, w, C) and shared (Q, C); units (m,).
     """
     own = np.concatenate([group_fixed, random.group], axis=-1)
+    offset = combine_offsets(random, unit, shared, units)
+    flat = random.unit_columns @ offset.reshape(-1, offset.shape[-1])
+    flat += random.shared @ shared[: random.shared.shape[1]]
+    return np.asarray(flat.reshape(*own.shape[:2], -1) + own @ group)
+
+
+def combine_offsets(random: RandomColumns, unit: Array, shared: Array, units: Index) -> Array:
+    """Return the offsets (U, w, C) of all units, fields and all.
+
+    unit (m, w, C), units (m,): of some units alone; shared (Q, C): of shared columns.
+    """
     offset = np.zeros((len(random.unit_label), *unit.shape[1:]))
     offset[units] = unit
-    flat = random.unit_columns @ offset.reshape(-1, offset.shape[-1]) + random.shared @ shared
-    return np.asarray(flat.reshape(*own.shape[:2], -1) + own @ group)
+    offset = _without_absent(random, offset)
+    fields = random.fields @ shared[random.shared.shape[1] :]
+    return np.asarray(offset + fields.reshape(offset.shape))
+
+
+def _without_absent(random: RandomColumns, offset: Array) -> Array:
+    return np.where((random.unit_label >= 0)[..., None], offset, 0.0)
 
 
 def arrange_blocks(

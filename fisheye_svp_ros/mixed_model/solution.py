@@ -25,7 +25,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     solve_lower,
     solve_upper,
 )
-from fisheye_svp_ros.mixed_model.model_columns import RandomColumns
+from fisheye_svp_ros.mixed_model.model_columns import RandomColumns, combine_offsets
 
 
 class Posterior(NamedTuple):
@@ -233,7 +233,8 @@ def leave_groups_out(
     eq, (e, r) = f.equations, covariance_roots(f)
     # Roots of the covariance of the coefficients and, given the border, their predictions.
     e, r = (np.concatenate([root, root @ f.border], axis=1) for root in (e, r))
-    roots = eq.split(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
+    group, unit, shared = eq.split(e.reshape(*f.coupled.shape[:2], r.shape[1]), r)
+    roots = group, combine_offsets(random, unit, shared, eq.units), shared
     found = LeaveOneOut(
         np.empty((len(border), *f.information.shape)), np.zeros_like(border))
 
@@ -254,20 +255,23 @@ def _leave_out(
 ) -> Array:
     """Write what the others leave of a group's rows (M, X); return it before inv(P_gg), as wide.
 
-    roots: of the covariance and the predictions given the border, by group, by unit, shared.
+    roots: of the covariance and the predictions given the border: by group, by unit with what
+    fields add to it, shared.
     """
     used = np.flatnonzero(np.abs(fixed).sum(axis=1) + np.abs(border).sum(axis=1))
     height, found = len(fixed), np.zeros_like(border)
     own = np.concatenate(
         [fixed[used] / f.equations.group_scale[group], random.group[group][used]], axis=1
     )
-    unit, offset = _unit_rows(f.equations, random, group)
-    shared = random.shared[group * height + used].toarray()
-    touched = np.flatnonzero(shared.any(axis=0))
     by_group, by_unit, by_all = roots
-    both = own @ by_group[group] + shared[:, touched] @ by_all[touched]
-    if len(by_unit):
-        both += (offset @ by_unit[unit]).reshape(height, -1)[used]
+    shared = random.shared[group * height + used]
+    both = own @ by_group[group] + shared @ by_all[: shared.shape[1]]
+    unit = random.unit[group]
+    known = np.flatnonzero(unit >= 0)
+    moved = np.zeros((*random.offset.shape[1:3], both.shape[1]))
+    moved[known] = random.offset[group, known] @ by_unit[unit[known]]
+    both += moved.reshape(height, -1)[used]
+    unit, offset = _unit_rows(f.equations, random, group)
     root, predicted = np.split(both, [len(f.factor)], axis=1)
     rows_of_unit, width = np.repeat(unit, offset.shape[1])[used], offset.shape[2]
     inside, at_border = _eliminated_products(
@@ -284,11 +288,11 @@ def _leave_out(
 def _unit_rows(eq: Equations, random: RandomColumns, group: int) -> tuple[Index, Array]:
     """Return a group's units (N,) in the equations and their columns (N, p, w) or zero."""
     order = np.full(len(random.unit_label) + 1, -1)
+    present = np.zeros((len(order), random.unit_label.shape[1]), dtype=bool)
     order[eq.units] = np.arange(len(eq.units))
+    present[eq.units] = random.unit_label[eq.units] >= 0
     unit = random.unit[group]
-    at = order[unit]
-    present = (random.point_label[group] >= 0) & (at >= 0)[:, None]
-    return at, np.where(present[:, None], random.offset[group], 0.0)
+    return order[unit], np.where(present[unit][:, None], random.offset[group], 0.0)
 
 
 def _eliminated_products(

@@ -63,7 +63,7 @@ def dense_columns(linear, random):
     place[f, n, :, random.unit[f, n]] = random.offset[f, n]
     columns = np.concatenate([
         blocks.reshape(frames * height, -1), place.reshape(frames * height, -1),
-        random.shared.toarray(),
+        random.shared_columns.toarray(),
     ], axis=1)
     label = np.concatenate([
         np.tile(random.group_label, frames), random.unit_label.ravel(), random.shared_label
@@ -101,7 +101,7 @@ def test_equations_are_those_of_the_dense_matrices(cameras, frames):
     z, label = dense_columns(linear, random)
     weight = np.concatenate([
         np.ones(random.group.shape[-1] * frames), np.repeat(now.weight, 3),
-        np.ones(random.shared.shape[1]),
+        np.ones(len(random.shared_label)),
     ])
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
     tested = probe.reshape(-1, 1)[linear.row_mask.ravel()]
@@ -159,7 +159,7 @@ def test_score_tests_are_those_of_the_dense_matrices(frames, there):
     z, label = dense_columns(linear, random)
     weight = np.concatenate([
         np.ones(random.group.shape[-1] * frames), np.repeat(now.weight, 3),
-        np.ones(random.shared.shape[1])])
+        np.ones(len(random.shared_label))])
     v = np.eye(len(z)) + (z / (now.lam[label] * weight)) @ z.T
     fixed = np.column_stack([dense_poses(linear), probe.reshape(-1, 1)[linear.row_mask.ravel()]])
     inverse = np.linalg.inv(v)
@@ -219,7 +219,7 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     z, label = dense_columns(linear, random)
     precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate([
         np.ones(5 * random.group.shape[-1]), np.repeat(now.weight, 3),
-        np.ones(random.shared.shape[1]),
+        np.ones(len(random.shared_label)),
     ])
     probe = border[..., :1].reshape(-1, 1)[linear.row_mask.ravel()]
     x = np.concatenate([dense_poses(linear), probe], axis=1)
@@ -264,7 +264,7 @@ def test_a_frame_left_out_is_as_if_it_had_never_been(by_group):
     offset[direct.equations.units] = landmark
     moved = (random.offset[3] @ offset[random.unit[3]][..., None]).ravel()
     height = linear.residual.shape[1]
-    left = linear.residual[3] - moved - random.shared[3 * height : 4 * height] @ shared
+    left = linear.residual[3] - moved - random.shared_columns[3 * height : 4 * height] @ shared
     left -= pose[3] @ np.linalg.lstsq(pose[3], left, rcond=1e-9)[0]
     np.testing.assert_allclose(found.rows[3] @ way, left, atol=1e-5 * np.abs(left).max())
 

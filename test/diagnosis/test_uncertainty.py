@@ -152,7 +152,7 @@ def dense_square(null, sigma):
                             linear.shared_columns.reshape(frames.shape[0] * frames.shape[1], -1)],
                            axis=1)
     blocks = [linalg.block_diag(*random.group), random.unit_columns.toarray(),
-              random.shared.toarray()]
+              random.shared_columns.toarray()]
     lam = np.append(variances.lam, 1e12)
     prior = [np.tile(lam[random.group_label], len(frames)),
              (lam[random.unit_label] * variances.weight[:, None]).ravel(),

@@ -44,7 +44,8 @@ def equations_of(y, fixed, random):
     columns = RandomColumns(
         random, np.arange(2), np.zeros((GROUPS, ROWS // 2, 2, 1)),
         np.full((GROUPS, ROWS // 2), -1), np.zeros((0, 1), dtype=np.int64),
-        sparse.csr_array((GROUPS * ROWS, 0)), np.zeros(0, dtype=np.int64), components)
+        sparse.csr_array((GROUPS * ROWS, 0)), sparse.csr_array((0, 0)),
+        np.zeros(0, dtype=np.int64), components)
     border = np.concatenate([fixed, y[..., None]], axis=-1)
     return columns, make_equations(columns, np.zeros((GROUPS, ROWS, 0)), border), border
 
@@ -144,6 +145,7 @@ def test_units_that_are_exact_leave_all_as_it_is(case):
     crossed = columns._replace(
         offset=rng.normal(size=(GROUPS, ROWS // 2, 2, 1)),
         unit=np.tile(np.arange(ROWS // 2), (GROUPS, 1)),
+        fields=sparse.csr_array((ROWS // 2, 0)),
         unit_label=np.full((ROWS // 2, 1), 2), components=Components(
             np.array([False, False, True]), np.zeros(3, dtype=bool)))
     eq = make_equations(crossed, np.zeros((GROUPS, ROWS, 0)), border)
