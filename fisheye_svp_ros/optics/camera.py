@@ -207,9 +207,9 @@ def back_project(lens: Lens, uv: Array) -> Rays:
         origin[..., 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
     if lens.port is not None:
         at, way = ported.trace_rays(lens, direction.reshape(-1, 3))
-        back = (at.value * way.value).sum(axis=-1, keepdims=True)
-        origin = (at.value - back * way.value).reshape(direction.shape)
-        direction = way.value.reshape(direction.shape)
+        back = (at.value * way.value).sum(axis=0)
+        origin = (at.value - back * way.value).T.reshape(direction.shape)
+        direction = way.value.T.reshape(direction.shape)
         valid &= np.isfinite(direction).all(axis=-1)
     return Rays(np.where(valid[..., None], origin, np.nan), direction, theta, valid)
 

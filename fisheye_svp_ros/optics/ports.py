@@ -58,7 +58,7 @@ class Port(Curve, ABC):
     ) -> tuple[Varying, Varying]:
         """Follow rays through the port: where on its outer face they leave it, and which way.
 
-        origin, direction (unit): in air, vectors (M, 3); numbers: the coefficients.
+        origin, direction (unit): in air, vectors (3, M); numbers: the coefficients.
         """
 
     @abstractmethod

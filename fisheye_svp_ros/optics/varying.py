@@ -11,8 +11,9 @@ from fisheye_svp_ros.arrays import Array
 
 @dataclass(frozen=True)
 class Varying:
-    """Numbers (M, 1) or vectors (M, 3), and their derivatives by T variables (T, M, 1 or 3).
+    """Numbers (1, M) or vectors (3, M), and their derivatives by T variables (T, 1 or 3, M).
 
+    Coordinates come first, so that every operation runs along the rays.
     Source: forward-mode differentiation (Griewank and Walther, Evaluating Derivatives, chapter 3).
     """
 
@@ -37,10 +38,10 @@ class Varying:
         return Varying(constant - self.value, -self.slope)
 
     def dot(self, other: Varying) -> Varying:
-        """Return the inner product of two vectors, (M, 1)."""
+        """Return the inner product of two vectors, (1, M)."""
         both = self * other
-        return Varying(both.value.sum(axis=-1, keepdims=True),
-                       both.slope.sum(axis=-1, keepdims=True))
+        return Varying(both.value.sum(axis=-2, keepdims=True),
+                       both.slope.sum(axis=-2, keepdims=True))
 
     def root(self) -> Varying:
         """Return the square root; NaN below 0."""
@@ -58,9 +59,9 @@ class Varying:
 
 
 def joined(x: Varying, y: Varying, z: Varying) -> Varying:
-    """Return the vector (M, 3) of three numbers."""
-    return Varying(np.concatenate([x.value, y.value, z.value], axis=-1),
-                   np.concatenate([x.slope, y.slope, z.slope], axis=-1))
+    """Return the vector (3, M) of three numbers."""
+    return Varying(np.concatenate([x.value, y.value, z.value], axis=-2),
+                   np.concatenate([x.slope, y.slope, z.slope], axis=-2))
 
 
 def constant(value: float, variables: int) -> Varying:

@@ -53,7 +53,7 @@ def faces(port, a, b):
 def test_the_start_is_exact_where_all_rays_leave_one_viewpoint():
     lens = replace(AIR, viewpoint_shift=None, port=PORTS['flat'])
     at, way = ported.trace_rays(lens, lens.port.start(points()))
-    assert np.abs(np.cross(points() - at.value, way.value)).max() < 1e-6
+    assert np.abs(np.cross(points() - at.value.T, way.value.T)).max() < 1e-6
 
 
 @each_port

@@ -126,38 +126,40 @@ def _ray_miss(
     the lens's viewpoint shift and the coefficients of the port.
     """
     at, way = trace_rays(lens, direction, across, more)
-    arm = points - at.value
-    along = (arm * way.value).sum(axis=-1, keepdims=True)
+    arm = points.T - at.value
+    along = (arm * way.value).sum(axis=0)
     # A point between the camera and the port is not seen through it.
     along = np.where(along > 0, along, np.nan)
-    side = _across(way.value)
-    slope = at.slope + along * way.slope
-    return side, (side @ arm[..., None])[..., 0], -np.einsum('mij,tmj->mit', side, slope)
+    side = _across(way.value.T)
+    sides = np.ascontiguousarray(np.moveaxis(side, 0, -1))
+    slopes = (sides[:, None] * (at.slope + along * way.slope)).sum(axis=2)
+    return side, (sides * arm).sum(axis=1).T, -np.moveaxis(slopes, -1, 0)
 
 
 def trace_rays(
     lens: Lens, direction: Array, across: Array | None = None, more: int = 0
 ) -> tuple[Varying, Varying]:
-    """Return where rays in air of directions (M, 3) leave the port, and which way.
+    """Return where rays in air of directions (M, 3) leave the port, and which way: (3, M).
 
     across (M, V, 3): turns of the direction that are variables; more: of the variables that
     follow, the lens's viewpoint shift and the coefficients of the port, 0 or all.
     """
     assert lens.port is not None
+    direction = np.ascontiguousarray(direction.T)
     turns = np.zeros((0, *direction.shape))
     if across is not None:
-        turns = np.moveaxis(across, 1, 0)
+        turns = np.ascontiguousarray(np.moveaxis(across, 0, -1))
     count = len(turns) + more
     way = Varying(direction, np.concatenate([turns, np.zeros((more, *direction.shape))]))
     origin = Varying(np.zeros_like(direction), np.zeros((count, *direction.shape)))
     if lens.viewpoint_shift is not None:
-        sin = np.hypot(direction[:, 0], direction[:, 1])
-        theta = np.arctan2(sin, direction[:, 2])
+        sin = np.hypot(direction[0], direction[1])
+        theta = np.arctan2(sin, direction[2])
         value, slope = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))
-        origin.value[:, 2] = value
-        origin.slope[..., 2] = -way.slope[..., 2] * slope / np.maximum(sin, 1e-12)
+        origin.value[2] = value
+        origin.slope[:, 2] = -way.slope[:, 2] * slope / np.maximum(sin, 1e-12)
     if more:
-        origin.slope[len(turns), :, 2] += 1.0
+        origin.slope[len(turns), 2] += 1.0
     numbers = lens.port.varying(count, len(turns) + 1 if more else None)
     return lens.port.leave(origin, way, numbers)
 
