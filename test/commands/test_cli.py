@@ -302,6 +302,7 @@ class TestCalibrate:
         assert cli.main(['calibrate', observations, '--model', 'equidistant', '--image-size',
                          '1280x960', '--free', 'f,cx,cy', '-o', str(tmp_path / 'mine.yaml')]) == 0
         page = (tmp_path / 'mine.calibrate.html').read_text()
+        assert '`' not in page and 'noise of the image points is unknown (no sigma)' in page
         for heading in ('Parameters', 'Coverage', 'Residuals', 'Uncertainty'):
             assert f'<h2>{heading}</h2>' in page
         assert page.count('data:image/png;base64,') == 4 and '<script' not in page

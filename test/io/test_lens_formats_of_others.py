@@ -438,3 +438,29 @@ def test_files_that_others_wrote() -> None:
         assert lens.max_incidence > 0.5
         assert max(foreign.worst_px.values(), default=0.0) < (
             5 if path.stem == 'center_outside' else 0.3)
+
+
+_OPENCV8 = (0.2, 0.05, 0.001, -0.001, 0.01, 0.3, 0.1, 0.02)
+_SAME_LENS = {
+    'mrcal': "{{'lensmodel': 'LENSMODEL_OPENCV8', 'imagersize': [640, 480], 'intrinsics': "
+             '[300, 310, 320, 240, {}]}}',
+    'Basalt': '{{"value0": {{"resolution": [[640, 480]], "intrinsics": [{{"camera_type": '
+              '"pinhole-radtan8", "intrinsics": {{"fx": 300, "fy": 310, "cx": 320, "cy": 240, '
+              '{}}}}}]}}}}',
+    'ROS': 'image_width: 640\nimage_height: 480\ncamera_matrix: {{data: [300, 0, 320, 0, 310, '
+           '240, 0, 0, 1]}}\ndistortion_model: rational_polynomial\ndistortion_coefficients: '
+           '{{data: [{}]}}\n',
+}
+
+
+@pytest.mark.parametrize('form', _SAME_LENS)
+def test_the_rational_model_is_read_alike_from_every_tool(form: str, tmp_path: Path) -> None:
+    """With its deviation, however large: a file is not refused where another one is read."""
+    names = ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6')
+    numbers = ', '.join(f'"{name}": {value}' if form == 'Basalt' else str(value)
+                        for name, value in zip(names, _OPENCV8, strict=True))
+    lens, worst = loaded(tmp_path, _SAME_LENS[form].format(numbers))
+    assert worst == pytest.approx(1.78, abs=0.05)
+    matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
+    right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(_OPENCV8))[0]
+    assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < worst

@@ -10,7 +10,7 @@ from typing import Any
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
-from fisheye_svp_ros.io.lens_formats.distortion import Distortion, nearest_lens
+from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 
@@ -22,6 +22,8 @@ _MODELS: dict[str, tuple[tuple[str, ...], Callable[..., Distortion]]] = {
     'ucm': (('alpha',), lambda alpha: Distortion(radial.unified_heights(alpha, 1.0))),
     'fov': (('w',), lambda omega: Distortion(radial.field_of_view_model(omega))),
     'pinhole': ((), lambda: Distortion(radial.PERSPECTIVE)),
+    'pinhole-radtan8': (OPENCV, lambda *d: brown(
+        radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=True)))),
 }
 _NAMES = ('px', 'py', 'pz', 'qx', 'qy', 'qz', 'qw')
 

@@ -1,4 +1,4 @@
-"""mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, STEREOGRAPHIC and splined ones.
+"""mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, STEREOGRAPHIC, splined, OPENCV.
 
 mrcal has no model of Kannala and Brandt.  A lens of one viewpoint that has an image field is a
 splined model (`mrcal_splined`).  Its CAHVORE (Gennery, IJCV 2006) solves the equation of
@@ -17,11 +17,14 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats import Foreign, mrcal_splined, radial
+from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, brown, nearest_lens
 from fisheye_svp_ros.optics.curves import Gennery, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 
 _LINEARITY = re.compile(
     r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$')
+# Those of cv2.calibrateCamera, and how many coefficients follow fx, fy, cx and cy
+_PERSPECTIVE = {'LENSMODEL_PINHOLE': 0} | {f'LENSMODEL_OPENCV{n}': n for n in (4, 5, 8)}
 _MOST_TOKENS = 100_000
 _AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
 _TERMS, _GRID, _TOLERANCE = 3, 400, 0.01
@@ -49,10 +52,14 @@ def read(text: str, where: str) -> Foreign:
     if model.startswith(mrcal_splined.NAME):
         lens = mrcal_splined.read(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
+    if len(values) == 4 + _PERSPECTIVE.get(model, len(values)):
+        distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, values[4:], strict=False)))
+        lens, worst = nearest_lens('camera', size, values[:4], distortion, where)
+        return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
     match = _LINEARITY.match(model)
     if match is None or len(values) != 12:
-        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE, '
-                        'STEREOGRAPHIC and SPLINED_STEREOGRAPHIC can be read')
+        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE, STEREOGRAPHIC, '
+                        'SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be read')
     if max(map(abs, values[4:6])) > _AXIS:
         raise LensError(f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
                         'beta); that is not supported')

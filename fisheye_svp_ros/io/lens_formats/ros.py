@@ -63,7 +63,7 @@ def read(text: str, where: str) -> Foreign:
         d = fields.numbers({'data': d}, 'data', len(d), where)
     except (KeyError, TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    lens, worst = lens_of(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)
+    lens, worst = _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)
     return Foreign('ROS', {name: lens}, (), {name: worst} if worst else {})
 
 
@@ -79,7 +79,7 @@ def _read_message(text: str, where: str) -> Foreign:
         raise LensError(str(cause)) from cause
     except (LookupError, TypeError, ValueError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
-    lens, worst = lens_of(*model, name, where)
+    lens, worst = _fit_lens(*model, name, where)
     return Foreign('ROS', {name: lens}, (), {name: worst} if worst else {})
 
 
@@ -94,14 +94,26 @@ def lens_of(
     sensor_msgs/CameraInfo has it.
     Raises LensError, naming `where`, for a model that no lens here comes near to.
     """
+    lens, worst = _fit_lens(model, size, intrinsics, d, name, where)
+    if not worst <= _TOLERANCE:
+        raise LensError(f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
+                        'again, as equidistant')
+    return lens, worst
+
+
+def _fit_lens(
+    model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
+    name: str, where: str,
+) -> tuple[Lens, float]:
+    """Return the nearest lens, however far off: a file is read with a warning."""
     try:
         with np.errstate(all='ignore'):
-            return _lens_of(model, size, intrinsics, d, name, where)
+            return _nearest_lens(model, size, intrinsics, d, name, where)
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as cause:
         raise LensError(f'{where}: its numbers are no valid lens ({cause})') from cause
 
 
-def _lens_of(
+def _nearest_lens(
     model: str, size: tuple[int, int], intrinsics: tuple[float, ...], d: tuple[float, ...],
     name: str, where: str,
 ) -> tuple[Lens, float]:
@@ -117,11 +129,7 @@ def _lens_of(
     if len(d) not in counts and any(d[counts[-1]:] or d):
         raise LensError(f'{where}: {model} has {len(d)} coefficients; {counts[-1]} are needed')
     distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
-    lens, worst = nearest_lens(name, size, intrinsics, distortion, where)
-    if not worst <= _TOLERANCE:
-        raise LensError(f'{where}: the nearest lens is {worst:.2g} px off this {model}; calibrate '
-                        'again, as equidistant')
-    return lens, worst
+    return nearest_lens(name, size, intrinsics, distortion, where)
 
 
 def write(lens: Lens) -> str:
