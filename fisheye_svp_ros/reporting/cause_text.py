@@ -103,6 +103,6 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
         rms = '-' if math.isnan(c.heldout_rms_px) else f'{c.heldout_rms_px:.4f}'
         same = ', '.join(c.indistinguishable_from) or '-'
         p_value = bare_probability(c.p_value)
-        same += '' if c.survives else ' (not significant without one of the other causes)'
+        same += '' if c.survives else '; significant only together with another cause'
         share = percent(c.share) if c.share else '-'
         yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same

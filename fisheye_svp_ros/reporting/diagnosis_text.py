@@ -65,8 +65,10 @@ _UNCERTAIN = {
 COMPONENTS = {
     'named_lens': 'lens, identified', 'named_target': 'target, identified',
     'named_frame': 'frames, identified',
-    'image_broad': 'image field of a third', 'image_coarse': 'image field of a sixth',
-    'image_fine': 'image field of a fourteenth', 'image_finest': 'finer image field',
+    'image_broad': 'image field, correlated over 1/3 of the width',
+    'image_coarse': 'image field, correlated over 1/6 of the width',
+    'image_fine': 'image field, correlated over 1/14 of the width',
+    'image_finest': 'finer image field',
     'landmark_in_plane': 'landmarks along their board',
     'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
     'board_stretch': 'stretch of the board', 'board_in_plane': 'board field along it',
