@@ -131,8 +131,9 @@ class _Evaluated(NamedTuple):
 def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     """Take checked inputs through all stages, twice where frames were in another order."""
     evaluated = _evaluate(inputs, progress)
-    inputs = evaluated.evaluation.selection.problem.inputs
-    views = evaluated.turned
+    # The problem of a robot has no poses any more.
+    observations = evaluated.evaluation.selection.problem.inputs.observations
+    inputs, views = replace(inputs, observations=observations), evaluated.turned
     turned = [] if inputs.poses is not None else find_turned_frames(
         evaluated.evaluation.null, evaluated.evaluation.fitted)
     if any(one.corrected for one, _ in turned):
