@@ -320,25 +320,28 @@ def report(trials: Sequence[Trial], size: float) -> str:
     columns = [*HIDDEN, *sorted(others), NOTHING]
     lines = [
         '# Blind tests through images', '',
-        'Beside [blind.md](blind.md), where points are handed over, here nothing but photographs',
-        f'is: {PHOTOGRAPHS} of a board ({BOARD}), {LENS.width} x {LENS.height} px, rendered '
-        'through a lens of 94°. Of them',
-        '`detect`, `calibrate` and `diagnose` say what is wrong. An effect is as large as what a',
-        f'lens fitted without it leaves {size:g} times the noise of (corners scatter by {NOISE}',
-        'px here). Of `principal_point` the lens was calibrated before it was bumped; of',
-        '`rolling_shutter` the photographs are those of a video, the camera swings. Defocus and',
-        'uneven light are no error of the lens and count as clean; of over-exposed photographs,',
-        'which `detect` names itself, only the row tells. Intervals are 95 %.', '', '```bash',
+        f'The effect was named in {_rate([t.hit for t in hidden])} of the sets. Unlike in '
+        '[blind.md](blind.md), only',
+        f'photographs are given: {PHOTOGRAPHS} of a board ({BOARD}), {LENS.width} x {LENS.height} '
+        'px, rendered through a lens of',
+        '94°. `detect`, `calibrate` and `diagnose` find the model error. A lens fitted without '
+        'the effect',
+        f'leaves {size:g} times the noise ({NOISE} px) of it.', '',
+        '- `principal_point`: the lens was calibrated before it was bumped.',
+        '- `rolling_shutter`: frames of a video of a swinging camera.',
+        '- Defocus and uneven light count as clean: they are no errors of the lens.',
+        '- Over-exposed photographs are reported by `detect`, and have a row of their own.', '',
+        'Intervals are 95 %.', '', '```bash',
         f'python -m benchmark.blind_images --trials {len(hidden)}', '```', '',
         f'- effect named: {_rate([t.hit for t in hidden])}',
-        '- and nothing else: '
+        '- nothing else named: '
         + _rate([t.hit and len(t.named) == 1 for t in hidden]),
         f'- clean photographs found adequate: {_rate([t.verdict == "adequate" for t in clean])}',
         f'- no effect named in them: {_rate([not t.named for t in clean])}',
-        '- over-exposed: `detect` says so of all photographs in '
-        f'{_rate([t.odd == PHOTOGRAPHS for t in aside])}; found adequate nevertheless: '
+        '- over-exposed: `detect` reports all photographs in '
+        f'{_rate([t.odd == PHOTOGRAPHS for t in aside])}; still found adequate: '
         f'{_rate([t.verdict == "adequate" for t in aside])}', '',
-        'How often what was hidden (rows) was named (columns):', '',
+        'Trials by hidden effect (rows) and named effect (columns):', '',
         '| hidden | trials | ' + ' | '.join(columns) + ' |', '|---' * (len(columns) + 2) + '|',
     ]
     for effect, count in counts.items():

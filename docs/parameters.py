@@ -29,10 +29,10 @@ _COMMON = 'several nodes'
 
 def markdown(table: list[Row]) -> str:
     """Return a parameter table for nodes.md."""
-    lines = ['| parameter | default | unit | allowed | meaning |', '|---|---|---|---|---|']
+    lines = ['| parameter | default | allowed | meaning |', '|---|---|---|---|']
     for row in table:
-        default = _yaml(row.default)
-        cells = (f'`{row.name}`', f'`{default}`', row.unit, row.constraint(), row.description)
+        allowed = ' '.join(filter(None, (row.constraint(), row.unit)))
+        cells = (f'`{row.name}`', f'`{_yaml(row.default)}`', allowed, row.description)
         lines.append('| ' + ' | '.join(cells) + ' |')
     return '\n'.join(lines) + '\n'
 

@@ -12,18 +12,20 @@ Scores = Sequence[Mapping[str, Any]]
 INTRODUCTION = """# Blind tests with data of other code
 
 `benchmark/independent` makes blind sets from the text of the design alone and shares no code with
-the package or with `benchmark/blind`. Each trial draws a camera (any image height; a datasheet's
-lens, or one fitted to these very data), a scene (a board, a cube of boards, landmarks all around;
-one camera or two; stills or video; 12 to 40 frames) and noise of 0.05 to 0.5 px. The command line
-gets observations, held-out frames and the lens. Size 1: what free poses, rig and fitted intrinsics
-leave of the effect is, in rms of a coordinate, the noise (`noise_vs_angle`: rms relative growth of
-the noise; `quantisation`: step/√12; `wrong_ids`: five pairs). Background, in the same measure,
-before outliers: errors of single landmarks and of their neighbourhoods, an affine and
-quadratic field in each view, a static field in each camera; and up to 2 % outliers.
+the package or with `benchmark/blind`. A trial draws a camera (any image height; a datasheet's
+lens, or one fitted to these data), a scene (a board, a cube of boards, or landmarks all around;
+one or two cameras; stills or video; 12 to 40 frames) and noise of 0.05 to 0.5 px. The command line
+gets observations, held-out frames and the lens.
 
-An effect is named if a cause or its class (`indistinguishable_from`) has it. A name is false if
-nothing of its class is hidden. The stage is right if the strongest significant component (1 %)
-lies where the hidden effect does; under a background, which lies everywhere, it is not asked.
+- Size 1: after poses, rig and fitted intrinsics are fitted, the rms of the effect in a coordinate
+  equals the noise. For `noise_vs_angle` it is the rms relative growth of the noise, for
+  `quantisation` step/√12; `wrong_ids` swaps five pairs.
+- Background, in the same measure: errors of single landmarks and of their neighborhoods, an affine
+  and quadratic field in each view, a static field in each camera; also up to 2 % outliers.
+- An effect is named if a cause or its confounded set (`indistinguishable_from`) contains it. A
+  name is false if no effect of its set is hidden.
+- The stage is right if the strongest significant component (1 %) is in the stage of the hidden
+  effect. It is not tested with a background, which affects every stage.
 """
 
 
@@ -48,7 +50,7 @@ def page(tables: Sequence[Mapping[str, Any]]) -> str:
         by_mode[table['mode']][table['background']] += table['scores']
     for mode, title, section in (
         ('one', 'One hidden effect', _one), ('two', 'Two hidden effects', _two),
-        ('clean', 'Nothing hidden', _clean), ('outside', 'Outside the catalogue', _outside),
+        ('clean', 'Nothing hidden', _clean), ('outside', 'Outside the catalog', _outside),
     ):
         if mode in by_mode:
             commands = '\n'.join(
@@ -91,11 +93,11 @@ def _one(runs: Mapping[float, Scores]) -> str:
     named = [(f'`{effect}`', *(_by_size(cells[effect, b]) for b in backgrounds))
              for effect in effects]
     return '\n'.join([
-        _table(('background', 'size', 'its class is named', 'itself', 'another name beside it',
+        _table(('background', 'size', 'its class is named', 'itself', 'another effect named too',
                 'stage right', 'verdicts'), rows),
         'By effect and background: named at size 1, 0.5, 0.2.\n',
         _table(('effect', *(f'background {b:g}' for b in backgrounds)), named),
-        'What was said first (columns) where an effect (rows) was hidden; its own class counts as '
+        'Hidden effect (rows) and the first one named (columns); its confounded set counts as '
         'itself.\n', _confusion([s for scores in runs.values() for s in scores])])
 
 
@@ -127,7 +129,7 @@ def _two(runs: Mapping[float, Scores]) -> str:
         rows.append((f'{background:g}', _rate(all(s['found']) for s in scores),
                      _rate(f for s in scores for f in s['found']),
                      _rate(s['false'] for s in scores), _verdicts(scores)))
-    return _table(('background', 'both are named', 'each is named', 'another name beside them',
+    return _table(('background', 'both are named', 'each is named', 'another effect named too',
                    'verdicts'), rows)
 
 
