@@ -55,12 +55,12 @@ def split_frames(
     return factor_equations(eq.with_ridge(1e-9), variances.lam, variances.weight), tested
 
 
-def misfit(linear: Linearization, out: Mask, rows: Array) -> float:
-    """Return the sum of squares, px^2, of whitened rows (F, M) of some frames, poses refitted."""
+def misfits(linear: Linearization, out: Mask, rows: Array) -> Array:
+    """Return sums of squares (C,), px^2, of whitened rows (F, M, C) of frames, poses refitted."""
     poses, weight = linear.frame_columns[out], linear.row_weight[out]
-    fitted = poses @ (np.linalg.pinv(poses, rcond=1e-9) @ rows[..., None])
-    left = rows - fitted[..., 0]
-    return float(((left[weight > 0] / weight[weight > 0]) ** 2).sum())
+    left = rows - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ rows)
+    used = weight > 0
+    return np.asarray(((left[used] / weight[used][:, None]) ** 2).sum(axis=0))
 
 
 def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[Ends, ...]]:
@@ -72,26 +72,31 @@ def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[End
     lasting = [term for term in null.terms if not (term[0].per_frame or term[0].of_recording)]
     if linear.data.frames < _MIN_FRAMES or not lasting:
         return {}
+    models = [own, *(np.setdiff1d(own, columns) for _, columns, _ in lasting)]
     found: dict[str, tuple[Ends, ...]] = {}
     block, ends = contiguous_blocks(linear.data)
-    at = np.append(own, len(null.scale))
     for i, edge in enumerate(ends):
         out = block == i
         information = split_frames(fitted, null.variances, out)[0].information
-
-        def predict(included: Index, information: Array = information, out: Mask = out) -> float:
-            part = null.restrict_information(information, included, at)
-            change = np.zeros(len(own))
-            change[included] = np.linalg.lstsq(
-                part[np.ix_(included, included)], part[included, -1], rcond=1e-13)[0]
-            combination = null.residual_combination(included)[at]
-            combination[:-1] -= change
-            border = np.concatenate([linear.shared_columns[out] / null.scale[own],
-                                     linear.residual[out][..., None]], axis=-1)
-            return misfit(linear, out, border @ combination)
-
-        whole = predict(own)
-        for effect, columns, _ in lasting:
-            if whole > _WORSE * predict(np.setdiff1d(own, columns)):
+        predicted = np.stack([_predict(null, information, model) for model in models], axis=-1)
+        border = np.concatenate([linear.shared_columns[out] / null.scale[own],
+                                 linear.residual[out][..., None]], axis=-1)
+        whole, *without = misfits(linear, out, border @ predicted)
+        for (effect, _, _), square in zip(lasting, without, strict=True):
+            if whole > _WORSE * square:
                 found[effect.name] = (*found.get(effect.name, ()), edge)
     return found
+
+
+def _predict(null: NullModel, information: Array, included: Index) -> Array:
+    """Return the residual with some of the model's columns, fitted to other frames.
+
+    As a combination (own + 1,) of the columns of the model and its residual.
+    """
+    own = null.included_columns
+    at = np.append(own, len(null.scale))
+    part = null.restrict_information(information, included, at)
+    combination = null.residual_combination(included)[at]
+    combination[included] -= np.linalg.lstsq(
+        part[np.ix_(included, included)], part[included, -1], rcond=1e-13)[0]
+    return np.asarray(combination)

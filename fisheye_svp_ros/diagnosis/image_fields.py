@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.averaging import OpenShifts
 from fisheye_svp_ros.diagnosis.cross_validation import refit_shared
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel
-from fisheye_svp_ros.diagnosis.frame_blocks import Ends, contiguous_blocks, misfit, split_frames
+from fisheye_svp_ros.diagnosis.frame_blocks import Ends, contiguous_blocks, misfits, split_frames
 from fisheye_svp_ros.diagnosis.random_effects import ImageGrid
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.mixed_model import (
@@ -115,7 +115,7 @@ def _hold_out(fitted: FittedModel, variances: Variances, fold: Index) -> Array:
         out = fold == k
         whole, field = _predict(fitted, variances, out)
         left = linear.residual[out] - whole
-        squares[k] = misfit(linear, out, left + field), misfit(linear, out, left)
+        squares[k] = misfits(linear, out, np.stack([left + field, left], axis=-1))
     return squares
 
 

@@ -31,6 +31,7 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.scene.observations import views_of
 
 AGREES = 1e-10  # m
+pytestmark = pytest.mark.xdist_group('engines')  # compiled once
 
 
 def test_sides_take_turns_after_a_warm_up():
