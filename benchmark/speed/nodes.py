@@ -16,8 +16,10 @@ from fisheye_svp_ros.optics.engines import VARIABLE
 
 _GOAL = 1e-3  # s that a localizer may add
 _TEXT = """Latency from `image_points` to `~/pose` of a localizer (33 landmarks, ShiftVP) and of an
-echo node that answers at once, in processes of their own on loopback. Throughput: the highest rate
-at which all sets were answered, then the first at which not, and how many."""
+echo node that answers at once, in processes of their own on loopback: what the localizer adds, for
+a camera that moves on a circle of 0.2 m, 150 sets a turn, and for one that jumps 0.1 rad from set
+to set, so that each set is solved again, without a start. Throughput: the highest rate at which
+all sets were answered, then the first at which not, and how many."""
 _RUN = [sys.executable, '-m', 'benchmark.speed.round_trip']
 _START_GOAL = 1.0  # s from the first import to a node that is ready
 _STARTS = 9
@@ -47,7 +49,7 @@ def tables(count: int = 300) -> list[Table]:
             continue
         rows.append(_line(name, json.loads(run.stdout)))
     header = ('engine', 'echo node, ms', 'localizer, ms', 'adds, ms', 'goal, ms', 'met',
-              'echo node, sets/s', 'localizer, sets/s')
+              'adds after jumps, ms', 'echo node, sets/s', 'localizer, sets/s')
     return [_starts(), Table('Nodes', header, rows, _TEXT, notes)]
 
 
@@ -69,12 +71,13 @@ def _starts() -> Table:
 
 
 def _line(name: str, measured: dict[str, Any]) -> tuple[str, ...]:
-    echo, localizer = measured['median'].values()
+    echo, localizer = measured['motion']
     added = localizer - echo
+    jumps = measured['jumps'][1] - measured['jumps'][0]
     return (
         name, number(1e3 * echo), number(1e3 * localizer), number(1e3 * added),
         f'{1e3 * _GOAL:g}', 'yes' if added < _GOAL else 'no',
-        *map(_throughput, measured['throughput'].values()),
+        number(1e3 * jumps), *map(_throughput, measured['throughput']),
     )
 
 

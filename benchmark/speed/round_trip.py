@@ -20,14 +20,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmark.speed.scenes import LANDMARKS, localization
+from benchmark.speed.scenes import LANDMARKS, localization, motion
 from fisheye_svp_ros.commands.processes import domain
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.scene.landmarks import Landmarks
 
 _LENS = 'fish214'
-_VIEWS = 50
+_VIEWS = 150
 _PATIENCE = 30.0  # s
 _LASTING = 1.0  # s of sets at one rate
 _RATES = (100, 200, 400, 800, 1600, 3200)
@@ -53,8 +53,9 @@ class Probe:
         self._executor.add_node(self._node)
         self.heard: dict[str, dict[int, int]] = {name: {} for name in names}
         self._publishers = {}
-        scene = localization(load_lens(lens_path(_LENS)), _VIEWS)
-        landmarks = Landmarks(np.arange(LANDMARKS), scene.landmarks)
+        lens = load_lens(lens_path(_LENS))
+        scenes = {'motion': motion(lens, _VIEWS), 'jumps': localization(lens, _VIEWS)}
+        landmarks = Landmarks(np.arange(LANDMARKS), scenes['motion'].landmarks)
         self._known = []
         for name in names:
             known = self._node.create_publisher(PointCloud2, f'/{name}/landmarks', LATCHED)
@@ -66,9 +67,12 @@ class Probe:
             self._node.create_subscription(
                 PoseWithCovarianceStamped, f'/{name}/localizer/pose', self._hear(name), RELIABLE
             )
-        self._sets = [
-            messages.image_points_message(landmarks.ids, uv, 0, 'camera') for uv in scene.views.uv
-        ]
+        self.scene = 'motion'
+        self._sets = {
+            name: [messages.image_points_message(landmarks.ids, uv, 0, 'camera')
+                   for uv in scene.views.uv]
+            for name, scene in scenes.items()
+        }
         self._sent = 0
 
     def send(self, name: str) -> int:
@@ -76,7 +80,7 @@ class Probe:
         from fisheye_svp_ros.nodes import messages
 
         self._sent += 1
-        message = self._sets[self._sent % _VIEWS]
+        message = self._sets[self.scene][self._sent % _VIEWS]
         message.header = messages.header(self._sent, 'camera')
         self._publishers[name].publish(message)
         return self._sent
@@ -175,7 +179,7 @@ def nodes() -> Iterator[tuple[str, str]]:
 
 
 def main(count: int) -> None:
-    """Print the medians, s, and the throughput of both nodes."""
+    """Print the medians, s, of each scene, and the throughput: of the echo node, the localizer."""
     os.environ['ROS_DOMAIN_ID'] = domain()
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     with nodes() as names:
@@ -183,11 +187,12 @@ def main(count: int) -> None:
         for name in names:
             probe.greet(name)
         round_trips(probe, names, max(count // 10, 1))
-        seconds = round_trips(probe, names, count)
-        print(json.dumps({
-            'median': dict(zip(names, map(median, seconds.values()), strict=True)),
-            'throughput': {name: throughput(probe, name) for name in names},
-        }))
+        found: dict[str, Any] = {}
+        for probe.scene in ('jumps', 'motion'):
+            seconds = round_trips(probe, names, count)
+            found[probe.scene] = [median(values) for values in seconds.values()]
+        found['throughput'] = [throughput(probe, name) for name in names]
+        print(json.dumps(found))
         probe.close()
 
 

@@ -75,11 +75,24 @@ def localization(lens: Lens, views: int, landmarks: int = LANDMARKS) -> Scene:
     All peers can do that much: OpenCV's fisheye ends below 90 degrees.
     """
     rng = np.random.default_rng(_SEED + 1)
-    known = points(landmarks, np.radians(65.0))
     pose = Pose(
         rotation_from_vector(rng.uniform(-0.1, 0.1, (views, 3))),
         rng.uniform(-0.05, 0.05, (views, 3)),
     )
+    return _seen_from(lens, pose, landmarks, rng)
+
+
+def motion(lens: Lens, views: int) -> Scene:
+    """Return views of the same landmarks from a camera that goes round a circle of 0.2 m."""
+    turn = 2 * np.pi * np.arange(views) / views
+    place = np.stack([np.cos(turn), np.sin(turn), np.sin(2 * turn)], axis=-1)
+    pose = Pose(rotation_from_vector(0.1 * place), 0.1 * place)
+    return _seen_from(lens, pose, LANDMARKS, np.random.default_rng(_SEED + 3))
+
+
+def _seen_from(lens: Lens, pose: Pose, landmarks: int, rng: np.random.Generator) -> Scene:
+    views = len(pose.position)
+    known = points(landmarks, np.radians(65.0))
     uv = project(lens, pose.into_body(known)).uv + rng.normal(0, NOISE_PX, (views, landmarks, 2))
     start = pose.retract(rng.normal(0, 0.02, (views, 6)))
     return Scene(lens, known, views_of(known, uv), start)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 
-_LONGEST_DRAIN = 0.05  # s of taking in before a set is solved, come what may
-
 
 @dataclass
 class Counts:
@@ -19,27 +17,13 @@ class Counts:
     incomplete: int = 0
 
 
-class Arrivals:
-    """When to stop taking in and solve; and how late the sets are."""
+class Pace:
+    """How late the sets are, and what became of them since the last report."""
 
     def __init__(self) -> None:
-        self.count = 0  # of messages
         self.latency = 0.0  # s, of the latest set
-        self._seen = 0
-        self._since = self._restarted = time.monotonic()
+        self._restarted = time.monotonic()
         self._reported = Counts()
-
-    def go_on(self, now: float) -> bool:
-        """Say whether more may be waiting to be taken in."""
-        fresh, self._seen = self.count != self._seen, self.count
-        if fresh and now - self._since < _LONGEST_DRAIN:
-            return True
-        self._since = now
-        return False
-
-    def finish_set(self, now: float, began: float) -> None:
-        """Take note that a set is solved."""
-        self._since, self.latency = now, now - began
 
     def restart(self, counts: Counts) -> tuple[Counts, float]:
         """Return the counts at the last call, and the seconds since; remember those of now."""
@@ -49,16 +33,16 @@ class Arrivals:
 
 
 def report(
-    counts: Counts, arrivals: Arrivals, waiting: int
+    counts: Counts, pace: Pace, waiting: int
 ) -> tuple[dict[str, object], str]:
     """Return the counts since the start, and what is wrong since the last report.
 
     taken = solved + not solved + dropped + incomplete + waiting, at any time.
     """
-    before, seconds = arrivals.restart(counts)
+    before, seconds = pace.restart(counts)
     came = (counts.taken - before.taken) / seconds
     done = (counts.solved + counts.unsolved - before.solved - before.unsolved) / seconds
-    latency = arrivals.latency
+    latency = pace.latency
     told: dict[str, object] = {
         'sets: taken': counts.taken, 'sets: solved': counts.solved,
         'sets: not solved': counts.unsolved, 'sets: dropped': counts.dropped,

@@ -195,6 +195,9 @@ class BaseNode(Node):  # type: ignore[misc]
         if self.listening:
             self._inputs[topic].subscribe()
 
+    def after_message(self) -> None:
+        """Do what there is to do once the executor has brought a message, by then taken in."""
+
     @property
     def listening(self) -> bool:
         """Whether the node listens to its inputs now."""

@@ -220,5 +220,6 @@ class StampJoin:
                    default=self._pending.get(stamp))
 
     def _holding(self, topic: str, stamp: int) -> Pending | None:
-        return next((one for one in self._pending.values() if one.stamps.get(topic) == stamp),
-                    None)
+        own = [self._pending[stamp]] if stamp in self._pending else []
+        others = self._pending.values() if self.tolerance else ()
+        return next((one for one in (*own, *others) if one.stamps.get(topic) == stamp), None)

@@ -81,9 +81,9 @@ class Localizer(SolverNode):
         self._pose.publish(
             messages.pose_with_covariance_message(pose, covariance[0], stamp, world)
         )
-        self._residuals.publish(
-            messages.cloud_message(residual_points(model, views, solution), stamp, camera)
-        )
+        if self._residuals.get_subscription_count():
+            cloud = residual_points(model, views, solution)
+            self._residuals.publish(messages.cloud_message(cloud, stamp, camera))
         self._transforms.publish(pose, stamp, world, camera)
         if true is not None:
             error = pose.difference(true)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import Any
 
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
@@ -48,6 +49,10 @@ def create_with_qos(
     """
     entity = 'publisher' if create == node.create_publisher else 'subscription'
     policies = overridden(node, node.resolve_topic_name(topic), entity)
+    if entity == 'publisher' and not policies and qos.reliability == ReliabilityPolicy.RELIABLE:
+        # Hardly anybody asks for more, and who does says so; an executor asks each event of each
+        # publisher, whatever it wakes up for.
+        more = {'event_callbacks': PublisherEventCallbacks(use_default_callbacks=False), **more}
     try:
         # A copy, because rclpy changes the profile that it is given.
         return create(kind, topic, *arguments, copy(qos),

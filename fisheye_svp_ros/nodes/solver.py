@@ -29,7 +29,7 @@ from fisheye_svp_ros.io.decoding import (
 )
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import check_access
-from fisheye_svp_ros.nodes.backlog import Arrivals, Counts, report
+from fisheye_svp_ros.nodes.backlog import Counts, Pace, report
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.join import LIMIT, NeighborPair, Pending, StampJoin
@@ -47,6 +47,7 @@ from fisheye_svp_ros.study.solutions import Pair
 Items = Mapping[str, Any]
 
 _UNREAD = 5 * LIMIT  # messages to look at while there is nothing to solve
+_LONGEST_INTAKE = 0.05  # s of taking in before a set is solved, come what may
 _NS = 10**9
 
 
@@ -76,13 +77,14 @@ class SolverNode(ManagedNode):
         self._backlog: deque[Pending] = deque()
         self._unread: deque[tuple[int, str]] = deque(maxlen=_UNREAD)
         self._counts = Counts()
-        self._arrivals = Arrivals()
+        self._pace = Pace()
         self._standing = StandingLandmarks()
         self._said = ''
         self._lenses: dict[str, Lens] = {}  # those of the parameter lens
         self._infos = CameraInfos(self.get_logger().info)
         self._models: dict[str, tuple[Lens, ForwardModel]] = {}  # the latest, by camera
-        self._wake = self.create_guard_condition(self.guard_callback(self._work))
+        self._guarded_work = self.guard_callback(self._work)
+        self._rest = self.create_guard_condition(self._guarded_work)
         self.collect(
             PointCloud2, 'landmarks', read_landmarks, self._hear_landmarks, latched=True)
         self._collect(DiagnosticArray, 'scenario', read_key_values)
@@ -91,7 +93,7 @@ class SolverNode(ManagedNode):
         # Last, because a camera that sees this subscription counts on the others.
         for topic in self._image_points:
             self._collect(PointCloud2, topic, read_image_points)
-        self.start_timer(0.1, self._wake.trigger)
+        self.start_timer(0.1, self._work)
 
     def start(self) -> None:
         """Take the parameters into use, as every node does; call it after all `announce`."""
@@ -201,13 +203,12 @@ class SolverNode(ManagedNode):
 
         taken = solved + not solved + dropped + incomplete + waiting, at any time.
         """
-        return report(self._counts, self._arrivals, len(self._backlog) + len(self._join))
+        return report(self._counts, self._pace, len(self._backlog) + len(self._join))
 
     def _listen_to_camera_info(self) -> None:
         def hear(topic: str, stamp: int, unread: Unread) -> None:
             self._infos.hear(topic, stamp, unread)
             self._join.expect_no_more(topic)
-            self._wake.trigger()
 
         for topic in (f'{camera}{CAMERA_INFO}' for camera in self.cameras):
             if not self.listens_to(topic):
@@ -221,8 +222,6 @@ class SolverNode(ManagedNode):
     def _add(self, topic: str, stamp: int, item: Unread) -> None:
         self._counts.taken += self._join.add(topic, stamp, item, time.monotonic())
         self._unread.append((stamp, topic))
-        self._arrivals.count += 1
-        self._wake.trigger()
 
     def _hear_landmarks(self, stamp: int, unread: Unread) -> None:
         if stamp:
@@ -230,14 +229,15 @@ class SolverNode(ManagedNode):
         self._standing.hear(stamp, unread)
         if not stamp:
             self._join.expect_no_more('landmarks')
-            self._wake.trigger()
+
+    def after_message(self) -> None:
+        """Work at once: to be called back for it costs the executor more than most sets do."""
+        self._guarded_work()
 
     def _work(self) -> None:
-        """Do one thing: take all in that has come, then solve a set, then look at the rest."""
+        """Take all in that has come, then do one thing: solve a set, or look at the rest."""
+        self._take_in()
         now, patience = time.monotonic(), self.settings.patience
-        if self._arrivals.go_on(now):
-            self._wake.trigger()
-            return
         self._skip_unpublished()
         for one in self._join.pop_complete(now, patience):
             self._backlog.append(one)
@@ -252,11 +252,20 @@ class SolverNode(ManagedNode):
         if self._backlog:
             one = self._backlog.popleft()
             self._attempt(one)
-            self._arrivals.finish_set(time.monotonic(), one.since)
-        elif self._unread:
-            self._look_at(*self._unread.popleft())
+            self._pace.latency = time.monotonic() - one.since
+        else:
+            self._look_at_next()
         if self._backlog or self._unread:
-            self._wake.trigger()
+            self._rest.trigger()
+
+    def _take_in(self) -> None:
+        """Take in what has come, a message of each topic in turn, before the executor brings it.
+
+        A solver that is behind would else find out late which sets are too old to be solved.
+        """
+        end = time.monotonic() + _LONGEST_INTAKE
+        while sum(one.take() for one in self._inputs.values()) and time.monotonic() < end:
+            pass
 
     def _skip_unpublished(self) -> None:
         """Do not let sets wait for true poses that nobody publishes."""
@@ -273,9 +282,12 @@ class SolverNode(ManagedNode):
                           'image points; true poses are interpolated only over gaps up to '
                           f'true_pose_gap ({self.settings.true_pose_gap:g} s)')
 
-    def _look_at(self, stamp: int, topic: str) -> None:
+    def _look_at_next(self) -> None:
         """Decode what waits for the rest of its set, so that bad input is told of at once."""
-        item = self._join.waiting(topic, stamp)
+        item = None
+        while self._unread and not isinstance(item, Unread):
+            stamp, topic = self._unread.popleft()
+            item = self._join.waiting(topic, stamp)
         if not isinstance(item, Unread):
             return
         try:

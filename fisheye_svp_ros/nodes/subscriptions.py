@@ -12,7 +12,7 @@ import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable
 from copy import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSPolicyKind, ReliabilityPolicy
@@ -25,6 +25,13 @@ _LONG_INTERVALS = 3  # of a topic, without a message: it has stopped
 _MAX_HASHES = INPUT.depth
 
 _Kind = tuple[bool, bool]  # of a subscription: reliable, latched
+
+
+class _Subscription(NamedTuple):
+    """One of rclpy, and what is called with each of its messages."""
+
+    of_rclpy: Any
+    hear: Callable[[bytes], None]
 
 
 class Input:
@@ -43,14 +50,14 @@ class Input:
         self.typename = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
         self._node, self._kind, self._receive = node, kind, receive
         self._qos, self._latched = qos, latched
-        self._subscriptions: dict[_Kind, Any] = {}
+        self._subscriptions: dict[_Kind, _Subscription] = {}
         self._since = self._first = self._latest = 0.0  # s
         self._heard = 0
 
     @property
     def profiles(self) -> list[Any]:
         """What is asked for; empty while the node does not listen."""
-        return [one.qos_profile for one in self._subscriptions.values()]
+        return [one.of_rclpy.qos_profile for one in self._subscriptions.values()]
 
     @property
     def has_messages(self) -> bool:
@@ -89,22 +96,34 @@ class Input:
 
     def unsubscribe(self) -> None:
         """Listen no more."""
-        for subscription in self._subscriptions.values():
-            self._node.destroy_subscription(subscription)
+        for one in self._subscriptions.values():
+            self._node.destroy_subscription(one.of_rclpy)
         self._subscriptions.clear()
+
+    def take(self) -> bool:
+        """Take in a message that the executor has not brought yet; say whether there was one."""
+        taken = False
+        for one in self._subscriptions.values():
+            handle = one.of_rclpy.handle
+            with handle:
+                message = handle.take_message(self._kind, True)
+            if message is not None:
+                taken = True
+                one.hear(message[0])
+        return taken
 
     def adapt(self) -> None:
         """Add the subscriptions that the publishers of the topic need."""
         if not self._subscriptions or self._is_fixed():
             return
-        usual, first = next(iter(self._subscriptions.items()))
+        usual = next(iter(self._subscriptions))
         for publisher in self._node.get_publishers_info_by_topic(self.resolved):
             offered = publisher.qos_profile
             latched = self._latched and offered.durability == DurabilityPolicy.TRANSIENT_LOCAL
             reliable = offered.reliability != ReliabilityPolicy.BEST_EFFORT
             needed = reliable and (usual[0] or latched), latched
             if publisher.topic_type == self.typename and needed not in self._subscriptions:
-                qos = copy(first.qos_profile)
+                qos = copy(self.profiles[0])
                 qos.reliability = (ReliabilityPolicy.RELIABLE if needed[0]
                                    else ReliabilityPolicy.BEST_EFFORT)
                 if latched:
@@ -122,9 +141,15 @@ class Input:
         events = SubscriptionEventCallbacks(
             matched=adapt if self._latched else None,
             incompatible_qos=None if self._is_fixed() else adapt)
-        self._subscriptions[kind] = create_with_qos(
-            node, node.create_subscription, self._kind, self.name, self._filter.callback(),
-            qos=qos, raw=True, event_callbacks=events)
+        hear = self._filter.callback()
+
+        def receive(data: bytes) -> None:
+            hear(data)
+            node.after_message()
+
+        self._subscriptions[kind] = _Subscription(create_with_qos(
+            node, node.create_subscription, self._kind, self.name, receive,
+            qos=qos, raw=True, event_callbacks=events), hear)
 
 
 class DuplicateFilter:

@@ -23,7 +23,7 @@ from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.localizer import Localizer
-from fisheye_svp_ros.nodes.quality import LATCHED_SETS, RELIABLE
+from fisheye_svp_ros.nodes.quality import LATCHED_SETS, RELIABLE, SENSOR
 from fisheye_svp_ros.nodes.synthetic_camera import SyntheticCamera
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.kannala_brandt import kannala_brandt_equivalent
@@ -123,3 +123,35 @@ def test_who_comes_late_counts_no_set_for_the_landmarks_of_old_ones(
     assert last.message == 'all inputs usable'
     assert counts['sets: taken'] == counts['sets: solved'] == '5'
     assert counts['landmarks: received'] == '55' and counts['landmarks: dropped'] == '0'
+
+
+def test_all_that_has_come_is_taken_in_before_a_set_is_solved(
+    graph: Callable[..., Graph]
+) -> None:
+    g = graph('lens:=fish214', 'svp:=true', 'backlog:=2')
+    results = g.hear(DiagnosticArray, 'localizer/result')
+    node = g.start(Localizer)
+    told, points = (g.tell(PointCloud2, topic) for topic in ('landmarks', 'image_points'))
+    told.publish(messages.landmarks_message(LANDMARKS, 0, 'world'))
+    points.publish(points_message(1 * MS))
+    g.until(lambda: results)
+    for stamp in range(2, 9):
+        points.publish(points_message(stamp * MS))
+    time.sleep(0.2)  # they wait in the middleware
+    counts: dict[str, Any] = {}
+    while counts.get('sets: taken') in (None, 1):
+        g.executor.spin_once()
+        counts = {**node.report()[0]}
+    assert [counts[f'sets: {what}'] for what in ('taken', 'solved', 'dropped', 'waiting')] == [
+        8, 2, 5, 1]
+
+
+def test_publishers_that_everybody_hears_cost_the_executor_nothing(
+    graph: Callable[..., Graph]
+) -> None:
+    node = graph('lens:=fish214', 'svp:=true').start(Localizer)
+    entities = len(list(node.waitables))
+    node.announce(PointCloud2, 'reliable')
+    assert len(list(node.waitables)) == entities
+    node.announce(PointCloud2, 'lossy', SENSOR)  # that may not be heard, which is said
+    assert len(list(node.waitables)) > entities
