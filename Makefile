@@ -178,11 +178,12 @@ test-oldest:
 	$(QUIETLY) .venv-oldest/bin/pip install --quiet -e '.[fast,parquet,test$(ROS)]' -c test/oldest.txt
 	.venv-oldest/bin/python -m pytest -n $(WORKERS) --dist loadgroup
 
+# Modules are compiled when they are first imported: most never are.
 $(VENV)/ready: setup.py
 	@echo "Installing the package and its tools into $(VENV): about a minute, this once"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --upgrade pip
-	$(QUIETLY) $(BIN)/pip install --quiet -e '.[fast,parquet,dask,test,lint,docs$(ROS)]'
+	$(QUIETLY) $(BIN)/pip install --quiet --no-compile -e '.[fast,parquet,dask,test,lint,docs$(ROS)]'
 	touch $@
 
 clean:

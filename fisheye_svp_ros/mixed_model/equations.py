@@ -32,6 +32,7 @@ FIXED, ABSENT = -1, -2  # labels: without a prior; not there
 _RIDGE = 1e-10  # of normalised fixed columns of a group: some may be zero
 _ABSENT_PRECISION = 1e12
 _ROUNDING_RIDGE = 1e-5  # of a column's own information, where rounding makes the whole indefinite
+WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start
 
 
 def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
@@ -306,7 +307,6 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
     diagonal = np.arange(b.ee.shape[1])
     ee = b.ee.copy()
     ee[:, diagonal, diagonal] += e
-    cut = len(e) // 2
     inverse, coupled, block_border = np.empty_like(ee), np.empty_like(b.er), np.empty_like(b.ex)
 
     def eliminate_blocks(part: slice) -> tuple[Array, Array]:
@@ -316,14 +316,19 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
         flat = coupled[part].reshape(e[part].size, len(b.rr))
         return flat.T @ flat, flat.T @ block_border[part].reshape(len(flat), len(b.xx))
 
-    # Two threads: most of the time goes here, and NumPy lets go of the interpreter.
-    with ThreadPoolExecutor(2) as pool:
-        first, second = pool.map(eliminate_blocks, (slice(cut), slice(cut, None)))
-    rr, flat_border = b.rr - first[0] - second[0], block_border.reshape(e.size, len(b.xx))
+    if e.size * len(b.rr) ** 2 < WORTH_THREADS:
+        gone = [eliminate_blocks(slice(None))]
+    else:  # most of the time goes here, and NumPy lets go of the interpreter
+        with ThreadPoolExecutor(2) as pool:
+            cut = len(e) // 2
+            gone = list(pool.map(eliminate_blocks, (slice(cut), slice(cut, None))))
+    rr, rx = (whole - sum(parts) for whole, parts in
+              zip((b.rr, b.rx), zip(*gone, strict=True), strict=True))
+    flat_border = block_border.reshape(e.size, len(b.xx))
     rr[np.diag_indices_from(rr)] += r
     if len(rr):
         factor = linalg.cholesky(rr, lower=True, overwrite_a=True, check_finite=False)
-        border = solve_lower(factor, b.rx - first[1] - second[1])
+        border = solve_lower(factor, rx)
     else:
         factor, border = rr, b.rx
     information = b.xx - flat_border.T @ flat_border - border.T @ border

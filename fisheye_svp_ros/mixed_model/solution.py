@@ -19,6 +19,7 @@ from scipy import linalg
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.mixed_model.equations import (
+    WORTH_THREADS,
     Equations,
     FactoredEquations,
     log_determinant,
@@ -65,14 +66,15 @@ def posterior_covariance(f: FactoredEquations) -> Posterior:
     inverse_t = np.swapaxes(f.inverse, -1, -2)
     by_border = solve_upper(f.factor, f.border[:, :-1])
     by_block = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
-    root, count = np.concatenate(covariance_roots(f)), len(f.root)
-    shared = np.zeros((count, root.shape[1] + count))
+    size, rest, count = f.precision[0].size, len(f.factor), len(f.root)
+    root, shared = np.empty((size + rest, rest + count)), np.zeros((count, rest + count))
+    root[:size, :rest], root[size:, :rest] = covariance_roots(f)
     if count:
         fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
-        both = np.concatenate([by_block.reshape(-1, count), by_border])
-        root = np.concatenate([root, both @ fixed], axis=1)
+        root[:size, rest:] = by_block.reshape(size, count) @ fixed
+        root[size:, rest:] = by_border @ fixed
         # What fixed columns take up, random ones lose.
-        shared[:, -count:] = -fixed
+        shared[:, rest:] = -fixed
     return Posterior(inverse_t @ f.inverse, root, shared)
 
 
@@ -243,9 +245,12 @@ def leave_groups_out(
         remaining = _leave_out(f, roots, random, group, group_fixed[group], border[group], rows)
         np.matmul(remaining.T, rows, out=found.information[group])
 
-    # NumPy's linear algebra, unlike SciPy's, lets go of the interpreter.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(leave_out, range(len(border))))
+    every = range(len(border))
+    if border.size * len(f.factor) < WORTH_THREADS:
+        list(map(leave_out, every))
+    else:  # NumPy's linear algebra, unlike SciPy's, lets go of the interpreter
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            list(pool.map(leave_out, every))
     return found
 
 
