@@ -17,6 +17,8 @@ PYTEST ?=
 # Rooms whose tests start no process, nor diagnose whole sets.
 QUICK := $(patsubst %,test/%,optics scene mixed_model effects io simulate solve rectify detect study reporting) \
 	$(patsubst %,test/test_%.py,documents library pose)
+# Kept, whatever the environment says: tests start hundreds of processes.
+export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
