@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
@@ -26,19 +26,22 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import check_access
 from fisheye_svp_ros.nodes.base import BaseNode
 from fisheye_svp_ros.nodes.camera_info import CAMERA_INFO, CameraInfos
-from fisheye_svp_ros.nodes.guiding import Guiding
 from fisheye_svp_ros.nodes.image_topics import COMPRESSED_SUFFIX, compressed_topic
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import INFO_INPUT, LATCHED, SENSOR
-from fisheye_svp_ros.planning.guide import NUMBERS
+from fisheye_svp_ros.optics.lens import INTRINSICS
 from fisheye_svp_ros.scene.landmarks import Landmarks
 from fisheye_svp_ros.study.settings import Settings
+
+if TYPE_CHECKING:
+    from fisheye_svp_ros.nodes.guiding import Guiding
 
 _RAW, _COMPRESSED = 'image', f'image{COMPRESSED_SUFFIX}'
 _LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
 _MAX_LEAD = 100  # images of which one topic may be ahead of the other
 _MIN_FAILURES = 20  # images without a board before the first with one: it may be another board
 _LOOK = 0.005  # s, how often what a search found is looked for
+_GUIDED = ('e0', *INTRINSICS, 'k1', 'k2', 'k3', 'k4')  # parameters that a guide can determine
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class DetectorSettings(Settings):
     )
     guide: str = parameter(
         '', 'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
-        'empty: no guide', choices=('', *NUMBERS), fixed=True
+        'empty: no guide', choices=('', *_GUIDED), fixed=True
     )
     goal: float = parameter(
         0.0002, 'Standard error at which that parameter is determined, m for e0, px for fx, fy, '
@@ -122,6 +125,8 @@ class Detector(BaseNode):
                      partial(self._infos.hear, CAMERA_INFO), INFO_INPUT, latched=True)
         self.start()
         if self.settings.guide:
+            # The diagnosis and the plots behind it take half a second to import.
+            from fisheye_svp_ros.nodes.guiding import Guiding
             self._guiding = Guiding(self, self.settings, self._pattern, self._infos)
         # A search may take long, and nothing but the end of its process breaks it off.
         blank = np.zeros((16, 16), np.uint8), self._pattern, self._detector, None

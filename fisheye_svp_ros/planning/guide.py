@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import FisheyeSvpError
-from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, field_of_view, intrinsic_names
+from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import ViewLimits
 from fisheye_svp_ros.planning.plan import NextViews, next_photographs, plan
 from fisheye_svp_ros.scene.observations import Observations, make_observations
@@ -43,8 +43,6 @@ MIN_PROBABILITY = 0.3  # that a few more photographs tell two causes apart, belo
 _MAX_UNDECIDED = _MIN_DIAGNOSED + _VIEWS_AHEAD
 _EFFECT = ViewpointShiftEffect(1)
 
-NUMBERS = (_EFFECT.parameters[0].name, *INTRINSICS, 'k1', 'k2', 'k3', 'k4')
-
 
 class DetectedBoard(NamedTuple):
     """A board in an image: time, s; points (M,) of the pattern, uv (M, 2) and sigma (M,), px."""
@@ -60,8 +58,8 @@ class Session:
     """What a guide is for, and what it has.
 
     lens: as the data sheet has it, of Kannala-Brandt's form; points (N, 3), m, of a flat board;
-    number: whose standard error is to come down to `goal`, in its unit, one of NUMBERS; latest:
-    lens and e0 as fitted last.
+    number: whose standard error is to come down to `goal`, in its unit: e0, an intrinsic
+    or a coefficient k1 to k4; latest: lens and e0 as fitted last.
     """
 
     lens: Lens
