@@ -40,6 +40,7 @@ _FIELDS = {'name', 'image', 'projection', 'max_incidence_deg', 'viewpoint_shift'
 MAX_LENS_BYTES = 1 << 26  # bytes; a .cameramodel may hold all that it was fitted to
 _MAX_NUMBER = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
+_COLMAP_BINARY = 'cameras.bin'
 _NO_LENSES = ('rig', 'camchain', 'tf_static')  # files of a rig beside those of its lenses
 OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
 _LEGACY_KEY = 'effects'  # what older files call corrections, of the lens and of the target alike
@@ -170,6 +171,9 @@ def _read(path: str | Path) -> tuple[str, str]:
             raise LensError(f'{file}: no lens of camera {camera!r} in it; there are '
                             + ', '.join(lenses))
         file, camera = str(lenses[camera]), ''
+    if Path(file).name == _COLMAP_BINARY and Path(file).is_file():
+        raise LensError(f"{file}: COLMAP's binary form cannot be read; write cameras.txt with "
+                        'colmap model_converter --output_type TXT')
     return read_text(file, LensError, MAX_LENS_BYTES), camera
 
 

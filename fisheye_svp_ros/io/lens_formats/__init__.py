@@ -32,6 +32,10 @@ UNREADABLE_FORMATS = {
     'a Bundler file': '^# Bundle file',
     'a RealityScan (RealityCapture) XMP file': 'xcr:DistortionModel',
     'an SVO (vikit) camera': r'^cam_model *:|^cameras: *\n *- camera:',
+    "Kalibr's text of results (take its camchain YAML)": '^Camera-system parameters:',
+    'a transforms.json without fl_x': '"camera_angle_x"',
+    'a BoofCV model other than omnidirectional_universal': '^ *pinhole:',
+    'a configuration of stella_vslam': r'^ +setup: *"?(monocular|stereo|RGBD)',
     'a calibration of the MATLAB toolbox of Caltech': r'^ *fc *= *\[',
 }
 

@@ -16,9 +16,7 @@ from fisheye_svp_ros.optics.lens import Lens
 Values = dict[str, float]
 
 _CORNER = 0.5  # px, of our first pixel's center from the corner where COLMAP's image begins
-_ROW = re.compile(
-    r'^ *(\d+)[ ,\t]+([A-Z][A-Z\d_]+)[ ,\t]+(\d+)[ ,\t]+(\d+)((?:[ ,\t]+[-+.\deE]+)+)[ \t]*$',
-    re.MULTILINE)
+_ROW = re.compile(r'(\d+)[ ,\t]+([A-Z][A-Z\d_]+)[ ,\t]+(.+)')
 
 
 def _fisheye(values: Values) -> Distortion:
@@ -65,21 +63,29 @@ _MODELS: dict[str, tuple[str, Callable[[Values], Distortion]]] = {
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != '#']
+    lines = _lines(text)
     return bool(lines) and all(map(_ROW.fullmatch, lines))
+
+
+def _lines(text: str) -> list[str]:
+    """Return the lines without comments."""
+    lines = (line.partition('#')[0].strip() for line in text.splitlines())
+    return [line for line in lines if line]
 
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras, by their ids; raises LensError, naming camera and model."""
     lenses, worst = {}, {}
-    for camera, model, width, height, rest in _ROW.findall(text):
+    for row in filter(None, map(_ROW.fullmatch, _lines(text))):
+        camera, model, rest = row.groups()
+        place = f'{where}: camera {camera}'
         try:
-            values = [float(word) for word in rest.replace(',', ' ').split()]
+            width, height, *values = (float(word) for word in rest.replace(',', ' ').split())
         except ValueError as cause:
-            raise LensError(f'{where}: camera {camera}: {cause}') from cause
+            raise LensError(f'{place}: width, height and the parameters of {model} must be '
+                            f'numbers ({cause})') from cause
         lenses[camera], worst[camera] = _lens(
-            f'camera{camera}', model, (int(width), int(height)), values,
-            f'{where}: camera {camera}')
+            f'camera{camera}', model, (width, height), values, place)
     return Foreign('COLMAP', lenses, (), worst)
 
 

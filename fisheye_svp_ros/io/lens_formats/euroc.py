@@ -1,4 +1,4 @@
-"""EuRoC's sensor.yaml of a camera: equidistant as it stands, radial-tangential by a fit."""
+"""EuRoC's sensor.yaml of a camera, Kimera's too: equidistant as it stands, others by a fit."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_formats import Foreign, fields, radial
 from fisheye_svp_ros.io.lens_formats.distortion import OPENCV, Distortion, brown, nearest_lens
 
-_OF_CAMERA = re.compile(r'^sensor_type: *camera', re.MULTILINE)
+# Kimera's has camera_id in place of sensor_type.
+_OF_CAMERA = re.compile(r'^(sensor_type: *camera|camera_id:)', re.MULTILINE)
+_RADIAL_TANGENTIAL = ('radial-tangential', 'radial_tangential', 'radtan')
 
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return bool(_OF_CAMERA.search(text)) and 'intrinsics:' in text
+    return bool(_OF_CAMERA.search(text)) and 'intrinsics:' in text and 'camera_model:' in text
 
 
 def read(text: str, where: str) -> Foreign:
@@ -26,7 +28,7 @@ def read(text: str, where: str) -> Foreign:
     if kind == 'equidistant':
         k = fields.coefficients(document, name, (4,), where)
         distortion = Distortion(radial.EQUIDISTANT, k)
-    elif kind in ('radial-tangential', 'none'):
+    elif kind in (*_RADIAL_TANGENTIAL, 'none'):
         d = fields.coefficients(document, name, (4, 5), where) if kind != 'none' else ()
         distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, d, strict=False)))
     else:

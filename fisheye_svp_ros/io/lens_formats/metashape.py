@@ -48,12 +48,13 @@ def _lens(name: str, calibration: Element, where: str) -> tuple[Lens, float]:
     words = {tag: calibration.findtext(tag) for tag in ('width', 'height')} if (
         resolution is None) else dict(resolution.attrib)
     words |= {tag: calibration.findtext(tag, '0') for tag in _NAMES}
-    try:
-        values = {tag: float(word or '') for tag, word in words.items()}
-        width, height = values['width'], values['height']
-    except (KeyError, ValueError) as cause:
-        raise LensError(f'{where}: width, height, f or a coefficient is not a number '
-                        f'({cause})') from cause
+    values = {}
+    for tag in ('width', 'height', *_NAMES):
+        try:
+            values[tag] = float(words.get(tag) or '')
+        except ValueError as cause:
+            raise LensError(f'{where}: {tag} is {words.get(tag)!r}; a number is needed') from cause
+    width, height = values['width'], values['height']
     f, b1, b2 = values['f'], values['b1'], values['b2']
     distortion = Distortion(
         _BASES[projection], [values[f'k{i}'] for i in range(1, 5)], (),

@@ -6,6 +6,8 @@ The image begins at 0, as COLMAP's does, of which most of these files come.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_json
@@ -16,6 +18,7 @@ from fisheye_svp_ros.optics.lens import Lens
 _CORNER = 0.5  # px, of our first pixel's center from the corner where the image begins
 _FISHEYE, _PERSPECTIVE = 'OPENCV_FISHEYE', ('OPENCV', 'PINHOLE', 'SIMPLE_PINHOLE')
 _NAMES = ('k1', 'k2', 'k3', 'k4', 'p1', 'p2')
+_KEYS = ('camera_model', 'is_fisheye', 'w', 'h', 'fl_x', 'fl_y', 'cx', 'cy', *_NAMES)
 
 
 def recognises(text: str) -> bool:
@@ -24,11 +27,23 @@ def recognises(text: str) -> bool:
 
 
 def read(text: str, where: str) -> Foreign:
-    """Read the lens, or the first frame's where each has its own; raises LensError."""
+    """Read the lens, or the different ones of the frames; raises LensError."""
     document = parse_json(text, where, LensError)
+    shared = {key: document[key] for key in _KEYS if key in document}
     frames = document.get('frames')
-    first = frames[0] if isinstance(frames, list) and frames else {}
-    given = {**(first if isinstance(first, dict) else {}), **document}
+    given = [{key: frame[key] for key in _KEYS if key in frame} | shared
+             for frame in (frames if isinstance(frames, list) else []) if isinstance(frame, dict)]
+    different = list({json.dumps(one): one for one in given}.values()) or [shared]
+    if len(different) == 1:
+        found = {'camera': _lens('camera', different[0], where)}
+    else:
+        found = {f'camera{i}': _lens(f'camera{i}', one, f'{where}: camera{i}')
+                 for i, one in enumerate(different, start=1)}
+    return Foreign('nerfstudio', {name: lens for name, (lens, _) in found.items()}, (),
+                   {name: worst for name, (_, worst) in found.items()})
+
+
+def _lens(name: str, given: Mapping[str, Any], where: str) -> tuple[Lens, float]:
     model = given.get('camera_model', _FISHEYE if given.get('is_fisheye') else 'OPENCV')
     if model != _FISHEYE and model not in _PERSPECTIVE:
         raise LensError(f'{where}: camera_model is {model!r}; those that can be read are '
@@ -36,16 +51,14 @@ def read(text: str, where: str) -> Foreign:
     size = fields.values(given, ('w', 'h'), where)
     fx, cx, cy = fields.values(given, ('fl_x', 'cx', 'cy'), where)
     fy = fields.values(given, ('fl_y',), where)[0] if 'fl_y' in given else fx
-    names = tuple(name for name in _NAMES if name in given)
+    names = tuple(key for key in _NAMES if key in given)
     values = dict(zip(names, fields.values(given, names, where), strict=True))
     if model == _FISHEYE:
         distortion = Distortion(
-            radial.EQUIDISTANT, [values.get(name, 0.0) for name in _NAMES[:4]])
+            radial.EQUIDISTANT, [values.get(key, 0.0) for key in _NAMES[:4]])
     else:
         distortion = brown(radial.PERSPECTIVE, values)
-    lens, worst = nearest_lens(
-        'camera', size, (fx, fy, cx - _CORNER, cy - _CORNER), distortion, where)
-    return Foreign('nerfstudio', {'camera': lens}, (), {'camera': worst})
+    return nearest_lens(name, size, (fx, fy, cx - _CORNER, cy - _CORNER), distortion, where)
 
 
 def write(lens: Lens) -> str:

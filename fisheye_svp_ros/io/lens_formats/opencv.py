@@ -32,6 +32,7 @@ _COEFFICIENTS = ('distortion_coefficients', 'Distortion_Coefficients', 'distCoef
 _RIGHT_KEYS = ('K2', 'M2', 'cameraMatrix2'), ('D2', 'distCoeffs2')
 _WIDTH, _HEIGHT = ('image_width', 'width', 'image_Width'), ('image_height', 'height')
 _XI, _OF_FISHEYE = 'xi', 4
+_IS_FISHEYE = 'fisheye_model'  # 0 or 1, of OpenCV's own calibration program
 _COUNTS = [shape for n in (4, 5, 8, 12, 14) for shape in ((1, n), (n, 1))]
 _SIZE = ('image_size', 'imageSize', 'size')
 
@@ -88,7 +89,7 @@ def _distortion(d: Sequence[float], document: Mapping[str, Any], where: str) -> 
         xi = _matrix(given, ((1, 1),), where)[0] if isinstance(given, dict) else (
             fields.values(document, (_XI,), where)[0])
         return brown(radial.omnidirectional(xi), dict(zip(OPENCV, d, strict=False)))
-    if len(d) == _OF_FISHEYE:
+    if len(d) == _OF_FISHEYE and document.get(_IS_FISHEYE, 1):
         return Distortion(radial.EQUIDISTANT, d)
     if any(d[len(OPENCV):]):
         raise LensError(f'{where}: {len(d)} coefficients, with a thin prism or a tilt; the four '

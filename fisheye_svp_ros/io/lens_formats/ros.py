@@ -61,7 +61,9 @@ def read(text: str, where: str) -> Foreign:
         model = str(document['distortion_model'])
         d = document['distortion_coefficients']['data']
         d = fields.numbers({'data': d}, 'data', len(d), where)
-    except (KeyError, TypeError, AttributeError) as cause:
+    except KeyError as cause:
+        raise LensError(f'{where}: not a whole camera_info; {cause.args[0]} is missing') from cause
+    except (TypeError, AttributeError) as cause:
         raise LensError(f'{where}: not a whole camera_info ({cause})') from cause
     lens, worst = _fit_lens(model, size, (k[0], k[4], k[2], k[5], k[1]), tuple(d), name, where)
     return Foreign('ROS', {name: lens}, (), {name: worst} if worst else {})
