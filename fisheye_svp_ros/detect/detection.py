@@ -243,6 +243,10 @@ def _add_notes(searched: list[SearchedPhotograph]) -> tuple[SearchedPhotograph, 
             if one.digest == other.digest:
                 one = replace(one, points=None, reason=f'a copy of {other.name}')
                 break
+            if one.key == other.key:
+                one = replace(one, points=None, reason=(
+                    f'the same frame as {other.name}, by name or stamp; rename or remove it'))
+                break
             if _is_same_moment(one, other):
                 notes.append(f'from the same viewpoint as {Path(other.name).name}')
                 break

@@ -49,9 +49,9 @@ def pair_photographs(
 ) -> Pairing:
     """Return which photographs (S,) are of one moment.
 
-    keys: names without folder and camera; t (S,), s, NaN unknown; sync: largest difference of
-    stamps, s; None: stamps are compared, to within SYNC, where all are known, or else names, or
-    else the last numbers in these.
+    keys: names without folder and camera, where several paths are given after PATH/; t (S,), s,
+    NaN unknown; sync: largest difference of stamps, s; None: stamps are compared, to within SYNC,
+    where all are known, or else names, or else the last numbers in these.
     """
     own, names = tuple(keys), np.array(cameras)
     if len(set(cameras)) < 2:
@@ -61,8 +61,10 @@ def pair_photographs(
         return Pairing(joined, 'stamp', apart, _count_unpaired(joined, names))
     way, alone = 'name', _count_unpaired(own, names)
     if len(alone) == len(own):
-        numbers = [['', *_NUMBER.findall(key)][-1] for key in own]
-        counted = tuple(number.lstrip('0') or '0' for number in numbers)
+        parts = [key.rpartition('/') for key in own]
+        numbers = [['', *_NUMBER.findall(name)][-1] for _, _, name in parts]
+        counted = tuple(f'{path}{slash}{number.lstrip("0") or "0"}'
+                        for (path, slash, _), number in zip(parts, numbers, strict=True))
         each = list(zip(cameras, counted, strict=True))
         if all(0 < len(one) <= _DIGITS for one in numbers) and len({*each}) == len(each) and (
                 len(_count_unpaired(counted, names)) < len(own)):

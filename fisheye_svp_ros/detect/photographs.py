@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -66,15 +67,16 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
     """Yield the photographs of files, folders, videos and rosbag2 recordings, in their order.
 
     Subfolders such as left/ and right/, file names that begin so, or topics in such namespaces are
-    the cameras of a rig; equal file names, and equal stamps, are the same instant.  every: take
-    one of so many.
+    the cameras of a rig; equal file names, and equal stamps, are the same instant, file names in
+    one of the paths alone.  every: take one of so many.
     Raises ObservationError for a path without any.
     """
-    for path in map(Path, paths):
+    for place, path in enumerate(map(Path, paths)):
         number = -1
         for number, photograph in enumerate(_source(path)):
             if number % every == 0:
-                yield photograph
+                yield photograph if len(paths) < 2 else replace(
+                    photograph, key=f'{place}/{photograph.key}')
         if number < 0:
             raise ObservationError(f'{path}: it and its folders hold no photograph; images are '
                                    f'{" ".join(IMAGES)}')
@@ -97,6 +99,11 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
     say; and files called after cameras are those of one where others are called otherwise.
     """
     given = [*map(Path, paths)]
+    names = {folder: {p.stem for p in _images(folder)} for folder in given if folder.is_dir()}
+    for before, after in itertools.pairwise(names):
+        if names[before] & names[after]:
+            yield (f'{before}, {after}: photographs of equal names are different frames of one '
+                   'camera; for the cameras of a rig give the folder above')
     for folder in given:
         if not folder.is_dir() or is_recording(folder):
             continue

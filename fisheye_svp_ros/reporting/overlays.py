@@ -29,7 +29,7 @@ def write_overlays(photographs: Iterable[Photograph], detection: Detection, fold
             pixels = photograph.pixels()
         except FisheyeSvpError:
             continue
-        name = '_'.join(filter(None, (searched.camera, photograph.key)))
+        name = '_'.join(filter(None, (searched.camera, photograph.key.replace('/', '_'))))
         drawn = cv2.imencode('.png', _overlay(np.asarray(pixels), searched))[1]
         write_bytes(folder / f'{name}.png', drawn.tobytes())
 

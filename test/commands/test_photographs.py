@@ -72,6 +72,26 @@ def test_detect_then_calibrate(
     assert lens.parameters['e0'] == pytest.approx(0.003, abs=5e-4)
 
 
+def test_equal_names_in_two_folders_are_different_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = poses(5, 8)
+    for name, views in (('first', (0, 1)), ('second', (2, 3))):
+        write(tmp_path / name, [photograph(where.take(i), seed=i) for i in views])
+    folders, out = [str(tmp_path / name) for name in ('first', 'second')], tmp_path / 'o.csv'
+    assert cli.main(['detect', *folders, '--board', BOARD, '-o', str(out),
+                     '--overlays', str(tmp_path / 'overlays')]) == 0
+    assert (f'{folders[0]}, {folders[1]}: photographs of equal names are different frames of one '
+            'camera; for the cameras of a rig give the folder above') in capsys.readouterr().err
+    assert len(read_observations(out).frames) == 4  # refused, where a landmark is twice in a frame
+    assert len([*(tmp_path / 'overlays').iterdir()]) == 5
+    # In one folder they would be one frame.
+    cv2.imwrite(str(tmp_path / 'first' / '00.bmp'), photograph(where.take(4), seed=4))
+    assert cli.main(['detect', folders[0], '--board', BOARD, '-o', str(out)]) == 0
+    assert '00.png: the same frame as ' in capsys.readouterr().err
+    assert len(read_observations(out).frames) == 2
+
+
 def test_images_in_a_subfolder_beside_photographs_are_told(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

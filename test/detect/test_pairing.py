@@ -44,6 +44,10 @@ def test_by_name_or_else_by_number() -> None:
     assert paired(['left01', 'left2'], ['right001', 'right003']) == (
         'number', [('left01', 'right001')], 2)
     assert paired(['a', 'b'], ['c', 'd']) == ('name', [], 4)
+    # Of two paths
+    assert paired(['0/left01', '1/left01'], ['0/right1', '1/right2']) == (
+        'number', [('0/left01', '0/right1')], 2)
+    assert paired(['0/a', '1/a'], ['0/c', '1/d']) == ('name', [], 4)
     assert paired(['x1_1', 'x2_1'], ['y1_1', 'y2_2']) == ('name', [], 4)  # 1 counts nothing
 
 
