@@ -23,6 +23,7 @@ from fisheye_svp_ros.io.poses_csv import FramePoses, pose_columns
 from fisheye_svp_ros.io.readers import read_observations, read_poses
 from fisheye_svp_ros.io.result_files import Columns, Result
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.library_checks import check_list, check_pose, check_size
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
@@ -263,7 +264,7 @@ def localize(
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
     """
-    table, known = _table(observations), load_lens(lens)
+    table, known = table_of(observations), load_lens(lens)
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
         from fisheye_svp_ros.study.pose_errors import localize_with_errors
@@ -288,10 +289,13 @@ def calibrate(
 ) -> Calibrated:
     """Fit a lens to image points of known targets, see `solve.lens_calibration.calibrate`.
 
+    image_size: width, height, px; free: names of what is fitted, all by default.
     Outliers are rejected, and standard errors are honest, as those of the command.
     poses: of the flange of a robot that carried the camera; `calibration` of the lens has
     `hand_eye` then, where the camera sits in it.
     progress: called with each stage and the share that is done.
+    Raises LensError for an unknown model or parameter, ParameterError for an image size that is
+    none, ObservationError or GeometryError where the data do not fix a lens.
     """
     from fisheye_svp_ros.study.lens_trust import (
         assess_lens,
@@ -299,10 +303,11 @@ def calibrate(
         with_covariance,
     )
 
+    size = check_size(image_size, 'image_size')
     progress('fitting the lens', 0.0)
     found, kept, _ = calibrate_without_outliers(
-        _table(observations),
-        lambda rows: lens_calibration.calibrate(rows, model, image_size, free, name))
+        table_of(observations),
+        lambda rows: lens_calibration.calibrate(rows, model, size, free, name))
     if poses is not None:
         found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
     adjusted = found.adjusted
@@ -320,7 +325,7 @@ def calibrate_stereo(
 
     Raises ObservationError for a missing camera, GeometryError where the views fix no rig.
     """
-    table = _table(observations)
+    table = table_of(observations)
     views = stereo_views(table)
     found = stereo_calibration.calibrate_stereo(*_models(left, right), *views)
     residual = np.concatenate([found.left_residual, found.right_residual])
@@ -344,7 +349,8 @@ def stereo_depth(
     Raises ObservationError for a missing camera, LensError for a lens that does not know its
     errors.
     """
-    one, other = stereo_views(_table(observations))
+    rig = check_pose(rig, 'rig')
+    one, other = stereo_views(table_of(observations))
     both = one.used & other.used
     known = (*_models(left, right), rig, one.uv[both], other.uv[both])
     solved = triangulate(*known)
@@ -383,7 +389,8 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     stereo_depth.
     Raises ParameterError for an unknown parameter or a value that is not allowed.
     """
-    swept = {f'{SWEEP}{name}': list(values) for name, values in over.items()}
+    swept = {f'{SWEEP}{name}': check_list(values, f'over[{name!r}]')
+             for name, values in over.items()}
     parameters = {**nodes, sweeps.CAMERA: {**nodes.get(sweeps.CAMERA, {}), **swept}}
     for node, values in parameters.items():
         _check_names(node, values)
@@ -409,8 +416,8 @@ def diagnose(
     from fisheye_svp_ros.solve.measured_poses import posable_observations, poses_by_frame
 
     known = load_lens(lens)
-    table, _ = posable_observations(_table(observations), known)
-    test = None if held_out is None else posable_observations(_table(held_out), known)[0]
+    table, _ = posable_observations(table_of(observations), known)
+    test = None if held_out is None else posable_observations(table_of(held_out), known)[0]
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
     found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
                         poses=given, progress=progress)
@@ -442,7 +449,8 @@ def undistort_maps(
     Raises ParameterError for what no such camera has.
     """
     lens = load_lens(lens)
-    return Rectification(lens, camera_for([lens], projection, size, field_of_view), range_m)
+    view = _check_view(size, field_of_view)
+    return Rectification(lens, camera_for([lens], projection, *view), range_m)
 
 
 def rectify_maps(
@@ -458,8 +466,17 @@ def rectify_maps(
     side by side.
     """
     lenses = load_lens(left), load_lens(right)
-    camera = camera_for(lenses, projection, size, field_of_view, along_baseline=True)
-    return rectify_pair(*lenses, rig, camera, range_m)
+    view = _check_view(size, field_of_view)
+    camera = camera_for(lenses, projection, *view, along_baseline=True)
+    return rectify_pair(*lenses, check_pose(rig, 'rig'), camera, range_m)
+
+
+def _check_view(
+    size: tuple[int, int] | None, field_of_view: float | None
+) -> tuple[tuple[int, int] | None, float | None]:
+    if field_of_view is not None and field_of_view > 2 * np.pi:
+        raise ParameterError(f'field_of_view is {field_of_view!r}; rad are needed')
+    return None if size is None else check_size(size, 'size'), field_of_view
 
 
 def _check_names(node: str, values: Mapping[str, Any]) -> None:
@@ -473,7 +490,14 @@ def _check_names(node: str, values: Mapping[str, Any]) -> None:
                                  f'{", ".join(known)}')
 
 
-def _table(given: AnyObservations) -> Observations:
+def table_of(given: AnyObservations) -> Observations:
+    """Return a table of observations, read where a path is given.
+
+    Raises ParameterError for what is neither.
+    """
+    if not isinstance(given, Observations | str | Path):
+        raise ParameterError(f'observations are of type {type(given).__name__}; a table or a path '
+                             'is needed')
     return given if isinstance(given, Observations) else read_observations(given)
 
 

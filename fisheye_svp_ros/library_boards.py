@@ -14,6 +14,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.library import AnyLens, load_lens, save_lens
+from fisheye_svp_ros.library_checks import check_above, check_pair, check_pose
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
@@ -27,18 +28,29 @@ def observations(
     """Return a table of image points u, v (N,), px, of landmarks (N,).
 
     board: as in `--board`, or places (L, 3), m, of landmarks 0 to L - 1; frame (N,).
-    Raises ParameterError for arrays of different lengths and for landmarks that are not there.
+    Raises ParameterError for arrays of different lengths, image points that are not finite, and
+    landmarks that are not there or twice in a frame.
     """
     places = parse_pattern(board).points if isinstance(board, str) else np.asarray(board, float)
     columns = np.broadcast_arrays(*map(np.atleast_1d, (u, v, landmark, frame))) if len(
         {np.size(column) for column in (u, v, landmark)}) == 1 else []
     if not columns or places.shape[1:] != (3,):
         raise ParameterError('u, v and landmark must have one length, places the shape (L, 3)')
-    number = np.asarray(columns[2], dtype=np.int64)
+    if not np.isfinite(np.array(columns[:2], dtype=float)).all():
+        raise ParameterError('u and v must be finite; leave out what was not seen')
+    number, frames = _whole_numbers(columns[2], 'landmark'), _whole_numbers(columns[3], 'frame')
+    if len(np.unique(np.stack([frames, number]), axis=1).T) < len(number):
+        raise ParameterError('a landmark is twice in a frame; frame (N,) says which photograph')
     if number.min(initial=0) < 0 or number.max(initial=0) >= len(places):
         raise ParameterError(f'landmarks are 0 to {len(places) - 1}; there is {number.max()}')
-    return make_observations(np.asarray(columns[3], dtype=np.int64), number,
-                             np.stack(columns[:2], axis=-1), places[number])
+    return make_observations(frames, number, np.stack(columns[:2], axis=-1), places[number])
+
+
+def _whole_numbers(values: Array, name: str) -> Index:
+    whole = np.asarray(values).astype(np.int64)
+    if (whole != values).any():
+        raise ParameterError(f'{name} must be whole numbers')
+    return whole
 
 
 def render(
@@ -47,7 +59,7 @@ def render(
     """Return a photograph (H, W) of a chessboard by a lens with its viewpoint shift.
 
     pose: one, of the camera in the board's frame; noise: grey levels, rms.
-    Raises ParameterError for another board.
+    Raises ParameterError for another board, several poses or a negative noise.
     """
     from fisheye_svp_ros.simulate.render import Exposure, Print
     from fisheye_svp_ros.simulate.render import render as expose
@@ -55,6 +67,9 @@ def render(
     pattern = parse_pattern(board)
     if pattern.kind != 'chessboard':
         raise ParameterError(f'board {board!r}: only chessboards can be rendered')
+    pose = check_pose(pose, 'pose')
+    if not noise >= 0:
+        raise ParameterError(f'noise is {noise!r}; 0 or more grey levels are needed')
     printed = Print(pattern.columns, pattern.rows, pattern.size)
     return expose(load_lens(lens), printed, pose, Exposure(noise=noise),
                   np.random.default_rng(seed))
@@ -67,13 +82,20 @@ def plan(
     """Return which photographs to take of a board, as the command does.
 
     room: nearest and furthest distance, m; number: the parameter that matters most, None for the
-    lens as a whole.
+    lens as a whole; noise_px: standard deviation of u and of v of a corner.
+    Raises ParameterError for a room, count or noise that cannot be.
     """
     from fisheye_svp_ros.planning.optimal_design import ViewLimits
     from fisheye_svp_ros.planning.plan import plan as choose
 
-    return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(*room), count, number,
-                  noise_px)
+    near, far = check_pair(room, 'room', '(nearest, furthest) in m')
+    if not 0 < near < far < np.inf:
+        raise ParameterError(f'room is {room!r}; two distances above 0, m, are needed, the nearer '
+                             'first')
+    check_above(count, 0, 'count')
+    check_above(noise_px, 0, 'noise_px', ' px')
+    return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(near, far), count,
+                  number, noise_px)
 
 
 def write_lens(lens: AnyLens, path: str | Path, form: str = '') -> None:

@@ -5,14 +5,19 @@ A notebook shows it; `figure.savefig('picture.png')` writes it.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from matplotlib.figure import Figure
 
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.io.readers import read_observations
-from fisheye_svp_ros.library import AnyLens, AnyObservations, Budgeted, load_lens, localize
+from fisheye_svp_ros.library import (
+    AnyLens,
+    AnyObservations,
+    Budgeted,
+    load_lens,
+    localize,
+    table_of,
+)
+from fisheye_svp_ros.library_checks import check_type
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
 from fisheye_svp_ros.solve.measured_poses import rms_px
 
@@ -22,7 +27,12 @@ _UNITS = {'position': (1e3, 'mm'), 'axis': (180 / np.pi, 'deg'), 'depth': (1e3, 
 
 
 def plot_lens(*lenses: AnyLens) -> Figure:
-    """Draw image height (px) and viewpoint shift (mm) of lenses over the incidence angle."""
+    """Draw image height (px) and viewpoint shift (mm) of lenses over the incidence angle.
+
+    Raises ParameterError without a lens.
+    """
+    if not lenses:
+        raise ParameterError('no lens to draw; give at least one')
     figure = Figure(figsize=(10, 4), layout='constrained')
     height, shift = figure.subplots(1, 2)
     for lens in map(load_lens, lenses):
@@ -44,9 +54,7 @@ def plot_residuals(observations: AnyObservations, lens: AnyLens) -> Figure:
 
     Outliers are not drawn.  Raises what `localize` raises.
     """
-    lens = load_lens(lens)
-    table = observations if not isinstance(observations, str | Path) else read_observations(
-        observations)
+    table, lens = table_of(observations), load_lens(lens)
     residual = localize(table, lens).residual
     used = np.isfinite(residual).all(axis=1)
     figure = Figure(figsize=(8, 1 + 8 * lens.height / lens.width), layout='constrained')
@@ -65,6 +73,7 @@ def plot_budget(budget: Budgeted, quantity: str = 'position') -> Figure:
     quantity: position, axis, residual, epipolar or depth.
     Raises ParameterError for another one.
     """
+    check_type(budget, Budgeted, 'budget', 'the result of fsvp.budget')
     if quantity not in budget.error:
         raise ParameterError(f'{quantity!r} is no quantity of a budget; known are '
                              f'{", ".join(budget.error)}')

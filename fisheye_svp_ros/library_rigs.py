@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from fisheye_svp_ros.errors import ObservationError
-from fisheye_svp_ros.io.readers import read_observations
 from fisheye_svp_ros.io.rig_files import load_cameras
-from fisheye_svp_ros.library import AnyLens, AnyObservations, load_lens
+from fisheye_svp_ros.library import AnyLens, AnyObservations, load_lens, table_of
+from fisheye_svp_ros.library_checks import check_type
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -60,8 +60,8 @@ def localize_rig(
 def _inputs(
     observations: AnyObservations, lenses: Mapping[str, AnyLens]
 ) -> tuple[Observations, dict[str, Lens]]:
-    table = observations if isinstance(observations, Observations) else (
-        read_observations(str(observations)))
+    table = table_of(observations)
+    check_type(lenses, Mapping, 'lenses', 'a mapping of cameras to lenses')
     return table, rig_lenses(table, {name: load_lens(lens) for name, lens in lenses.items()})
 
 

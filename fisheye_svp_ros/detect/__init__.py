@@ -32,15 +32,27 @@ class _CallablePackage(ModuleType):
         board: as in `--board`; every: take one of so many; sync: largest difference, s, of the
         stamps of one moment of a rig.  The result has `observations` and `searched`.
         Raises ObservationError where no photograph shows the board, ParameterError for a board
-        that cannot be.
+        that cannot be, and for a detector that does not find it.
         """
         from fisheye_svp_ros.detect.detection import detect
+        from fisheye_svp_ros.detect.finders import DETECTORS
         from fisheye_svp_ros.detect.patterns import parse_pattern
         from fisheye_svp_ros.detect.photographs import find_photographs
+        from fisheye_svp_ros.errors import ParameterError
 
         given = [photographs] if isinstance(photographs, str | Path) else photographs
-        paths = [str(path) for path in given]
-        return detect(find_photographs(paths, every), parse_pattern(board), detector,
+        paths, pattern = [str(path) for path in given], parse_pattern(str(board))
+        able = [name for name, (kinds, _) in DETECTORS.items() if pattern.kind in kinds]
+        if detector and detector not in able:
+            raise ParameterError(f'detector {detector!r} does not find {pattern.spec}; take one '
+                                 f'of {", ".join(able)}')
+        if not paths:
+            raise ParameterError('no photographs; give at least one file or folder')
+        if every < 1:
+            raise ParameterError(f'every is {every}; 1 or more is needed')
+        if sync is not None and (isinstance(sync, str) or not sync >= 0):
+            raise ParameterError(f'sync is {sync!r}; seconds are needed, 0 or more')
+        return detect(find_photographs(paths, every), pattern, detector,
                       source=', '.join(paths), sync=sync)
 
 

@@ -1,0 +1,71 @@
+"""What the library refuses: one line that names the argument and what is needed, no traceback."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from helpers.photographs import BOARD, LENS, poses, true_corners
+
+import fisheye_svp_ros as fsvp
+
+TABLE = fsvp.observations(*true_corners(poses(4).take(0)).T, np.arange(30), BOARD)
+RIG = fsvp.rig('parallel')
+ROOM = (0.1, 0.3)
+
+
+@pytest.mark.parametrize(('call', 'said'), [
+    (lambda: fsvp.detect('.', BOARD, detector='zzz'), "detector 'zzz' does not find chessboard"),
+    (lambda: fsvp.detect('.', BOARD, detector='circles'), 'take one of saddle, quick, sb, cl'),
+    (lambda: fsvp.detect('.', 3), "board '3': known kinds are chessboard"),
+    (lambda: fsvp.detect([], BOARD), 'no photographs; give at least one'),
+    (lambda: fsvp.detect('.', BOARD, every=0), 'every is 0; 1 or more is needed'),
+    (lambda: fsvp.detect('.', BOARD, sync=-1), 'sync is -1; seconds are needed'),
+    (lambda: fsvp.detect('.', BOARD, sync='5ms'), "sync is '5ms'; seconds are needed"),
+    (lambda: fsvp.calibrate(TABLE, 'equidistant', '424x400'),
+     "image_size is '424x400'; (width, height) in whole px is needed"),
+    (lambda: fsvp.calibrate(TABLE, 'equidistant', (424,)), 'image_size is (424,); (width, '),
+    (lambda: fsvp.calibrate(TABLE, 'equidistant', (424.5, 400)), 'image_size is (424.5, 400)'),
+    (lambda: fsvp.calibrate([1, 2], 'equidistant', (424, 400)),
+     'observations are of type list; a table or a path is needed'),
+    (lambda: fsvp.localize(LENS, TABLE), 'observations are of type Lens; a table or a path'),
+    (lambda: fsvp.plan(LENS, BOARD, 0.3), 'room is 0.3; (nearest, furthest) in m is needed'),
+    (lambda: fsvp.plan(LENS, BOARD, (0.3, 0.1)), 'room is (0.3, 0.1); two distances above 0, m'),
+    (lambda: fsvp.plan(LENS, BOARD, (-1, 0.1)), 'room is (-1, 0.1); two distances above 0'),
+    (lambda: fsvp.plan(LENS, BOARD, ROOM, count=0), 'count is 0; a number above 0 is needed'),
+    (lambda: fsvp.plan(LENS, BOARD, ROOM, noise_px=-1), 'noise_px is -1; a number above 0 px is'),
+    (lambda: fsvp.render(LENS, BOARD, None), 'pose is of type NoneType; a Pose is needed'),
+    (lambda: fsvp.render(LENS, BOARD, poses(4)), 'pose holds 4 poses; one is needed'),
+    (lambda: fsvp.render(LENS, BOARD, poses(4).take(0), noise=-1), 'noise is -1; 0 or more grey'),
+    (lambda: fsvp.undistort_maps(LENS, size=(10,)), 'size is (10,); (width, height) in whole px'),
+    (lambda: fsvp.undistort_maps(LENS, size='4x4'), "size is '4x4'; (width, height) in whole px"),
+    (lambda: fsvp.undistort_maps(LENS, field_of_view=120), 'field_of_view is 120; rad are needed'),
+    (lambda: fsvp.rectify_maps(LENS, LENS, 'rig.yaml'), 'rig is of type str; a Pose is needed'),
+    (lambda: fsvp.stereo_depth(TABLE, LENS, LENS, None), 'rig is of type NoneType; a Pose is'),
+    (lambda: fsvp.plot_lens(), 'no lens to draw; give at least one'),
+    (lambda: fsvp.plot_budget(None), 'budget is of type NoneType; the result of fsvp.budget'),
+    (lambda: fsvp.plot_residuals(LENS, TABLE), 'observations are of type Lens; a table or a path'),
+    (lambda: fsvp.sweep({'radius': 0.5}), "over['radius'] is 0.5; a list of values is needed"),
+    (lambda: fsvp.sweep({'style': 'mono'}), "over['style'] is 'mono'; a list of values is needed"),
+    (lambda: fsvp.calibrate_rig(TABLE, [LENS, LENS]), 'lenses is of type list; a mapping of cam'),
+    (lambda: fsvp.observations([1.0], [np.nan], [0], BOARD), 'u and v must be finite; leave out'),
+    (lambda: fsvp.observations([1.0], [2.0], [0.5], BOARD), 'landmark must be whole numbers'),
+    (lambda: fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD), 'a landmark is twice in a fr'),
+])
+def test_what_is_wrong_is_named(call: Callable[[], Any], said: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        with pytest.raises(fsvp.FisheyeSvpError, match=re.escape(said)) as error:
+            call()
+    assert '\n' not in str(error.value)
+
+
+def test_what_is_near_is_taken() -> None:
+    """Arrays in place of tuples and lists, and the same landmark in two frames."""
+    assert len(fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD, frame=[0, 1])) == 2
+    assert fsvp.undistort_maps(LENS, size=np.array([40, 30])).maps.u.shape == (30, 40)
+    assert len(fsvp.sweep({'radius': np.array([0.5, 1.0])}).table()['radius']) == 2
