@@ -5,7 +5,7 @@ Held-out residuals, shares of variance, errors of parameters, gains with their i
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -29,12 +29,17 @@ from fisheye_svp_ros.diagnosis.effect_tests import EffectTests
 from fisheye_svp_ros.diagnosis.fitted_model import FittedModel, PredictedOffsets
 from fisheye_svp_ros.diagnosis.frame_blocks import refuting_blocks
 from fisheye_svp_ros.diagnosis.held_out_data import HeldOutData, valid_state
-from fisheye_svp_ros.diagnosis.image_fields import CameraField, WrittenField
+from fisheye_svp_ros.diagnosis.image_fields import WrittenField
 from fisheye_svp_ros.diagnosis.lens_errors import stated_parameters
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
-from fisheye_svp_ros.diagnosis.uncertainty import standard_errors, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import (
+    OtherModel,
+    likely_models,
+    standard_errors,
+    total_errors,
+)
 from fisheye_svp_ros.diagnosis.variance_budget import (
     Component,
     cause_squares,
@@ -43,7 +48,6 @@ from fisheye_svp_ros.diagnosis.variance_budget import (
     variance_budget,
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.rig_state import (
     Linearization,
@@ -150,13 +154,20 @@ class Evaluation:
         return self.model_errors.summary(self.written_model)
 
     @cached_property
+    def other_models(self) -> list[OtherModel]:
+        """Other likely models; none of them with a shift that is averaged over."""
+        if self.selection.problem.options.quick:
+            return []
+        return likely_models(self.null, self.averaged_model.kinds)
+
+    @cached_property
     def errors(self) -> Array:
         """Standard errors of all that is shared."""
-        return self._errors_of(self.null)
+        return self._errors_of(self.null, None if self.averaged_model.kinds else self.other_models)
 
-    def _errors_of(self, null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
+    def _errors_of(self, null: NullModel, models: list[OtherModel] | None = None) -> Array:
         return (standard_errors(null, jackknife=False) if self.selection.problem.options.quick
-                else total_errors(null, averaged_kinds))
+                else total_errors(null, models))
 
     def predict(
         self, without: Sequence[str] = (), offsets: PredictedOffsets | None = None
@@ -249,39 +260,6 @@ class Evaluation:
         """Whether the rms of the fitted frames falls from base to named to extended."""
         sizes = [self.base_quality.rms_px, self.named_quality.rms_px, self.extended_quality.rms_px]
         return all(after <= MAX_RMS_RATIO * before for before, after in pairwise(sizes))
-
-    @cached_property
-    def _errors_without_shifts(self) -> Array:
-        """Standard errors (K,) without those of the shifts that are averaged over."""
-        kinds = self.averaged_model.kinds
-        return self._errors_of(self.null, kinds) if kinds else self.errors
-
-    @cached_property
-    def covariance(self) -> Array:
-        """Covariance (N, N) of what is shared in the model whose lens is written."""
-        larger = self._error_ratios
-        return self.averaged_model.widen(self._least_covariance * np.outer(larger, larger))
-
-    @cached_property
-    def _least_covariance(self) -> Array:
-        """Covariance (K, K) of what is shared beside the random effects, by this model alone."""
-        own = self.null.included_columns
-        inverse, _ = pseudo_inverse(self.null.information[np.ix_(own, own)], 1e-13)
-        return np.asarray(inverse / np.outer(self.null.scale[own], self.null.scale[own]))
-
-    @cached_property
-    def _error_ratios(self) -> Array:
-        """By how much (K,) standard errors are larger than that: other likely models."""
-        known = np.sqrt(np.diag(self._least_covariance))
-        larger = np.nan_to_num(self._errors_without_shifts) / np.maximum(known, 1e-300)
-        return np.where(known > 0, np.maximum(larger, 1.0), 0.0)
-
-    def field_covariance(self, known: CameraField) -> tuple[Array, Array]:
-        """Return the covariance (2 Q, 2 Q), px^2, of a field; with what is shared (N, 2 Q)."""
-        cross = np.zeros((len(self.covariance), len(known.root)))
-        cross[self.averaged_model.place] = (
-            self._error_ratios[:, None] * known.shared @ known.root.T)
-        return known.root @ known.root.T, cross
 
     @cached_property
     def base_quality(self) -> FitQuality:
@@ -385,8 +363,8 @@ class Evaluation:
             return {}
         selection = self.selection
         written = self.averaged_model
-        after = dict(zip(shared_names(written.linear),
-                         written.widen_errors(self._errors_without_shifts), strict=True))
+        errors = written.widen_errors(self._errors_of(self.null, self.other_models))
+        after = dict(zip(shared_names(written.linear), errors, strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = self._errors_of(selection.first)
         rig = _count_rig_columns(selection.first, self.free)

@@ -18,6 +18,8 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
 )
 from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
+from fisheye_svp_ros.diagnosis.image_fields import WrittenField
+from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
 from fisheye_svp_ros.diagnosis.lens_errors import InAir, stated_parameters
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.effects.base import Effect
@@ -174,18 +176,18 @@ def find_lens_rays(
     """
     if evaluation.medium is not None:
         return LensRays({}, None)
-    linear = evaluation.averaged_model.linear
-    before, views = lenses_of(evaluation.simulation.state), linear.data.views
+    known, written = LensCovariance.from_evaluation(evaluation), evaluation.written_field
+    before, views = lenses_of(evaluation.simulation.state), known.linear.data.views
     errors, offsets, asked = {}, [], evaluation.selection.problem.options.range_m
     for number, (name, given) in enumerate(lenses.items()):
         mine = views.used & ((views.camera == number) | (len(lenses) == 1))[:, None]
         uv = typical_points(views.uv[mine])
-        model, there = _written_rays(evaluation, lenses_of, number, name, uv)
+        model, there = _written_rays(known, written, lenses_of, number, name, uv)
         off = _difference(model, points_on_rays(given, uv[there]))
         errors[name] = {'given': model.errors(off), 'extended': model.errors()}
         if asked is not None and asked not in RANGES:
             wider, near = _written_rays(
-                evaluation, lenses_of, number, name, uv, (*RANGES, asked))
+                known, written, lenses_of, number, name, uv, (*RANGES, asked))
             more = _difference(wider, points_on_rays(given, uv[near], wider.ranges))
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
@@ -196,11 +198,11 @@ def find_lens_rays(
 
 
 def _written_rays(
-    evaluation: Evaluation, lenses_of: LensesOf, camera: int, name: str, uv: Array,
-    ranges: tuple[float, ...] = RANGES,
+    known: LensCovariance, written: WrittenField | None, lenses_of: LensesOf, camera: int,
+    name: str, uv: Array, ranges: tuple[float, ...] = RANGES,
 ) -> tuple[RayModel, Mask]:
     """Return the rays of the lens of a camera that is written, and which points (G,) have some."""
-    linear, written = evaluation.averaged_model.linear, evaluation.written_field
+    linear = known.linear
     of_lens, frames = lens_columns(linear), np.zeros((linear.data.frames, 6))
 
     def extend_lens(step: Array) -> Lens:
@@ -210,14 +212,14 @@ def _written_rays(
         return lens if written is None else written.add_to(lens, camera)
 
     model, there = ray_model(
-        extend_lens, evaluation.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
-    known = None if written is None else written.fields.get(camera)
-    if known is None:
+        extend_lens, known.covariance[np.ix_(of_lens, of_lens)], uv, ranges)
+    field = None if written is None else written.fields.get(camera)
+    if field is None:
         return model, there
-    covariance, cross = evaluation.field_covariance(known)
+    covariance, cross = known.with_field(field)
     lens = extend_lens(np.zeros(int(of_lens.sum())))
     return model.with_field(
-        lens, uv[there], known.bumps_at(uv[there]), covariance, cross[of_lens]), there
+        lens, uv[there], field.bumps_at(uv[there]), covariance, cross[of_lens]), there
 
 
 def _difference(model: RayModel, points: Array) -> Array:

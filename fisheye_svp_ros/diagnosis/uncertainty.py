@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -22,12 +22,21 @@ _MIN_FRAMES = 3
 _ODDS_WINDOW = 6.0  # of the criterion: odds of 20, beyond which a model counts for nothing
 
 
-def total_errors(null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
+class OtherModel(NamedTuple):
+    """A model: its criterion beside the chosen one, its columns, kinds of what differs."""
+
+    criterion: float
+    included: Index
+    kinds: frozenset[str]
+
+
+def total_errors(null: NullModel, models: Sequence[OtherModel] | None = None) -> Array:
     """Return the standard errors (K,) of all that is shared, other likely models allowed for.
 
-    averaged_kinds: kinds of effects whose share in these is counted elsewhere.
+    models: the likely ones, where they are known already.
     """
-    parts = standard_errors(null), field_uncertainty(null), model_uncertainty(null, averaged_kinds)
+    models = likely_models(null) if models is None else models
+    parts = standard_errors(null), field_uncertainty(null), model_uncertainty(null, models)
     return np.asarray(np.sqrt(np.square(parts).sum(axis=0)))
 
 
@@ -41,13 +50,14 @@ def standard_errors(null: NullModel, jackknife: bool = True) -> Array:
     NaN where the data leave a parameter open.
     """
     own, reported = null.included_columns, _reporting_matrix(null)
-    estimate, variance, open_ = _estimate(null.information, own, reported)
+    estimate, covariance, open_ = _estimate(null.information, own, reported)
+    variance = np.diag(covariance).copy()
     if jackknife and null.linear.data.frames > 2:
         changed, allowed = np.zeros(null.column_count), np.zeros(null.column_count)
         for part in null.information_without_poses(np.append(own, len(null.scale))):
             other, wider, lost = _estimate(part, own, reported)
             changed += np.where(lost, 0.0, (other - estimate) ** 2)
-            allowed += np.where(lost, 0.0, wider - variance)
+            allowed += np.where(lost, 0.0, np.diag(wider - covariance))
         least = np.maximum(1e-9 * variance, 1e-300)  # nothing is known of what the data leave open
         variance = variance * np.maximum(changed / np.maximum(allowed, least), 1.0)
     errors = np.sqrt(variance) / null.scale[: null.column_count]
@@ -67,15 +77,15 @@ def _reporting_matrix(null: NullModel) -> Array:
 def _estimate(
     information: Array, included: Index, reported: Array
 ) -> tuple[Array, Array, Array]:
-    """Return estimates (K,) and variances of what is included, normalised, and what is open."""
+    """Return estimates (K,), covariance (K, K) of what is included, normalised, what is open."""
     if not len(included):
-        return np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool)
+        return np.zeros(0), np.zeros((0, 0)), np.zeros(0, dtype=bool)
     values, vectors = np.linalg.eigh(information[np.ix_(included, included)])
     kept = values > 1e-12 * max(float(values[-1]), 1e-300)
     seen = reported[np.ix_(included, included)] @ vectors
     estimate = seen[:, kept] @ (vectors[:, kept].T @ information[included, -1] / values[kept])
-    variance = (seen[:, kept]**2 / values[kept]).sum(axis=1)
-    return estimate, variance, np.asarray((seen[:, ~kept] ** 2).sum(axis=1) > 1e-6)
+    covariance = (seen[:, kept] / values[kept]) @ seen[:, kept].T
+    return estimate, covariance, np.asarray((seen[:, ~kept] ** 2).sum(axis=1) > 1e-6)
 
 
 def field_uncertainty(null: NullModel) -> Array:
@@ -87,7 +97,7 @@ def field_uncertainty(null: NullModel) -> Array:
     """
     own, reported = null.included_columns, _reporting_matrix(null)
     freedom = null.freedom
-    estimate, variance, _ = _estimate(null.information, own, reported)
+    estimate, covariance, _ = _estimate(null.information, own, reported)
     likelihoods, more = [], []
     for logs, information in null.field_alternatives:
         noise = null.remaining_information(information, own)[-1, -1] / freedom
@@ -95,12 +105,12 @@ def field_uncertainty(null: NullModel) -> Array:
         determinant = np.log(np.maximum(values, 1e-12)).sum()
         likelihoods.append(-(logs + determinant + freedom * np.log(noise)) / 2)
         other, wider, _ = _estimate(information / noise, own, reported)
-        more.append(wider - variance + (other - estimate) ** 2)
+        more.append(np.diag(wider - covariance) + (other - estimate) ** 2)
     added = np.maximum(special.softmax(likelihoods) @ np.array(more), 0.0)
     return np.asarray(np.sqrt(added) / null.scale[: null.column_count])
 
 
-def model_uncertainty(null: NullModel, averaged_kinds: Collection[str] = ()) -> Array:
+def model_uncertainty(null: NullModel, models: Sequence[OtherModel]) -> Array:
     """Return what other models, likely too, add to standard errors (K,) of what is shared.
 
     Each model with more effects, or with another effect in the place of one, is as probable as its
@@ -108,28 +118,71 @@ def model_uncertainty(null: NullModel, averaged_kinds: Collection[str] = ()) -> 
     and of the square of the change.  Beside a further form of an effect or one that does nearly
     the same, or without it, its parameters mean something else: for them that model does not
     count.  What is added is hardly larger than large, however little the data say of it.
-    averaged_kinds: kinds of effects that are added to none.
     """
-    own, information, reported = null.column_count, null.information, _reporting_matrix(null)
-    prior = np.zeros(len(information))
-    for form, effect in enumerate(null.fixed.forms.effects):
-        prior[null.form_columns(form)] = null.prior_precision(null.form_columns(form), effect)
-    estimate, variance, _ = _estimate(information, np.arange(own), reported)
-    models = _likely_models(null, averaged_kinds)
-    weights = special.softmax([one.criterion / 2 for one in models])
-    added = np.zeros(own)
-    for weight, one in zip(weights, models, strict=True):
+    own, reported = null.column_count, _reporting_matrix(null)
+    estimate, covariance, _ = _estimate(null.information, np.arange(own), reported)
+    added, prior = np.zeros(own), _prior_information(null)
+    for weight, one in zip(model_weights(models), models, strict=True):
         there = one.included < own
         at, more = one.included[there], np.zeros(own)
-        other, wider, _ = _estimate(
-            null.restrict_information(information, at) + np.diag(prior), one.included, reported)
+        other, wider = _fit_other(null, one, reported, prior)
         change = other[there] - estimate[at]
-        more[at] = np.maximum(wider[there] - variance[at], 0.0) + change**2
+        more[at] = np.maximum(np.diag(wider)[there] - np.diag(covariance)[at], 0.0) + change**2
         for effect, columns, _ in null.terms:
             if one.kinds & _effect_family(effect):
                 more[columns] = 0.0
         added += weight * more
     return np.asarray(np.sqrt(added) / null.scale[:own])
+
+
+def model_covariance(null: NullModel, models: Sequence[OtherModel], into: Array) -> Array:
+    """Return what other likely models add to the covariance (N, N) of a richer model's parameters.
+
+    into (N, X): makes them of the coefficients of all columns, normalised.  Unlike in
+    `model_uncertainty` every parameter counts, with what others do in its place: together they say
+    how far a prediction is off.
+    """
+    reported, own = np.eye(len(null.scale)), null.included_columns
+    prior = _prior_information(null)
+    for form, effect in enumerate(null.fixed.forms.effects):
+        at = null.form_columns(form)
+        prior[at, at] += null.physical_precision(at, effect)
+    size = np.maximum(np.abs(into).max(axis=1, initial=0.0), 1e-300)
+    into = into / size[:, None]
+    estimate, covariance, _ = _estimate(null.information, own, reported)
+    base, known = into[:, own] @ estimate, into[:, own] @ covariance @ into[:, own].T
+    added = np.zeros_like(known)
+    for weight, one in zip(model_weights(models), models, strict=True):
+        values, wider = _fit_other(null, one, reported, prior)
+        step = into[:, one.included]
+        sizes, vectors = np.linalg.eigh(step @ wider @ step.T - known)
+        change = step @ values - base
+        added += weight * (
+            (vectors * np.maximum(sizes, 0.0)) @ vectors.T + np.outer(change, change))
+    return np.asarray(added * np.outer(size, size))
+
+
+def model_weights(models: Sequence[OtherModel]) -> Array:
+    """Return how probable each of the models is."""
+    return np.asarray(special.softmax([one.criterion / 2 for one in models]))
+
+
+def _prior_information(null: NullModel) -> Array:
+    """Return the prior information (X, X), normalised, of effects that are not in the model."""
+    prior = np.zeros(len(null.information))
+    for form, effect in enumerate(null.fixed.forms.effects):
+        prior[null.form_columns(form)] = null.prior_precision(null.form_columns(form), effect)
+    return np.diag(prior)
+
+
+def _fit_other(
+    null: NullModel, one: OtherModel, reported: Array, prior: Array
+) -> tuple[Array, Array]:
+    """Return estimates (m,) and their covariance (m, m), normalised, by another model."""
+    at = one.included[one.included < null.column_count]
+    estimate, covariance, _ = _estimate(
+        null.restrict_information(null.information, at) + prior, one.included, reported)
+    return estimate, covariance
 
 
 def _log_odds(null: NullModel, score: Score) -> float:
@@ -147,21 +200,14 @@ def _is_likely(null: NullModel, least: float, score: Score) -> bool:
     return _log_odds(null, score) > least
 
 
-class _Model(NamedTuple):
-    """A model: its criterion beside the chosen one, its columns, kinds of what differs."""
-
-    criterion: float
-    included: Index
-    kinds: frozenset[str]
-
-
-def _likely_models(null: NullModel, averaged_kinds: Collection[str]) -> list[_Model]:
+def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list[OtherModel]:
     """Return the chosen model, those with an effect exchanged, and larger, likelier ones of each.
 
     The likeliest of those at hand is extended first, and so many are enough.
+    averaged_kinds: kinds of effects that are added to none.
     """
-    tests, found = EffectTests(null), dict[frozenset[int], _Model]()
-    waiting = {frozenset[int](): _Model(0.0, null.included_columns, frozenset())}
+    tests, found = EffectTests(null), dict[frozenset[int], OtherModel]()
+    waiting = {frozenset[int](): OtherModel(0.0, null.included_columns, frozenset())}
     waiting |= dict(_exchange_effects(null))
     while waiting and len(found) < _MAX_MODELS:
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
@@ -173,11 +219,11 @@ def _likely_models(null: NullModel, averaged_kinds: Collection[str]) -> list[_Mo
                 continue
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, null.form_columns(one.form)])
-                waiting[larger] = _Model(model.criterion + gain, columns, model.kinds | kinds)
+                waiting[larger] = OtherModel(model.criterion + gain, columns, model.kinds | kinds)
     return [*found.values()]
 
 
-def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], _Model]]:
+def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherModel]]:
     """Yield models with another effect in the place of one, by what is gone (~i) and the form.
 
     Beside other effects of the recording intrinsics mean something else: those stay as they are.
@@ -196,7 +242,7 @@ def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], _Model]
             gain = _log_odds(null, one.score) - lost
             if _is_lasting(one.effect) and not null.effect_kinds & kinds:
                 included = np.concatenate([rest, null.form_columns(one.form)])
-                yield frozenset({~i, one.form}), _Model(
+                yield frozenset({~i, one.form}), OtherModel(
                     gain, included, kinds | set(effect.kinds))
 
 

@@ -9,7 +9,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
 from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
-from fisheye_svp_ros.diagnosis.uncertainty import model_uncertainty, total_errors
+from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.optics.lens import parameter_values
@@ -74,7 +74,7 @@ def test_an_effect_that_may_be_there_widens_the_errors_of_what_it_would_change(s
     data = group_by_frame(observe(lens(), terms, pose, views, SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(null), model_uncertainty(null)
+    errors, more = standard_errors(null), model_uncertainty(null, likely_models(null))
     off = abs(state.lens.cy - lens().cy)
     if size:
         assert off > 5 * errors[1]
@@ -93,10 +93,10 @@ def test_an_effect_that_may_be_there_is_hardly_larger_than_large(monkeypatch):
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     others = {*CATALOGUE} - {tilt.name}
     null = NullModel.estimate(data, state, ('cx', 'cy'), left_out=[*others])
-    more = model_uncertainty(null)[1]
+    more = model_uncertainty(null, likely_models(null))[1]
     small = tuple(p._replace(large=p.large / 10) for p in tilt.parameters)
     monkeypatch.setattr(tilt, 'parameters', small)
-    assert 0 < model_uncertainty(null)[1] < 0.7 * more
+    assert 0 < model_uncertainty(null, likely_models(null))[1] < 0.7 * more
 
 
 def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
@@ -111,7 +111,7 @@ def test_a_plate_beside_a_shift_makes_the_shift_mean_something_else():
     others = [name for name in CATALOGUE if name not in (shift.name, plate.name)]
     state = adjust(data, begin, ('cx', 'fx'))
     null = NullModel.estimate(data, state, ('cx', 'fx'), left_out=others)
-    more = model_uncertainty(null)
+    more = model_uncertainty(null, likely_models(null))
     assert more[1] > 0 and more[2] == 0.0
 
 
@@ -125,7 +125,7 @@ def test_an_effect_that_may_be_another_one_widens_the_errors_of_what_that_would_
     begin = replace(initial_state(data, lens()), terms=((tilt, np.zeros(2)),))
     state = adjust(data, begin, ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(null), model_uncertainty(null)
+    errors, more = standard_errors(null), model_uncertainty(null, likely_models(null))
     off = abs(state.lens.cy - lens().cy)
     assert off > 4 * errors[1]
     assert off < 2 * np.hypot(errors, more)[1]
@@ -151,7 +151,7 @@ def test_two_effects_that_hide_each_other_widen_the_errors():
     data = group_by_frame(observe(lens(), terms, pose, views, 0.1 * SIGMA, rng))
     state = adjust(data, initial_state(data, lens()), ('cx', 'cy'))
     null = NullModel.estimate(data, state, ('cx', 'cy'))
-    errors, more = standard_errors(null), model_uncertainty(null)
+    errors, more = standard_errors(null), model_uncertainty(null, likely_models(null))
     off = abs(state.lens.cy - lens().cy)
     assert off > 20 * errors[1]
     assert off < 2 * np.hypot(errors, more)[1]

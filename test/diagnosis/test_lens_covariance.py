@@ -1,0 +1,59 @@
+"""What is known of the rays of a lens, other likely models allowed for."""
+
+from dataclasses import replace
+from functools import reduce
+
+import numpy as np
+from helpers.scenes import lens, observe, scene
+
+from benchmark.true_rays import ray_error
+from fisheye_svp_ros.diagnosis import NullModel
+from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
+from fisheye_svp_ros.diagnosis.stages import extended_lenses
+from fisheye_svp_ros.diagnosis.uncertainty import likely_models, total_errors
+from fisheye_svp_ros.effects.catalogue import CATALOGUE
+from fisheye_svp_ros.solve.bundle_adjustment import adjust
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.ray_errors import ray_model, typical_points
+from fisheye_svp_ros.solve.rig_state import group_by_frame
+
+SIGMA = 0.01
+CENTER = ('cx', 'cy')
+
+
+def stated_mrad(known, given, table, uv):
+    """Return the expected error of the rays at 1 m."""
+    frames = np.zeros((known.linear.data.frames, 6))
+
+    def extend_lens(step):
+        state = known.linear.state.retract(known.linear.free, frames, step)
+        return extended_lenses({'': given}, state, table)['']
+
+    model, _ = ray_model(extend_lens, known.covariance, uv)
+    return 1e3 * model.errors()[1].value
+
+
+def test_effects_that_hide_each_other_move_rays_less_than_parameters():
+    """A tilt, which is not named, undoes what its decentering does to the center: not to rays."""
+    rng = np.random.default_rng(31)
+    pose, views = scene(rng, frames=16)
+    terms = [(CATALOGUE['decentering'](), np.array([1e-3, 0.0])),
+             (CATALOGUE['sensor_tilt'](), np.array([-5e-3, 0.0]))]
+    table = observe(lens(), terms, pose, views, SIGMA, rng)
+    data = group_by_frame(table)
+    begin = replace(initial_state(data, lens()), terms=((terms[0][0], np.zeros(2)),))
+    null = NullModel.estimate(data, adjust(data, begin, CENTER), CENTER)
+    columns = null.column_count
+    uv = typical_points(data.views.uv[data.views.used])
+    fitted = extended_lenses({'': lens()}, null.linear.state, table)['']
+    truth = reduce(lambda one, term: term[0].extend(one, term[1]), terms, lens())
+    off = ray_error(fitted, truth, uv, (1.0,))
+
+    errors = total_errors(null)
+    parameters_alone = LensCovariance(
+        null.linear, np.diag(errors**2), np.ones(columns), np.arange(columns))
+    known = replace(parameters_alone, covariance=np.zeros((columns, columns)))
+    known = known.with_other_models(null, likely_models(null))
+    stated = stated_mrad(known, lens(), table, uv)
+    assert off / 3 < stated < 3 * off
+    assert stated_mrad(parameters_alone, lens(), table, uv) > 3 * stated
