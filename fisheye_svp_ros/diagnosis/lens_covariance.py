@@ -20,7 +20,7 @@ from fisheye_svp_ros.diagnosis.uncertainty import (
 )
 from fisheye_svp_ros.effects.base import Effect
 from fisheye_svp_ros.mixed_model import pseudo_inverse
-from fisheye_svp_ros.solve.rig_state import Linearization, with_effect
+from fisheye_svp_ros.solve.rig_state import Linearization, RigState, with_effect
 
 _MIN_WEIGHT = 0.01  # probability of an effect below which it moves no ray worth counting
 
@@ -60,7 +60,10 @@ class LensCovariance:
         """Add what other likely models say, those whose effects of the lens can be added."""
         state = self.linear.state
         for form in _likely_forms(null, models):
-            state = with_effect(state, null.fixed.forms.effects[form])
+            richer = with_effect(state, null.fixed.forms.effects[form])
+            # A form with fewer parameters takes the place of a richer one of the same effect.
+            if _effect_names(state) <= _effect_names(richer):
+                state = richer
         linear = Linearization(self.linear.data, state, self.linear.free)
         names = shared_names(linear)
         first = np.array([names.index(name) for name in shared_names(self.linear)], dtype=int)
@@ -84,6 +87,10 @@ class LensCovariance:
         cross = np.zeros((len(self.covariance), len(known.root)))
         cross[self.place] = self.ratios[:, None] * known.shared @ known.root.T
         return known.root @ known.root.T, cross
+
+
+def _effect_names(state: RigState) -> set[str]:
+    return {name for term in state.terms for name in parameter_names(term)}
 
 
 def _is_of_lens(effect: Effect) -> bool:
