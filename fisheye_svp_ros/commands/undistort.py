@@ -167,14 +167,15 @@ def _write_photographs(
             say(str(error))
             continue
         image = _remap(sides[photograph.camera], photograph, pixels)
-        path = folder / photograph.camera / f'{photograph.key}.png'
+        key = Path(photograph.key).name
+        path = folder / photograph.camera / f'{key}.png'
         if path in written:
-            raise ParameterError(f'{photograph.name}: another photograph is also called '
-                                 f'{photograph.key}; give one folder at a time')
+            raise ParameterError(f'{photograph.name}: another photograph is also called {key}; '
+                                 'give one folder at a time')
         written.add(path)
         write_bytes(path, cv2.imencode('.png', image)[1].tobytes())
         counts[photograph.camera] += 1
-        first.setdefault(photograph.camera, (photograph.key, image))
+        first.setdefault(photograph.camera, (key, image))
         done()
     if pair and len(first) == 2:
         left, right = (first[name] for name in sides)

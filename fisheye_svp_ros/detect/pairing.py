@@ -49,9 +49,9 @@ def pair_photographs(
 ) -> Pairing:
     """Return which photographs (S,) are of one moment.
 
-    keys: names without folder and camera, where several paths are given after PATH/; t (S,), s,
-    NaN unknown; sync: largest difference of stamps, s; None: stamps are compared, to within SYNC,
-    where all are known, or else names, or else the last numbers in these.
+    keys: names without folder and camera, after PATH/ where an earlier path has such a name; t
+    (S,), s, NaN unknown; sync: largest difference of stamps, s; None: stamps are compared, to
+    within SYNC, where all are known, or else names, or else the last numbers in these.
     """
     own, names = tuple(keys), np.array(cameras)
     if len(set(cameras)) < 2:

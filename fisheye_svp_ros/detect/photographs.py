@@ -67,16 +67,21 @@ def find_photographs(paths: Sequence[str], every: int = 1) -> Iterator[Photograp
     """Yield the photographs of files, folders, videos and rosbag2 recordings, in their order.
 
     Subfolders such as left/ and right/, file names that begin so, or topics in such namespaces are
-    the cameras of a rig; equal file names, and equal stamps, are the same instant, file names in
-    one of the paths alone.  every: take one of so many.
+    the cameras of a rig; equal file names, and equal stamps, are the same instant.  A name that a
+    camera had in an earlier path is another instant: the number of its path stands before it.
+    every: take one of so many.
     Raises ObservationError for a path without any.
     """
+    earlier: set[tuple[str, str]] = set()
     for place, path in enumerate(map(Path, paths)):
-        number = -1
+        number, own = -1, set()
         for number, photograph in enumerate(_source(path)):
             if number % every == 0:
-                yield photograph if len(paths) < 2 else replace(
+                name = photograph.camera, photograph.key
+                own.add(name)
+                yield photograph if name not in earlier else replace(
                     photograph, key=f'{place}/{photograph.key}')
+        earlier |= own
         if number < 0:
             raise ObservationError(f'{path}: it and its folders hold no photograph; images are '
                                    f'{" ".join(IMAGES)}')
