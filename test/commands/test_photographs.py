@@ -72,19 +72,14 @@ def test_detect_then_calibrate(
     assert lens.parameters['e0'] == pytest.approx(0.003, abs=5e-4)
 
 
-def test_files_of_a_rig_given_one_by_one_are_paired_by_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_files_given_one_by_one_keep_their_names(tmp_path: Path) -> None:
     """As a shell gives them for *.png."""
-    where = poses(2, 8)
-    for number, side in enumerate(('left', 'right')):
-        for i in range(2):
-            pixels = photograph(where.take(i), seed=2 * number + i)
-            cv2.imwrite(str(tmp_path / f'{side}{i}.png'), pixels)
-    files, out = sorted(map(str, tmp_path.glob('*.png'))), tmp_path / 'o.csv'
-    assert cli.main(['detect', *files, '--board', BOARD, '-o', str(out)]) == 0
-    found = read_observations(out)
-    assert found.cameras == ('left', 'right') and len(found.frames) == 2
+    where, overlays = poses(2, 8), tmp_path / 'overlays'
+    write(tmp_path / 'photos', [photograph(where.take(i), seed=i) for i in range(2)])
+    files = sorted(map(str, (tmp_path / 'photos').glob('*.png')))
+    assert cli.main(['detect', *files, '--board', BOARD, '-o', str(tmp_path / 'o.csv'),
+                     '--overlays', str(overlays)]) == 0
+    assert {path.name for path in overlays.iterdir()} >= {Path(file).name for file in files}
 
 
 def test_equal_names_in_two_folders_are_different_frames(
