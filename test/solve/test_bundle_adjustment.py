@@ -68,7 +68,9 @@ def by_scipy(data, state, prior):
         return np.concatenate([residual, prior_rows(prior, moved)])
 
     count = 6 * frames + turned + len(state.shared_values(FREE))
-    return after(least_squares(rows, np.zeros(count), method='lm', xtol=1e-14, ftol=1e-14).x)
+    # Central differences: with those of one side MINPACK stops short.
+    return after(least_squares(rows, np.zeros(count), jac='3-point', x_scale='jac', xtol=1e-14,
+                               ftol=1e-14, gtol=1e-14, max_nfev=60).x)
 
 
 def assert_alike(first, second, free=FREE):
@@ -195,7 +197,7 @@ def test_a_rig_predicts_each_view_by_its_camera():
             np.testing.assert_array_equal(getattr(linear, name)[rows], getattr(alone, name))
         columns = own.through(alone, views.take(rows), alone.d_pose)
         whole = state.model.through(linear, views, linear.d_pose)
-        np.testing.assert_array_equal(whole[rows], columns)
+        np.testing.assert_allclose(whole[rows], columns, rtol=1e-14)
         image = state.model.predict(pose, views)
         assert np.array_equal(image.uv[rows], own.predict(pose.take(rows), views.take(rows)).uv,
                               equal_nan=True)

@@ -102,7 +102,7 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     design = sparse.csr_array(
         (weight.ravel(), (np.repeat(np.arange(len(uv)), weight.shape[1]), node.ravel())),
         (len(uv), rows * columns))
-    normal = design.T @ design + _RIDGE * sparse.eye_array(rows * columns)
+    normal = design.T @ design + _RIDGE * sparse.csr_array(sparse.eye(rows * columns))
     values: Array = splu(normal.tocsc()).solve(design.T @ (uv - ideal))
     field = replace(empty, values=values.reshape(rows, columns, 2))
     worst = float(np.linalg.norm(field.apply(ideal) - uv, axis=-1).max())
