@@ -75,13 +75,28 @@ def test_frames_that_show_several_boards_are_left_alone() -> None:
 
 
 def test_turns_carry_a_board_onto_itself() -> None:
-    """A board of 9 x 7 has one other order; with a corner missing it has none."""
+    """A board of 9 x 7 has one other order; with half of it missing it has none."""
     board = plane()
     turn, = board_turns(board, np.zeros(63, dtype=np.int64))
     assert turn.degrees == 180
     assert np.array_equal(turn.partner, np.arange(63)[::-1])
     partial = replace(board, ids=board.ids[1:], points=board.points[1:])
-    assert not board_turns(partial, np.zeros(62, dtype=np.int64))
+    turn, = board_turns(partial, np.zeros(62, dtype=np.int64))
+    assert turn.landmark.tolist() == [*range(1, 62)] and turn.alone.tolist() == [62]
+    table = make_observations(np.repeat([0, 1], 62), np.tile(partial.ids, 2),
+                              np.zeros((124, 2)), np.tile(partial.points, (2, 1)))
+    turned = turn.apply(table, table.frame == 1)
+    assert turned.landmark.tolist() == [*range(1, 63), *range(61, 0, -1)]
+    half = replace(board, ids=board.ids[:30], points=board.points[:30])
+    assert not board_turns(half, np.zeros(30, dtype=np.int64))
+
+
+def test_reversed_photographs_are_found_where_no_row_has_a_corner() -> None:
+    hidden, right = photographs(1, 0.2, HIDDEN), photographs(1, 0.2)
+    found, right = (diagnosed(one.take(one.landmark > 0)) for one in (hidden, right))
+    assert [one.frame for one in found.record.turned] == list(HIDDEN)
+    assert all(one.corrected for one in found.record.turned)
+    assert found.figures.extended.rms_px == pytest.approx(right.figures.extended.rms_px, rel=0.02)
 
 
 def test_photographs_of_a_real_board_are_found_by_where_its_clip_is(tmp_path: Path) -> None:

@@ -261,18 +261,20 @@ def _gather(
     board, ids = turns[0].board, turns[0].landmark
     count = len(linear.residual)
     used = linear.row_mask.reshape(count, -1, 2)[..., 0]
-    mine = np.isin(fitted.random.landmark, ids)
-    shown = mine[columns.unit] & used
-    at = np.flatnonzero((shown == used).all(axis=1) & (shown.sum(axis=1) >= _MIN_POINTS))
+    alone = np.isin(fitted.random.landmark, turns[0].alone)[columns.unit] & used
+    shown = np.isin(fitted.random.landmark, ids)[columns.unit] & used
+    at = np.flatnonzero(
+        ((shown | alone) == used).all(axis=1) & (shown.sum(axis=1) >= _MIN_POINTS))
     # Fields of the image stay in: they take up what a frame in the wrong order errs by.
     rows = fitted.residuals_of_frames().reshape(count, -1, 2)[at]
     bumps = columns.group_label == NAMES.index('frame_bumps')
     fixed = np.concatenate([linear.frame_columns[at], columns.group[at][..., ~bumps]], axis=-1)
-    fixed = fixed.reshape(*rows.shape, fixed.shape[-1])
+    fixed = np.where(shown[at][..., None, None],
+                     fixed.reshape(*rows.shape, fixed.shape[-1]), 0.0)
     fixed = fixed / np.maximum(np.sqrt((fixed**2).sum(axis=(1, 2), keepdims=True)), 1e-12)
     own = np.isin(target.landmark, ids)
     where = target.points[own] + target.moved(linear.state.terms, linear.state.lens)[own]
-    slot = np.where(used[at], np.searchsorted(ids, target.landmark[columns.unit[at]]), -1)
+    slot = np.where(shown[at], np.searchsorted(ids, target.landmark[columns.unit[at]]), -1)
     partner = [np.arange(len(ids)), *(np.searchsorted(ids, one.partner) for one in turns)]
     frames = _Frames(
         np.where((slot >= 0)[..., None], rows, 0.0),
