@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -99,7 +100,7 @@ def _fit_nodes(lens: Lens, columns: int) -> tuple[str, ImageField, float]:
     empty = ImageField(low, focal * spacing, np.zeros((rows, columns, 2)))
     ideal = focal * plane + centre
     weight, node = empty.weights(ideal)
-    design = sparse.csr_array(
+    design: Any = sparse.csr_array(
         (weight.ravel(), (np.repeat(np.arange(len(uv)), weight.shape[1]), node.ravel())),
         (len(uv), rows * columns))
     normal = design.T @ design + _RIDGE * sparse.csr_array(sparse.eye(rows * columns))
