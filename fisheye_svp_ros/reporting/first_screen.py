@@ -74,13 +74,23 @@ def first_screen(
     )
     return Screen(
         headline(d), _facts(d, source), _warning(d),
-        tuple(Action(title, do, decision.why[:1].upper() + decision.why[1:], _confidence(decision),
+        tuple(Action(title, do, _reason(decision, d), _confidence(decision),
                      tuple(Photo(name, _thumbnail(paths.get(name))) for name in some[:_MAX_NAMES]),
                      max(len(some) - _MAX_NAMES, 0))
               for title, do, decision, some in answers),
         _causes(d), _candidates(d), _bound_text(d.decision['lens']),
         '; '.join(f'{name} {before} → {after}'
                   for name, before, after, _ in known_rows(known or {})))
+
+
+def _reason(decision: Decision, d: Diagnosis) -> str:
+    """Return why, with the photographs whose board is numbered from another end."""
+    why = decision.why[:1].upper() + decision.why[1:]
+    if decision is not d.decision['photographs'] or not d.record.turned:
+        return why
+    names = [one.photograph for one in d.record.turned]
+    more = f' and {len(names) - _MAX_NAMES} more' if len(names) > _MAX_NAMES else ''
+    return f'{why}; numbered from another end of the board: {", ".join(names[:_MAX_NAMES])}{more}'
 
 
 def terminal_lines(screen: Screen, command: str) -> list[str]:

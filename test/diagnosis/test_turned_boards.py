@@ -17,6 +17,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.board_turns import board_turns
 from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
 
@@ -60,6 +61,10 @@ def test_reversed_photographs_are_named_and_put_in_order() -> None:
     advice, = (one for one in found.advice if one.kind == TURNED)
     assert 'left03.png' in advice.photographs
     assert 'left03.png' in verdict_sentences(found)[2]
+    told, = (line for line in terminal_lines(first_screen(found, 'x'), '')
+             if line.startswith('Photographs: '))
+    assert ('numbered from another end of the board: left03.png, left08.png, left09.png, '
+            'left14.png') in told
 
 
 @pytest.mark.parametrize('seed', [2, 3])
