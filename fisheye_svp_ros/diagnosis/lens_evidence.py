@@ -41,6 +41,7 @@ _NORMAL_95 = 1.96
 _EDGE = 0.9  # of the points by incidence angle: beyond is the edge
 _FLOOR = 0.1  # of the noise: what an angle may differ by without a reason
 _LINEARITY = 0.05  # of a change: beyond it, its columns are no measure
+_ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
 LensesOf = Callable[[RigState], Mapping[str, Lens]]
@@ -261,7 +262,8 @@ def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     """
     flat = samples.reshape(-1, samples.shape[-1])
     covariance: Array = flat @ flat.T / flat.shape[1]
-    covariance[np.diag_indices_from(covariance)] += floor**2 * len(flat) / 3
+    rounding = _ROUNDING * float(np.trace(covariance)) / len(flat)  # of data without noise
+    covariance[np.diag_indices_from(covariance)] += floor**2 * len(flat) / 3 + rounding
     root = np.asarray(np.linalg.cholesky(covariance))
     whitened = solve_lower(root, np.column_stack([off.ravel(), flat]))
     distances = np.sqrt((whitened**2).sum(axis=0))

@@ -9,6 +9,7 @@ from helpers.scenes import lens, observe, scene
 from benchmark.true_rays import ray_error
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
+from fisheye_svp_ros.diagnosis.lens_evidence import _distances
 from fisheye_svp_ros.diagnosis.stages import extended_lenses
 from fisheye_svp_ros.diagnosis.uncertainty import likely_models, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
@@ -57,3 +58,13 @@ def test_effects_that_hide_each_other_move_rays_less_than_parameters():
     stated = stated_mrad(known, lens(), table, uv)
     assert off / 3 < stated < 3 * off
     assert stated_mrad(parameters_alone, lens(), table, uv) > 3 * stated
+
+
+def test_without_noise_a_lens_is_as_far_off_as_its_parameters_say():
+    """Of a simulator's truth, say: four parameters move all rays, and nothing else does."""
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(300, 3, 4))
+    samples = columns @ rng.normal(size=(4, 1000))
+    distance, drawn = _distances(3e-3 * columns[..., 0], 1e-3 * samples, 1e-12)
+    assert 2 < distance < 4
+    assert 1.5 < np.sqrt(np.mean(drawn**2)) < 2.5
