@@ -12,12 +12,12 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.library import (
     AnyLens,
     AnyObservations,
-    Budgeted,
     load_lens,
     localize,
     table_of,
 )
 from fisheye_svp_ros.library_checks import check_type
+from fisheye_svp_ros.library_results import Budgeted
 from fisheye_svp_ros.reporting.diagnosis_plots import draw_arrows, draw_image_frame
 from fisheye_svp_ros.solve.measured_poses import rms_px
 

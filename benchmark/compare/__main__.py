@@ -39,7 +39,7 @@ from fisheye_svp_ros.diagnosis import (  # noqa: E402
     predict_other_data,
 )
 from fisheye_svp_ros.io.files import write_text  # noqa: E402
-from fisheye_svp_ros.library import Localized  # noqa: E402
+from fisheye_svp_ros.library_results import Localized  # noqa: E402
 from fisheye_svp_ros.reporting.progress import progress  # noqa: E402
 from fisheye_svp_ros.scene.observations import Observations  # noqa: E402
 from fisheye_svp_ros.solve.initial_rig import localize_frames  # noqa: E402
