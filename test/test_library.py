@@ -17,23 +17,23 @@ import pytest
 from helpers.nodes import ROOT
 
 import fisheye_svp_ros as fsvp
-from fisheye_svp_ros import library_results
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.result_files import Columns, Result
+from fisheye_svp_ros.library_results import Localized, Simulated
 
 _BLOCK = re.compile(r'```python\n(.*?)```(?:\n\n```text\n(.*?)```)?', re.DOTALL)
 
 
 @pytest.fixture(scope='module')
-def seen() -> library_results.Simulated:
+def seen() -> Simulated:
     """Return ten views of a lens with a shift."""
     return fsvp.simulate_scenario(
         lens='fish214', radius=0.5, noise_px=0.2, poses_file='calibration')
 
 
 @pytest.fixture(scope='module')
-def pair() -> library_results.Simulated:
+def pair() -> Simulated:
     """Return ten views of a rig."""
     return fsvp.simulate_scenario(
         lens='fish214', radius=0.5, style='vergent', noise_px=0.2, poses_file='calibration')
@@ -77,7 +77,7 @@ def test_a_page_runs_as_printed(
         assert printed.getvalue() == expected
 
 
-def test_a_rig_is_as_uncertain_as_its_residuals_say(pair: library_results.Simulated) -> None:
+def test_a_rig_is_as_uncertain_as_its_residuals_say(pair: Simulated) -> None:
     lens, table = fsvp.load_lens('fish214'), pair.observations
     assert pair.rig is not None
     found, known = (
@@ -88,7 +88,7 @@ def test_a_rig_is_as_uncertain_as_its_residuals_say(pair: library_results.Simula
     assert 1 < off @ np.linalg.solve(found.covariance, off) < 20  # chi-square of 6
 
 
-def _results(seen: library_results.Simulated, pair: library_results.Simulated) -> list[Result]:
+def _results(seen: Simulated, pair: Simulated) -> list[Result]:
     svp = seen.lens.svp()
     rig = pair.rig
     assert rig is not None
@@ -103,10 +103,10 @@ def _results(seen: library_results.Simulated, pair: library_results.Simulated) -
 
 
 def test_results_come_back(
-    seen: library_results.Simulated, pair: library_results.Simulated, tmp_path: Path
+    seen: Simulated, pair: Simulated, tmp_path: Path
 ) -> None:
     results = _results(seen, pair)
-    kinds = {kind for kind in Result.__subclasses__() if kind.__module__ == library_results.__name__}
+    kinds = {kind for kind in Result.__subclasses__() if kind.__module__ == Simulated.__module__}
     assert {type(one) for one in results} == kinds
     for one in results:
         one.save(tmp_path / 'result.json')
@@ -120,14 +120,14 @@ def test_results_come_back(
         assert list(map(repr, again.table().rows())) == list(map(repr, one.table().rows()))
 
 
-def test_a_file_that_is_no_such_result(seen: library_results.Simulated, tmp_path: Path) -> None:
+def test_a_file_that_is_no_such_result(seen: Simulated, tmp_path: Path) -> None:
     seen.save(tmp_path / 'seen.json')
     for name in ('seen.json', 'none.json'):
         with pytest.raises(ObservationError, match=name):
-            library_results.Localized.load(tmp_path / name)
+            Localized.load(tmp_path / name)
 
 
-def test_localize_says_what_the_command_says(seen: library_results.Simulated, tmp_path: Path) -> None:
+def test_localize_says_what_the_command_says(seen: Simulated, tmp_path: Path) -> None:
     table = tmp_path / 'observations.csv'
     fsvp.write_observations(table, seen.observations)
     assert main(['localize', str(table), '--lens', 'fish214', '-o', str(tmp_path)]) == 0
@@ -140,7 +140,7 @@ def test_localize_says_what_the_command_says(seen: library_results.Simulated, tm
 
 
 def test_calibrate_writes_the_lens_of_the_command(
-    seen: library_results.Simulated, tmp_path: Path
+    seen: Simulated, tmp_path: Path
 ) -> None:
     table = tmp_path / 'observations.csv'
     fsvp.write_observations(table, seen.observations)
