@@ -72,3 +72,11 @@ def test_every_hostile_message_is_received_read_and_counted(graph: Callable[...,
 
     g.until(answer)
     assert float(read_key_values(answer())['rms_px']) < 0.5
+
+
+def test_no_hostile_message_is_empty_for_the_middleware_sends_nothing_after_it(
+    ros_domain: int,
+) -> None:
+    for seed in range(3):
+        attacks = hostile.pool('true_pose', PoseStamped, 1000, Random(seed), lambda _: True)
+        assert all(attack.data for attack in attacks)
