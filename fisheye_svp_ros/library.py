@@ -46,7 +46,7 @@ from fisheye_svp_ros.solve.reliability import noise_sigma
 from fisheye_svp_ros.solve.stereo_depth import epipolar_offset, triangulate
 from fisheye_svp_ros.study import budget as budgets
 from fisheye_svp_ros.study import sweep as sweeps
-from fisheye_svp_ros.threads import single_threaded
+from fisheye_svp_ros.threads import limit_threads
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.optics.camera import Image, Rays
@@ -96,7 +96,7 @@ def _check_last_axis(size: int, values: Array, name: str) -> Array:
     return numbers
 
 
-@single_threaded
+@limit_threads
 def localize(
     observations: AnyObservations, lens: AnyLens, *, model_error: bool = False
 ) -> Localized:
@@ -123,7 +123,7 @@ def localize(
     )
 
 
-@single_threaded
+@limit_threads
 def calibrate(
     observations: AnyObservations, model: str, image_size: tuple[int, int],
     free: Sequence[str] | None = None, name: str = 'lens', *,
@@ -159,7 +159,7 @@ def calibrate(
                       trusted.covariance, found.sigma, found.left_out, bool(adjusted.converged))
 
 
-@single_threaded
+@limit_threads
 def calibrate_stereo(
     observations: AnyObservations, left: AnyLens, right: AnyLens
 ) -> CalibratedRig:
@@ -179,7 +179,7 @@ def calibrate_stereo(
     )
 
 
-@single_threaded
+@limit_threads
 def stereo_depth(
     observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose, *,
     model_error: bool = False,
@@ -223,7 +223,7 @@ def simulate_scenario(**scenario: Any) -> Simulated:
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
 
-@single_threaded
+@limit_threads
 def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swept:
     """Solve the Cartesian product of lists of scenario parameters, as `fisheye-svp sweep` does.
 
@@ -240,7 +240,7 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
 
 
-@single_threaded
+@limit_threads
 def diagnose(
     observations: AnyObservations, lens: AnyLens, *, free_intrinsics: bool | None = None,
     held_out: AnyObservations | None = None, poses: AnyPoses | None = None,
@@ -266,7 +266,7 @@ def diagnose(
     return Diagnosed(found.verdict, found.to_dict(), found.lens)
 
 
-@single_threaded
+@limit_threads
 def budget(
     lens: AnyLens, *, noise_px: float = 0.3, style: str = 'parallel', baseline: float = BASELINE
 ) -> Budgeted:

@@ -16,10 +16,10 @@ from fisheye_svp_ros.solve import rig_calibration, rig_localization
 from fisheye_svp_ros.solve.measured_poses import posable_observations, rig_lenses
 from fisheye_svp_ros.solve.rig_calibration import RigCalibration
 from fisheye_svp_ros.solve.rig_localization import RigLocalization
-from fisheye_svp_ros.threads import single_threaded
+from fisheye_svp_ros.threads import limit_threads
 
 
-@single_threaded
+@limit_threads
 def calibrate_rig(
     observations: AnyObservations, lenses: Mapping[str, AnyLens]
 ) -> RigCalibration:
@@ -41,7 +41,7 @@ def calibrate_rig(
     return rig_calibration.calibrate_rig(table, known, table.cameras)
 
 
-@single_threaded
+@limit_threads
 def localize_rig(
     observations: AnyObservations, lenses: Mapping[str, AnyLens],
     rig: RigCalibration | str | Path,

@@ -23,7 +23,7 @@ def set_thread_count() -> None:
     os.environ.setdefault(VARIABLES[0], '1')
 
 
-def single_threaded(function: Callable[_P, _R]) -> Callable[_P, _R]:
+def limit_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Return the function with BLAS on one thread while it runs, in a process of somebody else's.
 
     A number that the environment sets stays as it is, and so does BLAS after the call.  Without

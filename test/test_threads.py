@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from fisheye_svp_ros.threads import VARIABLES, set_thread_count, single_threaded
+from fisheye_svp_ros.threads import VARIABLES, limit_threads, set_thread_count
 
 threadpoolctl = pytest.importorskip('threadpoolctl', reason='comes with pip, not with ROS 2')
 
 
-@single_threaded
+@limit_threads
 def _threads() -> set[int]:
     """Return the numbers of threads that BLAS libraries take."""
     return {pool['num_threads'] for pool in threadpoolctl.threadpool_info()

@@ -12,7 +12,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.io.lens_files import lens_to_dict
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.beyond import pose_sets
+from fisheye_svp_ros.paper.extensions import pose_sets
 from fisheye_svp_ros.paper.lens_evaluation import calibrate_rigs
 from fisheye_svp_ros.paper.studies import NAMES
 from fisheye_svp_ros.paper.tables import LENSES, agreeing

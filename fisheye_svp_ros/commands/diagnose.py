@@ -231,7 +231,7 @@ def _write(
     from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, refusal_reason
     from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
-    folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.named_fit)
+    folder, points = args.output, point_residuals(diagnosis.simulation, diagnosis.cause_fit)
     truth = {name: compared.to_dict() for name, compared in known.items()}
     document = {**diagnosis.to_dict(), 'known_truth': truth}
     if wanted:

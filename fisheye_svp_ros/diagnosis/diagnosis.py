@@ -177,9 +177,9 @@ class Diagnosis:
         return self.evaluation.fixed_model
 
     @property
-    def named_fit(self) -> Linearization:
+    def cause_fit(self) -> Linearization:
         """The named causes fitted as the simulation was, for residuals after and before them."""
-        return self.evaluation.named_fit
+        return self.evaluation.cause_fit
 
     @property
     def written_model(self) -> Linearization:

@@ -244,7 +244,7 @@ class Evaluation:
         return _with_poses_anew(self.null.linear)
 
     @cached_property
-    def named_fit(self) -> Linearization:
+    def cause_fit(self) -> Linearization:
         """The named causes fitted as the simulation was, by least squares without random effects.
 
         All points count alike in both: the rms on the fitted frames says what the causes bring.
@@ -268,7 +268,7 @@ class Evaluation:
         freedom = full.rows - full.group_rank - len(self.free)
         chi2 = float((linear.residual**2).sum()) / self._noise_square / max(freedom, 1)
         # Of the points that the causes were fitted to: figures before and after are comparable.
-        views = self.named_fit.data.views
+        views = self.cause_fit.data.views
         squares = ((views.uv - linear.linear.uv) ** 2).sum(axis=-1)[views.used]
         return FitQuality(
             float(np.sqrt(np.nanmean(squares))), self._given_prediction.rms, chi2)
@@ -276,7 +276,7 @@ class Evaluation:
     @cached_property
     def named_quality(self) -> FitQuality:
         """All causes, without random effects."""
-        return FitQuality(rms_px(self.named_fit), self._cause_predictions[-1].rms)
+        return FitQuality(rms_px(self.cause_fit), self._cause_predictions[-1].rms)
 
     @cached_property
     def lens_quality(self) -> FitQuality:

@@ -22,7 +22,7 @@ from fisheye_svp_ros.solve.rig_state import Linearization, RigViews
 
 BLOCKS = 3
 _MIN_FRAMES = 9
-_WORSE = 1.02  # times the sum of squares without: less is chance
+_MAX_SQUARE_RATIO = 1.02  # times the sum of squares without: less is chance
 
 Ends = tuple[int, int]  # the first and the last frame of a block
 
@@ -83,7 +83,7 @@ def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[End
                                  linear.residual[out][..., None]], axis=-1)
         whole, *without = misfits(linear, out, border @ predicted)
         for (effect, _, _), square in zip(lasting, without, strict=True):
-            if whole > _WORSE * square:
+            if whole > _MAX_SQUARE_RATIO * square:
                 found[effect.name] = (*found.get(effect.name, ()), edge)
     return found
 

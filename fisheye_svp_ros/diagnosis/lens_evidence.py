@@ -124,12 +124,14 @@ def find_bounds(null: NullModel) -> list[Bound]:
         elif effect.name in _BOUNDED_EFFECTS and not null.effect_kinds & set(effect.kinds) and (
                 effect.name not in smallest or len(mine) < len(smallest[effect.name][1])):
             smallest[effect.name] = effect, mine
-    return [_bound_of(null, effect, mine, np.concatenate([*columns, mine]),
+    return [_effect_bound(null, effect, mine, np.concatenate([*columns, mine]),
                    np.concatenate([*prior, null.prior_precision(mine, effect)]))
             for effect, mine in smallest.values()]
 
 
-def _bound_of(null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array) -> Bound:
+def _effect_bound(
+    null: NullModel, effect: Effect, mine: Index, every: Index, prior: Array
+) -> Bound:
     information, count, scale = null.information, len(mine), null.scale[mine]
     inverse, _ = pseudo_inverse(information[np.ix_(every, every)] + np.diag(prior), 1e-13)
     value = (inverse @ information[every, -1])[-count:] / scale

@@ -178,7 +178,7 @@ class GatheredPoints(NamedTuple):
             ids, boards = np.unique(landmark[used]), linear.scene.boards
         else:
             target = Target((), geometry.landmark, geometry.board, geometry.points)
-            shown = used & (rows(target.shown(views).astype(float)[..., None])[..., 0] > 0)
+            shown = used & (rows(target.landmark_mask(views).astype(float)[..., None])[..., 0] > 0)
             known = BoardLandmarks.of_geometry(geometry)
             ids, boards = known.ids, known.boards
         slot = np.where(shown, np.searchsorted(ids, landmark).clip(max=len(ids) - 1), -1)

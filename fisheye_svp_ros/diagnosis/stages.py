@@ -114,7 +114,7 @@ def diagnose_against(
     return replace(found, record=found.record._replace(against=datasets))
 
 
-class _Evaluated(NamedTuple):
+class _EvaluationResult(NamedTuple):
     """What the stages up to the evaluation return.
 
     of_robot: the poses are those of a flange; turned: views that were put in the order of the
@@ -149,7 +149,7 @@ def _run_stages(inputs: Inputs, progress: Progress) -> Diagnosis:
     return replace(found, record=found.record._replace(hand_eye=hand_eye))
 
 
-def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
+def _evaluate(inputs: Inputs, progress: Progress) -> _EvaluationResult:
     """Take checked inputs through the stages up to the evaluation of confirmed causes."""
     progress('fitting the simulation as it is', 0.0)
     problem, of_robot = prepare_problem(inputs)
@@ -169,7 +169,8 @@ def _evaluate(inputs: Inputs, progress: Progress) -> _Evaluated:
     progress('measuring the gain on held-out data', 0.8)
     evaluation, candidates = confirm(selection, lambda one: Evaluation.of_selection(
         one, FittedModel.solve_null_model(one.null), medium))
-    return _Evaluated(evaluation, candidates, cameras, of_robot, tuple(one for one, _ in turned))
+    return _EvaluationResult(evaluation, candidates, cameras, of_robot,
+                             tuple(one for one, _ in turned))
 
 
 def _conclude(

@@ -125,7 +125,7 @@ def model_uncertainty(null: NullModel, models: Sequence[OtherModel]) -> Array:
     for weight, one in zip(model_weights(models), models, strict=True):
         there = one.included < own
         at, more = one.included[there], np.zeros(own)
-        other, wider = _fit_other(null, one, reported, prior)
+        other, wider = _fit_other_model(null, one, reported, prior)
         change = other[there] - estimate[at]
         more[at] = np.maximum(np.diag(wider)[there] - np.diag(covariance)[at], 0.0) + change**2
         for effect, columns, _ in null.terms:
@@ -153,7 +153,7 @@ def model_covariance(null: NullModel, models: Sequence[OtherModel], into: Array)
     base, known = into[:, own] @ estimate, into[:, own] @ covariance @ into[:, own].T
     added = np.zeros_like(known)
     for weight, one in zip(model_weights(models), models, strict=True):
-        values, wider = _fit_other(null, one, reported, prior)
+        values, wider = _fit_other_model(null, one, reported, prior)
         step = into[:, one.included]
         sizes, vectors = np.linalg.eigh(step @ wider @ step.T - known)
         change = step @ values - base
@@ -175,7 +175,7 @@ def _prior_information(null: NullModel) -> Array:
     return np.diag(prior)
 
 
-def _fit_other(
+def _fit_other_model(
     null: NullModel, one: OtherModel, reported: Array, prior: Array
 ) -> tuple[Array, Array]:
     """Return estimates (m,) and their covariance (m, m), normalised, by another model."""

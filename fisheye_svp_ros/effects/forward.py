@@ -112,14 +112,14 @@ class ForwardModel:
             yield np.flatnonzero(views.camera == number), number, self.cameras[number]
 
     @property
-    def plain(self) -> bool:
+    def is_lens_only(self) -> bool:
         """Whether what the lens's own curves do is all there is, of one lens."""
         bare = not self.cameras and self._target is None
         return bare and not self._acts('target', 'pose', 'image', 'detector')
 
     def seeing(self, views: Views) -> ForwardModel:
         """Return the model without corrections of a target that none of the views shows."""
-        if self._target is None or self._target.shown(views).any():
+        if self._target is None or self._target.landmark_mask(views).any():
             return self
         return ForwardModel(self._given, self.terms)
 
@@ -157,7 +157,7 @@ class ForwardModel:
 
         limited: refuse points outside the field of view, as a camera does.
         """
-        if self.plain:
+        if self.is_lens_only:
             return camera.project(self.lens, pose.into_body(views.points), limited)
         linear = self._linearize(pose, views, limited)
         return Image(linear.uv, linear.valid)
@@ -172,13 +172,13 @@ class ForwardModel:
 
     def d_pose(self, linear: LinearViews, views: Views) -> Array:
         """Return derivatives (S, N, 2, 6) by the pose, with how effects vary over the image."""
-        return self.through(linear, views, linear.d_pose)
+        return self.transform_columns(linear, views, linear.d_pose)
 
-    def through(self, linear: LinearViews, views: Views, columns: Array) -> Array:
+    def transform_columns(self, linear: LinearViews, views: Views, columns: Array) -> Array:
         """Return columns (S, N, 2, P) that move ideal image points as they move measured ones."""
         if self.cameras:
             return gather_rows([
-                (rows, self.cameras[i].through(own, views.take(rows), columns[rows]))
+                (rows, self.cameras[i].transform_columns(own, views.take(rows), columns[rows]))
                 for rows, i, own in linear.cameras])
         for stage, uv in (('image', linear.ideal), ('detector', linear.optical)):
             if self._acts(stage):
@@ -321,7 +321,7 @@ class ForwardModel:
         for effect, values in self.terms:
             if effect.stage == stage:
                 moved = moved + effect.displacement(scene, values)
-        return moved if self._target is None else moved + self._target.moved(scene, stage)
+        return moved if self._target is None else moved + self._target.displacement(scene, stage)
 
 
 def project(lens: Lens, points: Array) -> Image:

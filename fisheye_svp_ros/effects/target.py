@@ -72,7 +72,7 @@ class Target:
             board[new] = self.board[away.argmin(axis=1)]
         return views._replace(board=board)
 
-    def shown(self, views: Views) -> Mask:
+    def landmark_mask(self, views: Views) -> Mask:
         """Return which landmarks (S, N) are the target's, or may be, in views that show it."""
         if self.landmark is None:
             return np.ones(views.landmark.shape, dtype=bool)
@@ -83,13 +83,13 @@ class Target:
         shows = (count > 0) & (2 * count >= views.used.sum(axis=1))
         return np.asarray(shows[:, None] & (same | ~known))
 
-    def moved(self, scene: Scene, stage: str) -> Array | float:
+    def displacement(self, scene: Scene, stage: str) -> Array | float:
         """Displacement (S, N, D) by the corrections at a stage, in views that show the target."""
         terms = [term for term in self.terms if term[0].stage == stage]
         if not terms:
             return 0.0
         parts = [effect.displacement(scene, values) for effect, values in terms]
-        return np.asarray(np.sum(parts, axis=0) * self.shown(scene.views)[..., None])
+        return np.asarray(np.sum(parts, axis=0) * self.landmark_mask(scene.views)[..., None])
 
     def _lookup(self, views: Views) -> tuple[Index, Mask, Mask]:
         """Return places in the table (S, N), whether the number is there, whether the place is."""
@@ -116,7 +116,7 @@ def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Obs
         return seen
     target, views = Target.from_entries({LANDMARKS: rows}, seen.source), group_views(seen)
     assert target is not None
-    mine = views.used & target.shown(views).any(axis=1, keepdims=True)
+    mine = views.used & target.landmark_mask(views).any(axis=1, keepdims=True)
     board = seen.board.copy()
     board[views.row[mine]] = target.assign_boards(views).board[mine]
     return replace(seen, board=board)

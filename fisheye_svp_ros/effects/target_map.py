@@ -53,7 +53,7 @@ class KnownTarget(NamedTuple):
         numbers, first = np.unique(views.landmark[views.used], return_index=True)
         return cls(numbers, views.board[views.used][first], views.points[views.used][first])
 
-    def moved(self, terms: Sequence[Term], lens: Lens) -> Array:
+    def displacements(self, terms: Sequence[Term], lens: Lens) -> Array:
         """Return the displacements (L, 3), m, by the effects on the target among some terms."""
         views = views_of(self.points[None], np.zeros((1, len(self.points), 2)))
         views = views._replace(board=self.board[None], landmark=self.landmark[None])
@@ -85,7 +85,7 @@ def at_landmarks(views: Views, landmark: Index, values: Array) -> Array:
 def board_maps(views: Views, terms: Sequence[Term], lens: Lens) -> list[BoardMap]:
     """Return how effects on the target, among some terms, displace the landmarks of views."""
     known = KnownTarget.from_views(views)
-    return known.maps(known.moved(terms, lens))
+    return known.maps(known.displacements(terms, lens))
 
 
 def less_similarity(points: Array, moved: Array) -> Array:

@@ -41,7 +41,7 @@ _LIVE_DETECTORS = {'saddle': 'quick'}  # a live camera has another image soon
 _MAX_LEAD = 100  # images of which one topic may be ahead of the other
 _MIN_FAILURES = 20  # images without a board before the first with one: it may be another board
 _LOOK = 0.005  # s, how often what a search found is looked for
-_GUIDED = ('e0', *INTRINSICS, 'k1', 'k2', 'k3', 'k4')  # parameters that a guide can determine
+_GUIDE_PARAMETERS = ('e0', *INTRINSICS, 'k1', 'k2', 'k3', 'k4')  # that a guide can determine
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class DetectorSettings(Settings):
     )
     guide: str = parameter(
         '', 'Parameter of the lens that the live guide determines (e0: the viewpoint shift); '
-        'empty: no guide', choices=('', *_GUIDED), fixed=True
+        'empty: no guide', choices=('', *_GUIDE_PARAMETERS), fixed=True
     )
     goal: float = parameter(
         0.0002, 'Standard error at which that parameter is determined, m for e0, px for fx, fy, '

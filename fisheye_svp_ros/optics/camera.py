@@ -21,7 +21,7 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Mask
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics import engines
-from fisheye_svp_ros.optics.engines import ported
+from fisheye_svp_ros.optics.engines import port_projection
 from fisheye_svp_ros.optics.engines.results import Incidence as Incidence
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, curve_limit
 from fisheye_svp_ros.optics.rays import caustic_range
@@ -54,7 +54,7 @@ class LinearImage:
     def incidence(self) -> Incidence:
         """Where the points have their ray through the lens."""
         if self.lens.port is not None:
-            return _reshape(ported.met(self.lens, self._sight, self.limited),
+            return _reshape(port_projection.met(self.lens, self._sight, self.limited),
                            self.points.shape[:-1])
         return incidence(self.lens, self.points, self.limited)
 
@@ -99,12 +99,12 @@ class LinearImage:
         return np.stack([self.lens.fx * rays.unit[0], self.lens.fy * rays.unit[1]], axis=-1)
 
     @cached_property
-    def _sight(self) -> ported.Sight:
-        return ported.sight(self.lens, self.points.reshape(-1, 3))
+    def _sight(self) -> port_projection.Sight:
+        return port_projection.sight(self.lens, self.points.reshape(-1, 3))
 
     @cached_property
     def _behind_port(self) -> tuple[Array, Array]:
-        shift, port = ported.columns(self.lens, self._sight)
+        shift, port = port_projection.columns(self.lens, self._sight)
         shape = (*self.points.shape[:-1], 2)
         columns = np.concatenate([shift[..., None], port], axis=-1).reshape(*shape, -1)
         columns = self.through_field(columns)
@@ -206,7 +206,7 @@ def back_project(lens: Lens, uv: Array) -> Rays:
     if lens.viewpoint_shift is not None:
         origin[..., 2] = lens.viewpoint_shift.value_and_slope(theta, np.tan(theta / 2))[0]
     if lens.port is not None:
-        at, way = ported.trace_rays(lens, direction.reshape(-1, 3))
+        at, way = port_projection.trace_rays(lens, direction.reshape(-1, 3))
         back = (at.value * way.value).sum(axis=0)
         origin = (at.value - back * way.value).T.reshape(direction.shape)
         direction = way.value.T.reshape(direction.shape)

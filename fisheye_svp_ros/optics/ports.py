@@ -17,7 +17,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.optics.curve_base import Curve
-from fisheye_svp_ros.optics.varying import Varying, constant, joined
+from fisheye_svp_ros.optics.varying import Varying, constant, stack_vector
 from fisheye_svp_ros.registry import Registry
 
 # Refractive indices beside air at 20 degrees and 589 nm (CRC Handbook; sea water of 35 g/kg:
@@ -118,7 +118,7 @@ class FlatGlass(Port):
     ) -> tuple[Varying, Varying]:
         distance, medium, tilt_x, tilt_y, thickness, glass = numbers
         one = constant(1.0, len(medium.slope))
-        normal = joined(tilt_y.tan(), 0.0 - tilt_x.tan(), one).unit()
+        normal = stack_vector(tilt_y.tan(), 0.0 - tilt_x.tan(), one).unit()
         at = origin + direction * ((distance - normal.dot(origin)) / normal.dot(direction))
         direction = refract(direction, normal, one, glass)
         at = at + direction * (thickness / normal.dot(direction))
@@ -180,7 +180,7 @@ class DomeGlass(Port):
         self, origin: Varying, direction: Varying, numbers: Sequence[Varying]
     ) -> tuple[Varying, Varying]:
         radius, medium, x, y, z, thickness, glass = numbers
-        centre, index = joined(x, y, z), constant(1.0, len(medium.slope))
+        centre, index = stack_vector(x, y, z), constant(1.0, len(medium.slope))
         for size, beyond in ((radius, glass), (radius + thickness, medium)):
             arm = origin - centre
             along = arm.dot(direction)

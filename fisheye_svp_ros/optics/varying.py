@@ -58,7 +58,7 @@ class Varying:
         return self / self.dot(self).root()
 
 
-def joined(x: Varying, y: Varying, z: Varying) -> Varying:
+def stack_vector(x: Varying, y: Varying, z: Varying) -> Varying:
     """Return the vector (3, M) of three numbers."""
     return Varying(np.concatenate([x.value, y.value, z.value], axis=-2),
                    np.concatenate([x.slope, y.slope, z.slope], axis=-2))

@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.beyond import NOISES, Crossings
+from fisheye_svp_ros.paper.extensions import NOISES, Crossings
 from fisheye_svp_ros.paper.lens_evaluation import (
     LensEvaluation,
     LocalizedSpread,

@@ -13,8 +13,8 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.files import replacing, write_json, write_together
 from fisheye_svp_ros.paper import figures
-from fisheye_svp_ros.paper.beyond import CALIBRATION_NOISE, NOISES, POSE_SETS
 from fisheye_svp_ros.paper.claims import FAILS, HOLDS, IN_PART
+from fisheye_svp_ros.paper.extensions import CALIBRATION_NOISE, NOISES, POSE_SETS
 from fisheye_svp_ros.paper.lens_evaluation import shift_at
 from fisheye_svp_ros.paper.results import Results
 from fisheye_svp_ros.paper.studies import COMMAND, shift_curves

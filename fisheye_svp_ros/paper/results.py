@@ -12,8 +12,14 @@ import numpy as np
 from fisheye_svp_ros.io.lens_files import lens_to_dict, load_lens
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
-from fisheye_svp_ros.paper.beyond import NOISES, VARIANTS, Crossings, crossings, evaluate_variant
 from fisheye_svp_ros.paper.claims import Claim, claims
+from fisheye_svp_ros.paper.extensions import (
+    NOISES,
+    VARIANTS,
+    Crossings,
+    crossings,
+    evaluate_variant,
+)
 from fisheye_svp_ros.paper.lens_evaluation import LensEvaluation, captions_of
 from fisheye_svp_ros.paper.studies import Family, Stopping, load_family, load_stopping
 from fisheye_svp_ros.paper.tables import (

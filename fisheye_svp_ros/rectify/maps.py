@@ -135,7 +135,7 @@ class Rectification:
     def project(self) -> Callable[[Array], Image]:
         """The projection of points (..., 3), m, in the frame of the lens, with its corrections."""
         model = self._model
-        return partial(camera.project, model.lens) if model.plain else model.project
+        return partial(camera.project, model.lens) if model.is_lens_only else model.project
 
     def rectified_points(self, uv: Array) -> Array:
         """Return rectified pixels (..., 2) of image points (..., 2), px, where the maps have them.

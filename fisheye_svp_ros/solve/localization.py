@@ -87,7 +87,7 @@ def _improve(
 def _solve_from(model: ForwardModel, views: Views, start: Pose) -> tuple[Localization, bool]:
     """Solve from these starts alone; return also whether any target may be flat."""
     quick = None
-    if model.plain:
+    if model.is_lens_only:
         quick = engines.localize(model.lens, views.solver_inputs, views.row, MIN_POINTS, start)
     if quick is None:
         return _by_reference(model, views, start), True
@@ -208,7 +208,7 @@ class _Localization:
 
 def pose_equations(model: ForwardModel, pose: Pose, views: Views) -> tuple[Array, Arrays]:
     """Return costs (S,) and (H (S, 6, 6), g (S, 6)) of poses (S,), each the only unknown."""
-    if model.plain and model.lens.is_bare:
+    if model.is_lens_only and model.lens.is_bare:
         cost, *normal = engines.pose_equations(model.lens, *pose, views.solver_inputs)
         return cost, tuple(normal)
     linear = model.linearise(pose, views)

@@ -24,7 +24,7 @@ from fisheye_svp_ros.solve.rig_state import RigState, RigViews, group_by_frame
 
 _MIN_TIED_FRAMES = 3  # of two cameras that see one board: any relative pose explains one frame
 _MIN_TURN = np.radians(3.0)  # rms, about the second axis; poses of a view are off by less
-_FAR = 5.0  # times the median: frames of other moments
+_MAX_DISTANCE_RATIO = 5.0  # times the median: frames of other moments
 _ROUNDS = 3
 
 
@@ -137,7 +137,7 @@ def _solve_robustly(camera: Pose, flange: Pose) -> Transforms:
         found = solve_hand_eye(camera.take(kept), flange.take(kept), 1.0)
         off = found.flange(camera).difference(flange) / np.repeat([size, 1.0], 3)
         distance = np.linalg.norm(off, axis=1)
-        kept = np.asarray(distance <= _FAR * np.median(distance))
+        kept = np.asarray(distance <= _MAX_DISTANCE_RATIO * np.median(distance))
     return found
 
 

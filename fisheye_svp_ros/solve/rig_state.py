@@ -249,7 +249,7 @@ class Linearization:
         """Return columns (S, N, 2, P) of measured points from those of ideal ones."""
         if not self._follows_effects:
             return columns
-        return self.model.through(self.linear, self.data.views, columns)
+        return self.model.transform_columns(self.linear, self.data.views, columns)
 
     def _frame_columns(self) -> Array:
         d_place, d_turn = self._d_pose[..., :3], self._d_pose[..., 3:]

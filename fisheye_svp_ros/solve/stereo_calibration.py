@@ -78,7 +78,7 @@ def _solve_rigs(
 ) -> Minimum:
     left, right = models
     quick = None
-    if left.plain and right.plain:
+    if left.is_lens_only and right.is_lens_only:
         quick = engines.adjust_rigs(
             (left.lens, right.lens), (views[0].solver_inputs, views[1].solver_inputs), start)
     if quick is None:

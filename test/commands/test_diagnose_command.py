@@ -478,7 +478,7 @@ def test_intrinsics_are_told_with_their_unit():
 def test_a_single_frame_is_drawn(tmp_path):
     table, _ = seen({})
     found = diagnose(table.take((table.frame == 0) & (table.landmark < 6)), LENS)
-    points = point_residuals(found.simulation, found.named_fit)
+    points = point_residuals(found.simulation, found.cause_fit)
     for name, draw, arguments in residual_pictures(PlotData.from_diagnosis(found, points)):
         draw(tmp_path / f'{name}.png', *arguments)
     assert len(list(tmp_path.glob('*.png'))) == 7
@@ -502,7 +502,7 @@ def test_each_camera_of_a_rig_has_pictures_of_its_own_image(tmp_path, monkeypatc
     larger = replace(LENS, width=2 * LENS.width, cx=LENS.cx + step[0], cy=LENS.cy + step[1])
     found = diagnose(replace(table, cameras=('left', 'right'), **both),
                      {'left': LENS, 'right': larger}, options=DiagnosisOptions(quick=True))
-    shown = PlotData.from_diagnosis(found, point_residuals(found.simulation, found.named_fit))
+    shown = PlotData.from_diagnosis(found, point_residuals(found.simulation, found.cause_fit))
     named = {name: (draw, arguments) for name, draw, arguments in residual_pictures(shown)}
     draw, arguments = named['field']
     draw(tmp_path / 'field.png', *arguments)

@@ -198,7 +198,7 @@ class TestTarget:
         other = scene(np.random.default_rng(6), frames=4)
         np.testing.assert_allclose(
             model.predict(*other).uv, ForwardModel(KB).predict(*other).uv, rtol=0, atol=1e-9)
-        assert model.seeing(other[1]).plain and not model.seeing(SEEN[1]).plain
+        assert model.seeing(other[1]).is_lens_only and not model.seeing(SEEN[1]).is_lens_only
         assert model.terms_for(other[1]) == () and len(model.terms_for(SEEN[1])) == 1
         # One view of each: every view is judged by itself.
         both = [np.concatenate([a[:1], b[:1]]) for a, b in zip(SEEN[1], other[1], strict=True)]
@@ -226,7 +226,7 @@ class TestTarget:
         views = SEEN[1]._replace(points=SEEN[1].points.copy())
         assert views.points.shape[1] == 60
         views.points[:, :elsewhere] += 0.01
-        assert model.seeing(views).plain is not shown
+        assert model.seeing(views).is_lens_only is not shown
         moved = model.predict(SEEN[0], views).uv - ForwardModel(KB).predict(SEEN[0], views).uv
         assert bool(np.nanmax(np.abs(moved)) > 0.1) is shown
 

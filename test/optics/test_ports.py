@@ -12,7 +12,7 @@ from fisheye_svp_ros.io.lens_files import lens_from_dict, lens_to_dict, load_len
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics import camera, engines
 from fisheye_svp_ros.optics.curves import FlatPort, Gennery
-from fisheye_svp_ros.optics.engines import ported
+from fisheye_svp_ros.optics.engines import port_projection
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.optics.ports import DomeGlass, FlatGlass
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -52,7 +52,7 @@ def faces(port, a, b):
 
 def test_the_start_is_exact_where_all_rays_leave_one_viewpoint():
     lens = replace(AIR, viewpoint_shift=None, port=PORTS['flat'])
-    at, way = ported.trace_rays(lens, lens.port.start(points()))
+    at, way = port_projection.trace_rays(lens, lens.port.start(points()))
     assert np.abs(np.cross(points() - at.value.T, way.value.T)).max() < 1e-6
 
 

@@ -12,7 +12,7 @@ from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.share import config_path, lens_path
-from fisheye_svp_ros.paper.beyond import VARIANTS, scaled_shift
+from fisheye_svp_ros.paper.extensions import VARIANTS, scaled_shift
 from fisheye_svp_ros.paper.lens_evaluation import captions_of, localize_spreads
 from fisheye_svp_ros.paper.studies import load_family, load_stopping
 from fisheye_svp_ros.paper.tables import (

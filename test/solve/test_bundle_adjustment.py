@@ -195,13 +195,13 @@ def test_a_rig_predicts_each_view_by_its_camera():
         alone = own.linearise(pose.take(rows), views.take(rows))
         for name in ('uv', 'valid', 'd_pose', 'ideal', 'optical', 'points'):
             np.testing.assert_array_equal(getattr(linear, name)[rows], getattr(alone, name))
-        columns = own.through(alone, views.take(rows), alone.d_pose)
-        whole = state.model.through(linear, views, linear.d_pose)
+        columns = own.transform_columns(alone, views.take(rows), alone.d_pose)
+        whole = state.model.transform_columns(linear, views, linear.d_pose)
         np.testing.assert_allclose(whole[rows], columns, rtol=1e-14)
         image = state.model.predict(pose, views)
         assert np.array_equal(image.uv[rows], own.predict(pose.take(rows), views.take(rows)).uv,
                               equal_nan=True)
-    assert not state.model.plain and not ForwardModel(two_lenses()).plain
+    assert not state.model.is_lens_only and not ForwardModel(two_lenses()).is_lens_only
 
 
 def test_gauss_newton_under_white_noise_is_the_adjustment():

@@ -273,7 +273,7 @@ def _gather(
                      fixed.reshape(*rows.shape, fixed.shape[-1]), 0.0)
     fixed = fixed / np.maximum(np.sqrt((fixed**2).sum(axis=(1, 2), keepdims=True)), 1e-12)
     own = np.isin(target.landmark, ids)
-    where = target.points[own] + target.moved(linear.state.terms, linear.state.lens)[own]
+    where = target.points[own] + target.displacements(linear.state.terms, linear.state.lens)[own]
     slot = np.where(shown[at], np.searchsorted(ids, target.landmark[columns.unit[at]]), -1)
     partner = [np.arange(len(ids)), *(np.searchsorted(ids, one.partner) for one in turns)]
     frames = _Frames(

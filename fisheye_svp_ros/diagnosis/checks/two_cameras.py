@@ -115,7 +115,7 @@ def fitted_target(fitted: FittedModel, known: KnownTarget) -> Array:
     Effects of the target and predicted offsets; those of landmarks it did not see are zero.
     """
     offsets = fitted.predicted_offsets()
-    moved = known.moved(fitted.state.terms, fitted.state.lens)
+    moved = known.displacements(fitted.state.terms, fitted.state.lens)
     moved[np.searchsorted(known.landmark, offsets.landmark)] += offsets.offset
     return moved
 

@@ -2,8 +2,8 @@
 
 NumPy is the reference.  Numba computes the same faster, but must be loaded and, once on a machine,
 compile, which only long work pays back: what begins such work says so (`settle`).  A lens behind a
-port is traced by `ported`; an image field moves what any of them returns.  Anything else runs on
-NumPy, and gives the same to the last digit whatever was compiled before.
+port is traced by `port_projection`; an image field moves what any of them returns.  Anything else
+runs on NumPy, and gives the same to the last digit whatever was compiled before.
 FISHEYE_SVP_ENGINE or `use` have the last word; nothing outside this package asks which one runs.
 """
 
@@ -16,7 +16,7 @@ from types import ModuleType
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.errors import ParameterError
-from fisheye_svp_ros.optics.engines import cache, numpy_engine, ported
+from fisheye_svp_ros.optics.engines import cache, numpy_engine, port_projection
 from fisheye_svp_ros.optics.engines.results import Incidence, Localization, Rigs, Seen
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -54,13 +54,13 @@ def settle(points: float) -> str:
 def incidence(lens: Lens, points: Array, limited: bool) -> Incidence:
     """Return where points (M, 3), m, in the camera frame have their ray through the lens."""
     if lens.port is not None:
-        return ported.incidence(lens, points, limited)
+        return port_projection.incidence(lens, points, limited)
     return numpy_engine.incidence(lens, points, limited)
 
 
 def project(lens: Lens, points: Array, limited: bool) -> tuple[Array, Mask]:
     """Return image points (M, 2), px, of points (M, 3), m, in the camera frame, and validity."""
-    engine = _engine if lens.port is None else ported
+    engine = _engine if lens.port is None else port_projection
     uv, valid = engine.project(lens, points, limited)
     return uv if lens.image_field is None else lens.image_field.apply(uv), valid
 
@@ -73,7 +73,7 @@ def linearise_views(
     rotation (S, 3, 3), position (S, 3): cameras in the world.  The derivatives (S, N, 2, 6) are
     by the small changes of `pose.Pose.retract`, px/m and px/rad.
     """
-    engine = _engine if lens.port is None else ported
+    engine = _engine if lens.port is None else port_projection
     uv, valid, d_pose = engine.linearise_views(lens, rotation, position, points, limited)
     if lens.image_field is not None:
         d_pose, uv = lens.image_field.carry(uv, d_pose), lens.image_field.apply(uv)
