@@ -16,7 +16,11 @@ from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameters import rows, with_values
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.access import check_access
-from fisheye_svp_ros.nodes.declaration import declare, unknown_parameters
+from fisheye_svp_ros.nodes.declaration import (
+    declare,
+    unknown_parameters,
+    with_declared_types,
+)
 from fisheye_svp_ros.nodes.inputs import Unread
 from fisheye_svp_ros.nodes.quality import INPUT, RELIABLE, create_with_qos
 from fisheye_svp_ros.nodes.silence import LIMIT, explain_silence, silent_inputs
@@ -82,6 +86,7 @@ class BaseNode(Node):  # type: ignore[misc]
         """
         self.take_up()
         self.introduce()
+        self.add_pre_set_parameters_callback(functools.partial(with_declared_types, self))
         self.add_on_set_parameters_callback(self._consider)
         self.add_post_set_parameters_callback(self.guard_callback(self._adopt))
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.parameter import Parameter
 
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameter_files import read_parameter_file
@@ -33,6 +34,23 @@ def declare(node: Any, kind: type[S], given: Mapping[str, Any]) -> S:
             row.name, list(value) if isinstance(value, tuple) else value, descriptor(row),
             ignore_override=True)
     return settings
+
+
+def with_declared_types(node: Any, parameters: Sequence[Any]) -> list[Any]:
+    """Return parameters with whole numbers as floating-point ones where those are declared.
+
+    `ros2 param set NODE patience 1` sends an integer.
+    """
+    changed = []
+    for one in parameters:
+        declared = node.get_parameter(one.name).type_ if node.has_parameter(one.name) else None
+        if (one.type_, declared) == (Parameter.Type.INTEGER, Parameter.Type.DOUBLE):
+            one = Parameter(one.name, Parameter.Type.DOUBLE, float(one.value))
+        elif (one.type_, declared) == (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY):
+            values = [float(value) for value in one.value]
+            one = Parameter(one.name, Parameter.Type.DOUBLE_ARRAY, values)
+        changed.append(one)
+    return changed
 
 
 def unknown_parameters(node: Any, given: Mapping[str, Any], known: Sequence[str]) -> Iterator[str]:

@@ -121,6 +121,18 @@ def test_a_good_value_is_taken_into_use(start: Callable[..., Any]) -> None:
     assert node.settings.lens == 'fish180' and node.settings.svp == 'true'
 
 
+def test_a_whole_number_is_taken_for_a_floating_point_parameter(
+    start: Callable[..., Any]
+) -> None:
+    node = start('synthetic_camera')
+    for name, value in (('rate', 1), ('poses', [0, 0, 0, 1, 0, 0, 0])):
+        assert set_parameter(node, name, value).successful, name
+    assert (node.settings.rate, node.settings.poses) == (1.0, (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assert isinstance(node.get_parameter('rate').value, float)
+    assert not set_parameter(node, 'rate', -1).successful
+    assert not set_parameter(node, 'seed', 1.5).successful
+
+
 def test_a_parameter_of_ros_itself_starts_nothing_over(start: Callable[..., Any]) -> None:
     camera = start('synthetic_camera')
     steps = camera._steps
