@@ -43,6 +43,8 @@ def main() -> None:
     figure, axes = plt.subplots(layout='constrained')
     axes.loglog(RANGES, full, 'o-', label='full lens: the noise alone')
     axes.loglog(RANGES, svp, 's-', label='SVP')
+    axes.set_xticks(RANGES, map(str, RANGES))
+    axes.set_xticks([], minor=True)
     axes.set(xlabel='range of the landmarks [m]', ylabel='median position error [mm]')
     axes.legend()
     figure.savefig(args.output)

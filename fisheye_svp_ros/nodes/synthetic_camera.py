@@ -43,9 +43,9 @@ class PhotographingSettings(SyntheticCameraSettings):
     """Parameters of the synthetic camera and of what it photographs."""
 
     photograph: str = parameter(
-        '', 'Board, chessboard:COLUMNSxROWS:SIZE, to publish rendered images of on `image`, in '
+        '', 'Board, chessboard:COLUMNSxROWS:SIZE: publish rendered images of it on `image`, in '
         'place of landmarks and image points. Its first inner corner is the origin of the '
-        'world, x right, y down, z away from the camera. Empty: none', fixed=True
+        'world, x right, y down, z away from the camera', fixed=True
     )
 
 

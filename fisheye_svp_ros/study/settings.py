@@ -13,9 +13,8 @@ class Settings:
     """Parameters that every node has."""
 
     wait_for_subscribers: int = parameter(
-        0, 'Publish nothing before this number of subscribers listens to the image points (a '
-        'camera; the true pose, if it publishes images) or the results (a solver), so that '
-        'none misses the first', span=(0, 1000)
+        0, 'Publish nothing before this number of subscribers listens to the image points (true '
+        'poses, if a camera publishes images) or, of a solver, the results', span=(0, 1000)
     )
     folder: str = parameter(
         '', 'Folder of the files that `scenario` or a new parameter value may name while the node '
@@ -30,14 +29,13 @@ class CameraSettings(Settings):
     rate: float = parameter(10.0, 'Sets per second', 'Hz', (1e-3, 1e4))
     repeat: bool = parameter(True, 'Start again after the last set; otherwise the node ends')
     lock_step: str = parameter(
-        '', 'Result topics, separated by blanks: each set waits until all of them have answered '
-        'the previous one, and `rate` is ignored. Empty: do not wait'
+        '', 'Result topics, separated by blanks: each set waits, in place of `rate`, until all '
+        'have answered the previous one. Empty: do not wait'
     )
     world_frame: str = parameter('world', 'Frame id of the world', fixed=True)
     camera_frame: str = parameter(
         '', 'Frame id of the camera; in a rig with the prefix left_ or right_. Empty: '
-        'camera_optical_frame, in a namespace with its name as prefix: '
-        'front_camera_optical_frame',
+        'camera_optical_frame; in the namespace front, front_camera_optical_frame',
         fixed=True
     )
     publish_tf: bool = parameter(
