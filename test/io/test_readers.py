@@ -368,3 +368,18 @@ class TestOrpc:
         table = read_observations(OV_PLANE / f'{part}.csv')
         rounded = replace(orpc, uv=np.round(orpc.uv, 5), xyz=np.round(orpc.xyz, 7))
         assert same(rounded, table)
+
+
+@pytest.mark.parametrize(('frame', 't', 'said'), [
+    (0, 1.7e18, 'a time in seconds (these are nanoseconds: divide by 1e+09) is needed'),
+    (1_700_000_000_123_456_789, 0.5, '(stamps in nanoseconds belong in t, in seconds)'),
+])
+def test_stamps_in_nanoseconds_are_told_that_seconds_are_meant(
+    tmp_path: Path, frame: int, t: float, said: str
+) -> None:
+    path = tmp_path / 'o.csv'
+    path.write_text(f'frame,landmark,u,v,x,y,z,t\n{frame},1,10,20,0.1,0.2,0,{t}\n',
+                    encoding='utf-8')
+    with pytest.raises(ObservationError) as caught:
+        read_observations(path)
+    assert said in str(caught.value) and 'o.csv' in str(caught.value)
