@@ -363,7 +363,8 @@ class Evaluation:
             return {}
         selection = self.selection
         written = self.averaged_model
-        errors = written.widen_errors(self._errors_of(self.null, self.other_models))
+        alone = self._errors_of(self.null, self.other_models) if written.kinds else self.errors
+        errors = written.widen_errors(alone)
         after = dict(zip(shared_names(written.linear), errors, strict=True))
         given = stated_parameters(selection.problem.inputs.lenses)
         before = self._errors_of(selection.first)

@@ -125,7 +125,7 @@ def find_bounds(null: NullModel) -> list[Bound]:
                 effect.name not in smallest or len(mine) < len(smallest[effect.name][1])):
             smallest[effect.name] = effect, mine
     return [_effect_bound(null, effect, mine, np.concatenate([*columns, mine]),
-                   np.concatenate([*prior, null.prior_precision(mine, effect)]))
+                          np.concatenate([*prior, null.prior_precision(mine, effect)]))
             for effect, mine in smallest.values()]
 
 
