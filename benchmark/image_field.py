@@ -28,6 +28,8 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import diagnose
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.image_field import ImageField
+from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import calibrate
 
 FRAMES = 14, 19
@@ -60,17 +62,25 @@ def draw_warp(rng: np.random.Generator, size: float) -> Callable[[Array], Array]
     return warp
 
 
-def trial(number: int) -> Outcome:
-    """Calibrate and diagnose one set; every other one has a warp."""
+def draw_warped_set(
+    number: int, frames: tuple[int, int] = FRAMES
+) -> tuple[Observations, Lens, float]:
+    """Draw photographs, the lens that took them and the rms of its warp, px; 0 for even ones."""
     seed, warped = divmod(number, 2)
     rng = np.random.default_rng(10_000 + seed)
     size = float(np.exp(rng.uniform(*np.log([0.05, 0.4])))) * warped
     warp = draw_warp(rng, size)
-    table, bare = draw_set(seed, FRAMES, warp)
+    table, bare = draw_set(seed, frames, warp)
     low, pitch = np.full(2, -4 * _PITCH), np.full(2, _PITCH)
     shape = (int(HEIGHT / _PITCH) + 9, int(WIDTH / _PITCH) + 9, 2)
     nodes = ImageField(low, pitch, np.zeros(shape)).nodes
-    truth = replace(bare, image_field=ImageField.interpolate(low, pitch, warp(nodes)))
+    field = ImageField.interpolate(low, pitch, warp(nodes))
+    return table, replace(bare, image_field=field), size
+
+
+def trial(number: int) -> Outcome:
+    """Calibrate and diagnose one set; every other one has a warp."""
+    table, truth, size = draw_warped_set(number)
     given = calibrate(table, 'kannala_brandt', (WIDTH, HEIGHT)).adjusted.lens
     written = diagnose(table, given, free_intrinsics=True).lens
     lenses = given, replace(written, image_field=None), written
