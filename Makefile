@@ -22,7 +22,7 @@ export PYTHONDONTWRITEBYTECODE :=
 # setuptools has a long notice for every editable installation.
 QUIETLY := PYTHONWARNINGS='ignore:Editable installation'
 
-.PHONY: demo check test tests coverage lint paper paper-search blind blind-independent blind-images averaging image-field guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
+.PHONY: demo check test tests coverage lint paper paper-search blind blind-independent blind-images averaging image-field ray-coverage guided detectors docs bench compare decisions rectification hand-eye rigs kills mutation poses fuzz soak test-oldest clean
 
 demo: $(VENV)/ready
 	$(BIN)/fisheye-svp demo -o $(OUT)/demo
@@ -92,6 +92,10 @@ averaging: $(VENV)/ready
 # What the image field in a lens file is worth, into docs/results/image_field.md.
 image-field: $(VENV)/ready
 	$(BIN)/python -m benchmark.image_field --sets 30
+
+# Whether stated ray errors contain the true ones, into docs/results/ray_coverage.md.
+ray-coverage: $(VENV)/ready
+	$(BIN)/python -m benchmark.ray_coverage --sets 50
 
 # The live guide tried on rendered images by somebody who holds the board, into docs/results/next/.
 guided: $(VENV)/ready
