@@ -9,6 +9,7 @@ every other one with a hidden error of the lens.  Writes docs/results/hand_eye.m
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -32,7 +33,7 @@ from fisheye_svp_ros.simulate.simulation import predict_points
 from fisheye_svp_ros.solve.hand_eye import Transforms
 from fisheye_svp_ros.solve.lens_calibration import Calibration, calibrate, calibrate_hand_eye
 
-TRIALS, DIAGNOSED = 60, 12
+TRIALS, DIAGNOSED = 60, 120
 _DOC = Path(__file__).parents[1] / 'docs' / 'results' / 'hand_eye.md'
 _FRAMES, _NOISE_PX = 20, 0.15
 _LENS = Lens('made', 1280, 800, 350.0, 350.5, 645.0, 396.0, KannalaBrandt(-0.01, 0.002), 1.6)
@@ -183,7 +184,7 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     asked = [one for one in outcomes if one.named is not None]
     lines = [
         '# Cameras on robots', '',
-        'Written by `python -m benchmark.hand_eye` (`make hand-eye`). A robot turns a camera of\n'
+        'Written by `python -m benchmark.hand_eye` (`make hand-eye`). A robot turns a camera of '
         f'1280 x 800 px ({_LENS.fx:.0f} px, Kannala-Brandt) before a board of {_COLUMNS} x '
         f'{_ROWS} corners, {_FRAMES} photographs, {_NOISE_PX} px of noise. Its poses are those of '
         'the flange, with noise of 0.1 to 0.4 mm and 0.02 to 0.08 deg an axis and a scale of '
@@ -202,7 +203,8 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     ]
     if asked:
         lines += [*_diagnosed_lines(asked), '']
-    write_text(path, '\n'.join(lines))
+    write_text(path, '\n'.join(textwrap.fill(line, 100, break_on_hyphens=False)
+                               for line in lines))
 
 
 def _median(errors: Sequence[tuple[float, float]]) -> Array:

@@ -170,4 +170,4 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         return f'the scale of the board is off by {100 * most:.2g} %'
     if worst.effect == 'board_pose':
         return 'the relative poses of its boards are wrong'
-    return f'{worst.effect} is confirmed'
+    return f'confirmed cause: {worst.effect}'

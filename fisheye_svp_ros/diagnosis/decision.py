@@ -132,7 +132,7 @@ def decide_lens(facts: LensFacts) -> Decision:
             Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
     if facts.refitted:
         names = ', '.join(facts.refitted)
-        return Decision('recalibrate', f'{names} of the lens as given is wrong', gained, file.sure)
+        return Decision('recalibrate', f'the lens as given is wrong in {names}', gained, file.sure)
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
@@ -149,13 +149,13 @@ def decide_lens(facts: LensFacts) -> Decision:
     if facts.lens_causes:
         names = ', '.join(facts.lens_causes)
         return Decision(
-            'undecided', f'{names} is confirmed, but the held-out error of the extended lens '
+            'undecided', f'with {names} the held-out error of the extended lens '
                          f'({file.extended_px:.3g} px) is not significantly smaller than that of '
                          f'the lens as given ({file.given_px:.3g} px)', gained, file.sure, bounds)
     if hint is not None:
         sure = erf(hint.z / 2**0.5)
         return Decision(
-            'undecided', f'{hint.effect} is likely but not confirmed: it may cause up to '
+            'undecided', f'likely but not confirmed: {hint.effect}, which may cause up to '
                          f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
     return Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
 

@@ -12,7 +12,7 @@ from fisheye_svp_ros.diagnosis import Cause, Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.tables import with_error
 
-_HUMAN = {
+HUMAN_UNITS = {
     'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
     '1': (1e2, '%'), '1/rad^2': (1.0, '/rad²'),
 }
@@ -29,7 +29,7 @@ def describe_effect(effect: str) -> str:
 
 def quantity(entry: Mapping[str, Any]) -> str:
     """Return a parameter's value and standard error in the unit that people read."""
-    factor, unit = _HUMAN.get(entry['unit'], (1.0, entry['unit']))
+    factor, unit = HUMAN_UNITS.get(entry['unit'], (1.0, entry['unit']))
     value, error = with_error(factor * entry['value'], factor * entry['stderr'])
     return (f'{value} {unit}' if error == '-' else f'{value} ± {error} {unit}').rstrip()
 
@@ -49,7 +49,9 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     shown = {name: entry for name, entry in cause.parameters.items() if _is_determined(entry)}
     largest = sorted(shown, key=lambda name: -_significance(shown[name]))[:_MAX_PARAMETERS]
     text = ', '.join(f'{name} = {quantity(shown[name])}' for name in shown if name in largest)
-    return text + (f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else '')
+    text += f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else ''
+    within = bool(shown) and all(_significance(entry) < 1 for entry in shown.values())
+    return f'size within its error: {text}' if within else text
 
 
 def most_significant(parameters: Mapping[str, Mapping[str, Any]]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +18,7 @@ from fisheye_svp_ros.diagnosis import (
     frames_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.cause_text import size
+from fisheye_svp_ros.reporting.cause_text import HUMAN_UNITS, size
 from fisheye_svp_ros.reporting.diagnosis_text import frame_ranges, known_rows, lens_words
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
@@ -100,8 +99,8 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
     for one in screen.actions:
         names = ', '.join(photo.name for photo in one.photographs)
         names += f' and {one.more} more' if one.more else ''
-        lines.append(f'{one.about}: {one.do}. {one.why}{one.sure and f" ({one.sure})"}'
-                     f'{names and f": {names}"}.')
+        lines.append(f'{one.about}: {one.do}{names and f": {names}"}. {one.why}'
+                     f'{one.sure and f" ({one.sure})"}.')
     lines += [f'Causes: {screen.causes}'] if screen.causes else []
     lines += [f'Against the truth: {screen.truth}'] if screen.truth else []
     lines += [f'Not confirmed: {screen.candidates}'] if screen.candidates else []
@@ -173,10 +172,9 @@ def _candidates(d: Diagnosis) -> str:
 
 
 def _bound_text(decision: Decision) -> str:
-    human = {'m': (1e3, 'mm'), 'rad': (180 / math.pi, 'deg')}
     words = []
     for one in decision.bound:
-        factor, unit = human.get(one.unit, (1.0, ''))
+        factor, unit = HUMAN_UNITS.get(one.unit, (1.0, ''))
         words.append(f'{one.effect} up to {factor * one.value:.2g} {unit}'.rstrip()
                      + f' ({one.edge_px:.2g} px, {one.edge_mrad:.2g} mrad at the edge)')
     return '; '.join(words)

@@ -43,7 +43,7 @@ _HEADLINES = {
 
 def headline(d: Diagnosis) -> str:
     """Return the largest cause and the decision about the lens."""
-    return f'{largest_cause(d)}. {lens_words(d)}.'
+    return f'{largest_cause(d)}{_displaced_landmarks(d)}. {lens_words(d)}.'
 
 
 def target_words(d: Diagnosis) -> str:
@@ -77,6 +77,15 @@ def largest_cause(d: Diagnosis) -> str:
     if d.verdict == 'adequate':
         return 'No model error shows in these data'
     return 'No effect of the catalog explains the residual error'
+
+
+def _displaced_landmarks(d: Diagnosis) -> str:
+    """Return that the target is to be measured again, where the causes are all of others."""
+    target = d.decision['target']
+    if (target.say != 'measure_again' or target.figure.name != 'local_offsets' or not d.causes
+            or target.confidence is None):
+        return ''
+    return f', and landmarks of the target are displaced ({target.figure.value:.2g} px)'
 
 
 def _sentence(d: Diagnosis, cause: Cause) -> str:

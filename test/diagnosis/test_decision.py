@@ -78,6 +78,17 @@ def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
     assert found.say == 'undecided' and found.confidence == 0.0
 
 
+@pytest.mark.parametrize('facts', [
+    SOUND._replace(bounds=[LIKELY]),
+    SOUND._replace(lens_causes=['sensor_tilt'], causes=['sensor_tilt'], named_gain=(0.1, 0.02)),
+    SOUND._replace(refitted=['focal_length']),
+])
+def test_no_reason_begins_with_the_name_of_an_effect(facts: LensFacts) -> None:
+    """Reasons begin sentences: the first screen had "Sensor_tilt is confirmed"."""
+    first = decide_lens(facts).why.split()[0]
+    assert '_' not in first and first in ('likely', 'with', 'the')
+
+
 TARGET = TargetFacts(['target_shape'], 'board 0 is bent by 0.81 mm', (0.82, 0.76, 1.0), 0.137,
                      0.05, 4e-5, 1e-6, 0.043, False)
 

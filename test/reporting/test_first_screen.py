@@ -1,14 +1,19 @@
-"""The first screen of a report warns of errors that rise, and of no other."""
+"""The first screen of a report: what it warns of, and what its sentences say."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from helpers.diagnoses import with_changes
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import Diagnosis, DiagnosisOptions, diagnose
-from fisheye_svp_ros.reporting.first_screen import first_screen
+from fisheye_svp_ros.diagnosis import Cause, Diagnosis, DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis.decision import Bound, Figure
+from fisheye_svp_ros.reporting.cause_text import size
+from fisheye_svp_ros.reporting.first_screen import Photo, first_screen, terminal_lines
+from fisheye_svp_ros.reporting.headline import headline
 
 
 @pytest.fixture(scope='module')
@@ -28,3 +33,49 @@ def test_a_rise_is_warned_of_where_it_is_one(
         ratio * found.figures.base.rms_px, named.heldout_rms_px, named.chi2_per_dof))
     said = first_screen(risen, 'table').warning
     assert ('rms on the fitted frames, with the causes' in said) == warned
+
+
+def test_bounds_are_read_in_percent_and_millimetres(found: Diagnosis) -> None:
+    """A decentering "up to 0.0012" told nobody anything."""
+    bounds = [Bound('decentering', 0.0012, '1', 0.7, 0.02, 0.05),
+              Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)]
+    said = first_screen(_deciding(found, 'lens', bound=bounds), 'table').bound
+    assert 'decentering up to 0.12 % (' in said
+    assert 'viewpoint_shift up to 0.4 mm (' in said
+
+
+def test_the_terminal_names_photographs_after_what_to_do(found: Diagnosis) -> None:
+    screen = first_screen(found, 'table')
+    action = screen.actions[2]._replace(
+        do='Take some again', why='2 of 26 scatter', sure='',
+        photographs=(Photo('10.jpg', ''), Photo('8.jpg', '')), more=1)
+    lines = terminal_lines(screen._replace(actions=(action,)), '')
+    assert ('Photographs: Take some again: 10.jpg, 8.jpg and 1 more. 2 of 26 scatter.'
+            in lines)
+
+
+def test_a_size_within_its_error_is_called_so(found: Diagnosis) -> None:
+    """A cause may be certain by all its parameters together and each may be within its error."""
+    assert size(found, _tilt(-0.0005, 0.002)) == 'size within its error: x = -0.03 ± 0.11 deg'
+    assert size(found, _tilt(0.005, 0.002)) == 'x = 0.29 ± 0.11 deg'
+
+
+def test_the_headline_says_that_the_target_is_imperfect_too(found: Diagnosis) -> None:
+    """The decision was to measure the target again, and the headline spoke of the lens alone."""
+    offsets = Figure('local_offsets', 0.38, 'px')
+    again = replace(_deciding(found, 'target', say='measure_again', figure=offsets),
+                    causes=[_tilt(0.005, 0.002)])
+    assert headline(again).startswith(
+        'The sensor is tilted (x = 0.29 ± 0.11 deg), and landmarks of the target are displaced '
+        '(0.38 px). ')
+    assert 'landmarks' not in headline(_deciding(again, 'target', say='keep'))
+
+
+def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
+    decided = {**found.decision, about: replace(found.decision[about], **changes)}
+    return replace(found, conclusion=replace(found.conclusion, decision=decided))
+
+
+def _tilt(value: float, error: float) -> Cause:
+    return Cause('sensor_tilt', 'sensor_tilt', {'x': {
+        'value': value, 'stderr': error, 'unit': 'rad'}}, 1e-9, 0.2, True, 0.1, 0.3, [], '')
