@@ -167,7 +167,9 @@ def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:
         return f'{count} landmark{"s are" if count > 1 else " is"} displaced'
     if worst.effect == 'landmark_scale':
         most = max((abs(p['value']) for p in worst.parameters.values()), default=0.0)
-        return f'the scale of the board is off by {100 * most:.2g} %'
+        stretched = 'relative' not in worst.parameters
+        what = 'the board is stretched' if stretched else 'the scale of the board is off'
+        return f'{what} by {100 * most:.2g} %'
     if worst.effect == 'board_pose':
         return 'the relative poses of its boards are wrong'
     return f'confirmed cause: {worst.effect}'

@@ -136,9 +136,8 @@ def decide_lens(facts: LensFacts) -> Decision:
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
-            'use_extended', f'held-out error {file.extended_px:.3g} px instead of '
-                            f'{file.given_px:.3g} px with the lens as given, both on the '
-                            'corrected target', gained, file.sure)
+            'use_extended', 'on the same corrected target it takes the held-out error from '
+                            f'{file.given_px:.3g} to {file.extended_px:.3g} px', gained, file.sure)
     hint = max((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
                key=lambda one: one.edge_px, default=None)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
@@ -149,9 +148,9 @@ def decide_lens(facts: LensFacts) -> Decision:
     if facts.lens_causes:
         names = ', '.join(facts.lens_causes)
         return Decision(
-            'undecided', f'with {names} the held-out error of the extended lens '
-                         f'({file.extended_px:.3g} px) is not significantly smaller than that of '
-                         f'the lens as given ({file.given_px:.3g} px)', gained, file.sure, bounds)
+            'undecided', f'it is not certain that {names} in the lens reduces the held-out error '
+                         f'({file.given_px:.3g} → {file.extended_px:.3g} px): its probability is '
+                         f'{100 * file.sure:.0f} %', gained, file.sure, bounds)
     if hint is not None:
         sure = erf(hint.z / 2**0.5)
         return Decision(
@@ -203,7 +202,7 @@ def decide_target(facts: TargetFacts) -> Decision:
         figure = Figure('gain', gain, '1')
         if low > 0 and facts.local_px <= facts.named_px:
             return Decision('correct', f'{facts.size}; the correction removes {100 * gain:.0f} % '
-                                       'of the held-out error', figure, sure)
+                                       'of the squared held-out error', figure, sure)
         return Decision('measure_again', f'{facts.size}; in addition, {local}', figure, sure)
     figure = Figure('local_offsets', facts.local_px, 'px')
     if facts.local_px > facts.noise_px:

@@ -131,9 +131,7 @@ def multiply_columns(random: RandomColumns, group_fixed: Array, border: Array) -
     own = np.concatenate([group_fixed, random.group], axis=-1)
     across, flat = np.swapaxes(own, -1, -2), border.reshape(groups * height, border.shape[-1])
     uu, ux = _square_offsets(random), offsets.T @ flat
-    ug = np.zeros((offsets.shape[1], groups, own.shape[-1]))
-    for g in range(groups):
-        ug[:, g] = offsets[g * height : (g + 1) * height].T @ own[g]
+    ug = _multiply_groups(offsets, own)
     us = np.concatenate([(offsets.T @ shared).toarray(), _multiply_units(uu, random)], axis=1)
     # A field is a combination of units, and so are its products.
     fs, fx, fg = fields @ us, fields @ ux, fields @ ug.reshape(len(ug), groups * own.shape[-1])
@@ -166,7 +164,7 @@ def _multiply_units(squares: Array, random: RandomColumns) -> Array:
 
 
 def _multiply_groups(shared: sparse.csr_array, own: Array) -> Array:
-    """Return the products (S, G, W) of shared columns with those of each group (G, M, W)."""
+    """Return the products (S, G, W) of columns of all groups with each one's own (G, M, W)."""
     groups, height, width = own.shape
     count = shared.shape[1]
     group = np.repeat(np.arange(groups * height) // height, np.diff(shared.indptr))

@@ -172,12 +172,14 @@ def _step(step: TraceStep) -> dict[str, Any]:
 
 
 def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the bars of the budget: stage, percent without and with a name."""
+    """Return the bars of the budget: stage, percent without and with a name, the names."""
     shares = stage_shares(diagnosis.components)
+    names = {stage: ', '.join(cause.effect for cause in diagnosis.causes
+                              if cause.effect_class.budget_stage() == stage) for stage in shares}
     total = diagnosis.figures.base.rms_px**2
     return {
         'bars': [
-            (stage, text.STAGE_WORDS[stage], 100 * (share - named), 100 * named)
+            (stage, text.STAGE_WORDS[stage], 100 * (share - named), 100 * named, names[stage])
             for stage, (share, named) in shares.items()
         ],
         'total_px2': f'{total:.3g}',

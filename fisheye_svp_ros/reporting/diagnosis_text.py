@@ -30,11 +30,14 @@ LENS = {
     'keep': 'Keep the lens',
     'use_extended': f'Use {LENS_FILE}',
     'recalibrate': f'Do not use the lens as given; calibrate again, or use {LENS_FILE}',
-    'undecided': 'Undecided; take more photographs',
+    'undecided': 'Undecided about the lens; take more photographs',
 }
-_OF_RIG = {'keep': 'Keep the lenses', 'undecided': 'Undecided; take more photographs',
-           'recalibrate': 'Do not use these lenses as given; calibrate again, or use the extended '
-           'lenses', 'use_extended': 'Use the extended lenses'}
+_OF_RIG = {
+    'keep': 'Keep the lenses',
+    'use_extended': 'Use the extended lenses',
+    'recalibrate': 'Do not use these lenses as given; calibrate again, or use the extended lenses',
+    'undecided': 'Undecided about the lenses; take more photographs',
+}
 VARIABLES = {
     'image': 'the position in the image',
     'theta': 'the incidence angle',

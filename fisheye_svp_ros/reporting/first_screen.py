@@ -118,7 +118,7 @@ def _facts(d: Diagnosis, source: str) -> str:
         asked = d.problem.options.range_m or 1.0
         before, after = (next(one['value'] for one in rays[side] if one['range_m'] == asked)
                          for side in ('given', 'extended'))
-        near = f'; ray error at {asked:g} m {before:.2g} → {after:.2g} mrad'
+        near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
     return (f'{source}: {d.observations} points in {d.frames} {kind}; held-out error '
             f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
             f'noise {d.noise_px:.2g} px{near}')
@@ -139,13 +139,13 @@ def _warning(d: Diagnosis) -> str:
 
 
 def _confidence(decision: Decision) -> str:
-    if decision.confidence is None:
+    if decision.confidence is None or decision.say == 'undecided':
         return ''
     sure = f'{100 * decision.confidence:.0f} % sure'
     if decision.confidence > _CERTAIN:
         sure = f'more than {100 * _CERTAIN:.0f} % sure'
     if decision.say == 'use_extended':
-        return f'removes {100 * decision.figure.value:.0f} % of the error, {sure}'
+        return f'removes {100 * decision.figure.value:.0f} % of the squared error, {sure}'
     return sure
 
 

@@ -14,14 +14,14 @@ VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Correct it by {LENS_FILE} (valid for this target only), or flatten or replace it',
-    'measure_again': 'Measure the board, flatten or replace it',
+    'correct': f'Correct it by {LENS_FILE} (valid for this target only), or ',
+    'measure_again': 'Measure the target, or ',
 }
 PHOTOGRAPHS = {
     'enough': 'Enough', 'more': 'Take more', 'retake': 'Take some again',
 }
 _HEADLINES = {
-    'viewpoint_shift': 'The viewpoint of the lens moves',
+    'viewpoint_shift': 'The viewpoint of the lens shifts with the angle',
     'radial_profile': 'The image-height curve of the lens is wrong',
     'focal_length': 'The focal length is wrong',
     'principal_point': 'The principal point is wrong',
@@ -49,7 +49,9 @@ def headline(d: Diagnosis) -> str:
 def target_words(d: Diagnosis) -> str:
     """Return what to do about the target."""
     say = d.decision['target'].say
-    return TARGET['measure_again' if say == 'correct' and not d.offers_extended else say]
+    words = TARGET['measure_again' if say == 'correct' and not d.offers_extended else say]
+    bent = any(cause.effect == 'target_shape' for cause in d.causes)
+    return words if say == 'keep' else f'{words}{"flatten or " if bent else ""}replace it'
 
 
 def largest_cause(d: Diagnosis) -> str:
@@ -95,6 +97,8 @@ def _sentence(d: Diagnosis, cause: Cause) -> str:
         which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'
         return f'{which} is bent by {1e3 * worst.peak_to_valley:.2g} mm'
     words = _HEADLINES.get(cause.effect, _capital(describe_effect(cause.effect)))
+    if cause.effect == 'landmark_scale' and 'relative' not in cause.parameters:
+        words = 'The target is stretched'
     # Of several parameters, the most significant one.
     how = size(d, cause) if cause.effect_class.target_map else most_significant(cause.parameters)
     return f'{words} ({how})' if how else words

@@ -385,7 +385,8 @@ class TestWords:
             for name, value in zip('xyz', (0.1, 0.2, 0.6), strict=True)})
         words = headline(with_changes(found, causes=[first, board]))
         assert words.startswith('The relative poses of the boards are wrong (board1.z = 0.60 ± '
-                                '0.10 mm), and the viewpoint of the lens moves (e0 = ')
+                                '0.10 mm), and the viewpoint of the lens shifts with the '
+                                'angle (e0 = ')
 
     def test_points_that_are_set_aside_are_no_riddle(self, found):
         gross = [{'frame': 4, 'landmark': 17, 'px': 12.3456, 'why': 'far off'}] * 2
@@ -395,7 +396,8 @@ class TestWords:
         assert headline(clean).startswith('2 image points are outliers; nothing else is wrong')
         *_, following = verdict_sentences(clean)
         partly = with_changes(found, remaining=left, gross=gross)
-        assert headline(partly).startswith('The viewpoint of the lens moves (e0 = ')
+        assert headline(partly).startswith(
+            'The viewpoint of the lens shifts with the angle (e0 = ')
         more = [*left, Structure('range', 1e-9, 0.3)]
         assert headline(with_changes(clean, remaining=more)).startswith(
             'No effect of the catalog explains the residual error')

@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis import Cause, Diagnosis, DiagnosisOptions, diagno
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.reporting.cause_text import size
 from fisheye_svp_ros.reporting.first_screen import Photo, first_screen, terminal_lines
-from fisheye_svp_ros.reporting.headline import headline
+from fisheye_svp_ros.reporting.headline import headline, target_words
 
 
 @pytest.fixture(scope='module')
@@ -79,3 +79,28 @@ def _deciding(found: Diagnosis, about: str, **changes: object) -> Diagnosis:
 def _tilt(value: float, error: float) -> Cause:
     return Cause('sensor_tilt', 'sensor_tilt', {'x': {
         'value': value, 'stderr': error, 'unit': 'rad'}}, 1e-9, 0.2, True, 0.1, 0.3, [], '')
+
+
+@pytest.mark.parametrize(('parameter', 'words'), [
+    ('relative', 'The scale of the target is wrong'), ('x_over_y', 'The target is stretched')])
+def test_a_board_that_is_longer_one_way_is_not_one_of_another_scale(
+    found: Diagnosis, parameter: str, words: str
+) -> None:
+    """Who reads that the scale is off by 0.47 % corrects the size of a square."""
+    scale = replace(_tilt(0.0, 0.0), effect='landmark_scale', parameters={
+        parameter: {'value': 0.0047, 'stderr': 0.0002, 'unit': '1'}})
+    assert headline(replace(found, causes=[scale])).startswith(f'{words} ({parameter} = 0.47')
+
+
+def test_only_a_bent_target_is_to_be_flattened(found: Diagnosis) -> None:
+    again = _deciding(found, 'target', say='measure_again')
+    assert target_words(replace(again, causes=[])) == 'Measure the target, or replace it'
+    bent = replace(_tilt(0.0, 0.0), effect='target_shape')
+    assert target_words(replace(again, causes=[bent])) == (
+        'Measure the target, or flatten or replace it')
+
+
+def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
+    """"Not significantly smaller (96 % sure)" read as if that were sure."""
+    lens = _deciding(found, 'lens', say='undecided', confidence=0.96)
+    assert first_screen(lens, 'table').actions[0].sure == ''
