@@ -136,7 +136,7 @@ rigs: $(VENV)/ready .venv-rigs/ready
 	touch $@
 
 # Cameras on robots beside OpenCV's hand-eye calibration, which OpenCV 5 has no more, into
-# docs/results/hand_eye.md; twenty minutes.
+# docs/results/hand_eye.md; five minutes.
 hand-eye: .venv-hand-eye/ready
 	.venv-hand-eye/bin/python -m benchmark.hand_eye
 

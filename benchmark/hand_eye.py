@@ -203,8 +203,10 @@ def write_results(outcomes: Sequence[Outcome], path: Path = _DOC) -> None:
     ]
     if asked:
         lines += [*_diagnosed_lines(asked), '']
-    write_text(path, '\n'.join(textwrap.fill(line, 100, break_on_hyphens=False)
-                               for line in lines))
+    write_text(path, '\n'.join(
+        textwrap.fill(line, 100, break_on_hyphens=False,
+                      subsequent_indent='  ' if line.startswith('- ') else '')
+        for line in lines))
 
 
 def _median(errors: Sequence[tuple[float, float]]) -> Array:
