@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
 from fisheye_svp_ros.rectify.maps import MAX_RANGE
 from fisheye_svp_ros.rectify.svp import nearest_svp_lens
@@ -107,10 +109,15 @@ def _print_loss(lens: Lens, written: Lens, ranges: Sequence[float], as_it_stands
     """Say what the form does not hold, px, by angle and range; or how that could be less."""
     port = () if lens.port is None else (PORT,)
     field = [IMAGE_FIELD] if lens.image_field and not written.image_field else []
-    own = [name for name in lens.corrections if name not in written.corrections]
+    # Of corrections, an image field that was made for the form holds all.
+    held = lens.corrections if written.image_field else written.corrections
+    own = [name for name in lens.corrections if name not in held]
     named = [name for name in (*port, *own, *field, *lens.target) if name != LANDMARKS]
-    if lens.viewpoint_shift is not None and written.viewpoint_shift != lens.viewpoint_shift:
-        named.insert(0, 'the viewpoint shift')
+    shift = lens.viewpoint_shift
+    if shift is not None and written.viewpoint_shift != shift:
+        constant = (isinstance(shift, Gennery)
+                    and written.viewpoint_shift == replace(shift, s0=0.0))
+        named.insert(0, 's0 of the viewpoint shift' if constant else 'the viewpoint shift')
     if named:
         print(f'left out: {", ".join(named)}')
     angles = [angle for angle in _ANGLES if np.radians(angle) < lens.max_incidence]

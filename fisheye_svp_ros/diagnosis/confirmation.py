@@ -20,6 +20,7 @@ _FAR_SHIFT = 0.025  # m: no lens of a machine is known to move its viewpoint by 
 REFUTED_BY_FRAMES = 'held-out frames refute it'
 REFUTED_BY_FILE = 'the held-out file refutes it'
 NO_GAIN = 'its gain on held-out frames is not significant'
+NO_OTHER_FRAME = 'there is no other frame to confirm it'
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def weakest_cause(evaluation: Evaluation) -> Doubt | None:
             continue
         change = change_between(
             cross_validate(null, [effect.name]).take(kept), full.take(kept))
-        why = _refutation(change)
+        why = _refutation(change) if len(kept) > 1 else NO_OTHER_FRAME
         if not why and other is not None and change_between(
                 evaluation.predict([effect.name]), other).z < -1:
             why = REFUTED_BY_FILE
@@ -149,8 +150,9 @@ def _add_refused_causes(
     """Return also what was significant in the selection and did not predict better."""
     causes = {effect.name for effect, _, _ in selection.causes}
     every = dict(found)
+    why = NO_GAIN if selection.null.linear.data.frames > 1 else NO_OTHER_FRAME
     for step in selection.trace:
         if (not step.accepted and step.why.endswith('does not predict better')
                 and step.name not in causes and step.name not in every):
-            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, NO_GAIN)
+            every[step.name] = UnconfirmedCause(step.name, {}, step.corrected, why)
     return list(every.values())

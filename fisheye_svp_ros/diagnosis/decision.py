@@ -15,6 +15,7 @@ _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
 _MIN_FRAMES = 8  # frames
+_ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
 _MAX_REJECTED_SHARE = 0.1  # of the frames
 
 
@@ -103,7 +104,7 @@ class LensFacts(NamedTuple):
     has_likely_shift: whether the extended lens has a viewpoint shift that is likely and not named;
     named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
     not fitted; refitted: intrinsics that only a change of the lens explains, confirmed as causes;
-    falling: whether no error rises with the causes on the fitted frames.
+    falling: whether no error rises with the causes on the fitted frames; frames: how many.
     """
 
     lens_causes: Sequence[str]
@@ -116,6 +117,7 @@ class LensFacts(NamedTuple):
     bounds: list[Bound]
     noise_px: float
     falling: bool
+    frames: int
 
 
 def decide_lens(facts: LensFacts) -> Decision:
@@ -130,6 +132,9 @@ def decide_lens(facts: LensFacts) -> Decision:
             'recalibrate', f'the lens as given is off by {off.mrad:.2g} mrad ({off.px:.2g} px), '
                            f'{off.ratio:.1f} times the combined standard error',
             Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
+    if facts.frames < 2 and not facts.causes:
+        return Decision('undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained,
+                        None)
     if facts.refitted:
         names = ', '.join(facts.refitted)
         return Decision('recalibrate', f'the lens as given is wrong in {names}', gained, file.sure)
@@ -175,7 +180,8 @@ class TargetFacts(NamedTuple):
     away of the held-out error above noise, and the low end of that; named_px, local_px, noise_px:
     standard deviations of a coordinate by causes, by offsets without a name, and of noise;
     local_m: rms of those offsets; local_p: p-value of the least sure of their components;
-    contradicted: whether the cameras of a rig contradict each other about the target.
+    contradicted: whether the cameras of a rig contradict each other about the target; frames: how
+    many.
     """
 
     causes: Sequence[str]
@@ -187,6 +193,7 @@ class TargetFacts(NamedTuple):
     local_p: float
     noise_px: float
     contradicted: bool
+    frames: int
 
 
 def decide_target(facts: TargetFacts) -> Decision:
@@ -211,6 +218,8 @@ def decide_target(facts: TargetFacts) -> Decision:
     if facts.local_px > 0:
         return Decision('keep', f'{local}, less than the noise', figure,
                         1 - facts.local_p)
+    if facts.frames < 2:
+        return Decision('keep', f'its errors are unknown: {_ONE_FRAME}', figure, None)
     return Decision('keep', 'its errors are below the noise', figure, 0.95)
 
 
@@ -238,8 +247,8 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
         return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
                                   'others or are outliers as a whole', figure, None)
     if facts.frames < _MIN_FRAMES:
-        return Decision('more', f'{facts.frames} frames are too few; take {_MIN_FRAMES} or more',
-                        figure, None)
+        few = 'one frame is' if facts.frames == 1 else f'{facts.frames} frames are'
+        return Decision('more', f'{few} too few; take {_MIN_FRAMES} or more', figure, None)
     if facts.lens == 'undecided':
         return Decision('more', 'the lens is undecided; --next 6 lists the views that decide it',
                         figure, None)

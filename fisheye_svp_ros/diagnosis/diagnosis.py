@@ -104,7 +104,9 @@ class Diagnosis:
             return 'partly_explained' if self.remaining else 'explained'
         # Local offsets of the target alone leave the simulation of the lens adequate.
         rest = {one.variable for one in self.remaining} - {'landmark'}
-        return 'unexplained' if rest else 'adequate'
+        # Nothing confirms what one frame shows.
+        open_effects = self.frames < 2 and self.candidates
+        return 'unexplained' if rest or open_effects else 'adequate'
 
     @property
     def decision(self) -> dict[str, Decision]:

@@ -127,12 +127,14 @@ def _facts(d: Diagnosis, source: str) -> str:
 def _warning(d: Diagnosis) -> str:
     """Return which error is larger after than before, by more than rounding shows."""
     base, named, extended = d.figures.base, d.figures.named, d.figures.extended
-    pairs = (
+    pairs = [
         ('rms on the fitted frames, with the causes', base.rms_px, named.rms_px),
         ('rms on the fitted frames, with local offsets', named.rms_px, extended.rms_px),
         ('held-out rms, with the causes', base.heldout_rms_px, named.heldout_rms_px),
-        ('held-out rms, with the extended lens on one target', d.file.given_px,
-         d.file.extended_px))
+    ]
+    if d.offers_extended:
+        pairs.append(('held-out rms, with the extended lens on one target', d.file.given_px,
+                      d.file.extended_px))
     rising = [f'{name}: {before:.3g} → {after:.3g} px' for name, before, after in pairs
               if after > MAX_RMS_RATIO * before]
     return ('an error rises: ' + '; '.join(rising)) if rising else ''
@@ -163,11 +165,13 @@ def _causes(d: Diagnosis) -> str:
 
 
 def _candidates(d: Diagnosis) -> str:
+    shifts = d.averaged_model.shifts
+    others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
     words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
              f'{100 * one.weight:.0f} %: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
-             f'{1e3 * one.stderr:.2g} mm)' for one in d.averaged_model.shifts]
-    words += [f'{one.effect} ({one.why})' for one in d.candidates[:_MAX_NAMES]]
-    more = len(d.candidates) - _MAX_NAMES
+             f'{1e3 * one.stderr:.2g} mm)' for one in shifts]
+    words += [f'{one.effect} ({one.why})' for one in others[:_MAX_NAMES]]
+    more = len(others) - _MAX_NAMES
     return '; '.join(words) + (f'; and {more} more' if more > 0 else '')
 
 

@@ -66,6 +66,8 @@ def largest_cause(d: Diagnosis) -> str:
                       == {'lens', 'target'}), None)
         second = _sentence(d, other) if other else ''
         return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
+    if d.frames < 2 and d.candidates:
+        return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
         return _capital(d.decision['lens'].why)
     if only_gross(d):

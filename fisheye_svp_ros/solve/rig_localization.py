@@ -16,7 +16,7 @@ from fisheye_svp_ros.solve.initial_rig import localize_frames
 from fisheye_svp_ros.solve.measured_poses import posable_observations, sigma_known
 from fisheye_svp_ros.solve.outliers import Outliers, find_outliers
 from fisheye_svp_ros.solve.reliability import noise_sigma
-from fisheye_svp_ros.solve.rig_checks import rig_differs
+from fisheye_svp_ros.solve.rig_checks import is_unrelated, rig_differs
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews, group_by_frame
 
 
@@ -49,7 +49,7 @@ def localize_rig(
 
     cameras, rig (C,): names, and where each stands in the first one, whose poses are returned.
     Raises ObservationError for a camera that the rig does not have, GeometryError where no frame
-    can be posed.
+    can be posed, or no pose explains what the cameras see together.
     """
     missing = [name for name in table.cameras if name not in cameras]
     if missing:
@@ -62,6 +62,11 @@ def localize_rig(
     data, place = group_by_frame(rows), rig.take([list(cameras).index(name) for name in present])
     state = RigState(identity(data.frames), place, own[0], (), tuple(own[1:]), tuple(present),
                      corrected=True)
+    if is_unrelated(data, state):
+        raise GeometryError(
+            f'{table.source}: no pose of the rig explains what its cameras see at the same time: '
+            'they see boards of their own, or the rig is of other cameras; localize each camera '
+            'by itself, or calibrate the rig again')
     data, outliers = find_outliers(data, state)
     state = localize_frames(data, state)
     linear = Linearization(data, state, ())

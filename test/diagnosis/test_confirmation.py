@@ -8,12 +8,19 @@ from helpers.scenes import lens, observe, scene
 from helpers.water import AIR
 
 from fisheye_svp_ros.diagnosis import EffectTests, NullModel, diagnose
-from fisheye_svp_ros.diagnosis.confirmation import find_confounder
+from fisheye_svp_ros.diagnosis.confirmation import (
+    NO_OTHER_FRAME,
+    REFUTED_BY_FRAMES,
+    find_confounder,
+)
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.focal_drift import FocalDriftEffect
 from fisheye_svp_ros.effects.session_step import SessionStepEffect
+from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
+from fisheye_svp_ros.reporting.first_screen import first_screen
+from fisheye_svp_ros.reporting.headline import headline
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -108,3 +115,17 @@ def test_a_cause_must_predict_better_beside_what_takes_the_place_of_another(
     gain = HeldOutGain(1.0, 2.0)
     assert confounder(false_tilt) == ('no significant gain on held-out frames if session_step '
                                       'replaces focal_drift')
+
+
+def test_one_frame_confirms_nothing_and_is_not_adequate():
+    """Its errors are far above the noise, and no other frame tells whose they are."""
+    rng = np.random.default_rng(3)
+    shifted = [(ViewpointShiftEffect(), np.array([0.008]))]
+    table = observe(lens(), shifted, *scene(rng, frames=1), 0.01, rng)
+    found = diagnose(table, lens())
+    assert found.causes == [] and found.verdict == 'unexplained'
+    assert found.decision['lens'].say == 'undecided'
+    assert {one.why for one in found.candidates} <= {NO_OTHER_FRAME, REFUTED_BY_FRAMES}
+    assert headline(found).startswith('Errors show in one frame')
+    listed = first_screen(found, 'table').candidates
+    assert listed.count('viewpoint_shift (') <= 1

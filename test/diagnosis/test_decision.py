@@ -22,7 +22,7 @@ SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
 SMALL = Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
 LIKELY = Bound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
-    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [], [SMALL], 0.05, True)
+    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [], [SMALL], 0.05, True, 12)
 
 
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
@@ -90,7 +90,7 @@ def test_no_reason_begins_with_the_name_of_an_effect(facts: LensFacts) -> None:
 
 
 TARGET = TargetFacts(['target_shape'], 'board 0 is bent by 0.81 mm', (0.82, 0.76, 1.0), 0.137,
-                     0.05, 4e-5, 1e-6, 0.043, False)
+                     0.05, 4e-5, 1e-6, 0.043, False, 12)
 
 
 def test_the_target_is_judged_apart() -> None:
@@ -112,3 +112,12 @@ def test_photographs_are_enough_or_not() -> None:
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
     assert decide_photographs(facts._replace(unlike=['1', '2', '3', '4'])).say == 'more'
+
+
+def test_one_frame_decides_nothing() -> None:
+    """A board bent by 1.5 mm was called sound from one photograph, 95 % sure."""
+    lens = decide_lens(SOUND._replace(frames=1))
+    assert lens.say == 'undecided' and 'one frame' in lens.why and not lens.bound
+    target = decide_target(
+        TARGET._replace(causes=[], size='', local_px=0.0, local_m=0.0, frames=1))
+    assert target.confidence is None and 'errors are unknown' in target.why

@@ -89,8 +89,18 @@ def test_round_trip_of_cahvore_keeps_the_shift(tmp_path: Path) -> None:
     assert back.viewpoint_shift == SHORT.viewpoint_shift
     points = directions(SHORT, 0.2)
     assert np.abs(project(back, points).uv - project(SHORT, points).uv).max() < 1e-6
-    with pytest.raises(LensError, match='px from any CAHVORE'):
-        write_foreign(replace(LENS, image_height=KannalaBrandt(-0.01, 0.0, 0.0, -0.002)), 'mrcal')
+    with pytest.raises(LensError, match=r'px from any CAHVORE.*--range writes it'):
+        write_foreign(replace(SHORT, image_height=KannalaBrandt(-0.01, 0.0, 0.0, -0.002)), 'mrcal')
+
+
+def test_a_curve_that_cahvore_does_not_hold_is_a_splined_model(tmp_path: Path) -> None:
+    """A calibrated Kannala-Brandt lens was refused for a viewpoint shift that it has not."""
+    path, points = tmp_path / 'lens.cameramodel', directions(LENS)
+    path.write_text(write_foreign(LENS, 'mrcal'))
+    assert 'SPLINED_STEREOGRAPHIC' in path.read_text()
+    there = project(load_lens(path), points)
+    assert np.abs(there.uv - project(LENS, points).uv)[there.valid].max() < 0.01
+    assert there.valid.mean() > 0.9
 
 
 @pytest.mark.parametrize('linearity', ['0.37', '-0.5', '0'])

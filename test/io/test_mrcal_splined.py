@@ -109,3 +109,17 @@ def test_command_shows_an_image_field_and_what_a_form_loses(
     assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'x.cameramodel'),
                      '--format', 'mrcal']) == 0
     assert 'left out' not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('lens', 'said'), [
+    (replace(LENS, corrections={'skew': {'parameters': {'shear': 0.001}}}), None),
+    (replace(SHORT, viewpoint_shift=Gennery(0.002, 0.004)), 'left out: s0 of the viewpoint shift'),
+])
+def test_only_what_mrcal_does_not_hold_is_left_out(
+    lens: Lens, said: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(lens, tmp_path / 'lens.yaml')
+    assert cli.main(['lens', str(tmp_path / 'lens.yaml'), '-o', str(tmp_path / 'x.cameramodel'),
+                     '--format', 'mrcal']) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if 'left out' in line]
+    assert lines == ([said] if said else [])

@@ -104,3 +104,14 @@ def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
     """"Not significantly smaller (96 % sure)" read as if that were sure."""
     lens = _deciding(found, 'lens', say='undecided', confidence=0.96)
     assert first_screen(lens, 'table').actions[0].sure == ''
+
+
+@pytest.mark.parametrize(('say', 'warned'), [('keep', False), ('recalibrate', True)])
+def test_only_an_extended_lens_that_is_offered_is_warned_of(
+    found: Diagnosis, say: str, warned: bool
+) -> None:
+    """Beside "Keep the lens" stood that the error rises with a lens nobody was to use."""
+    worse = _deciding(found, 'lens', say=say)
+    worse = replace(worse, conclusion=replace(
+        worse.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)))
+    assert ('extended lens on one target' in first_screen(worse, 'table').warning) == warned

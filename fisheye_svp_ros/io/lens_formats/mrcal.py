@@ -1,9 +1,9 @@
 """mrcal .cameramodel files: CAHVORE, which has a viewpoint shift, STEREOGRAPHIC, splined, OPENCV.
 
-mrcal has no model of Kannala and Brandt.  A lens of one viewpoint that has an image field is a
-splined model (`mrcal_splined`).  Its CAHVORE (Gennery, IJCV 2006) solves the equation of
-this package; its image height is f (1 + r0 + r1 c^2 + r2 c^4) c, where c is theta for a
-linearity of 0, tan(l theta) / l above and sin(l theta) / l below.
+mrcal has no model of Kannala and Brandt.  A lens of one viewpoint is a splined model
+(`mrcal_splined`) where CAHVORE does not hold it.  Its CAHVORE (Gennery, IJCV 2006) solves the
+equation of this package; its image height is f (1 + r0 + r1 c^2 + r2 c^4) c, where c is theta for
+a linearity of 0, tan(l theta) / l above and sin(l theta) / l below.
 """
 
 from __future__ import annotations
@@ -93,20 +93,21 @@ def _read_stereographic(size: list[int], values: list[float], where: str) -> For
 def write(lens: Lens) -> str:
     """Return the lens as CAHVORE of linearity 0, its shift included.
 
-    With an image field and without a shift it is a splined model.
-    Raises LensError where three radial terms do not say its curve to a hundredth of a pixel.
+    Without a shift, and with an image field or a curve that three radial terms do not say to a
+    hundredth of a pixel, it is a splined model; raises LensError for such a curve with a shift.
     """
-    if lens.image_field is not None and lens.viewpoint_shift is None:
-        return _document(*mrcal_splined.fit_model(lens), (0.0, 0.0, 0.0), lens)
     theta = np.linspace(0.0, lens.max_incidence, _GRID)[1:]
     heights = lens.image_height.value_and_slope(theta)[0]
     powers = theta[:, None] ** np.arange(1, 2 * _TERMS, 2)
     terms = np.linalg.lstsq(powers, heights, rcond=None)[0]
     worst = float(np.abs(powers @ terms - heights).max() * max(lens.fx, lens.fy))
-    if worst > _TOLERANCE:
-        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE; '
-                        'mrcal has no other fisheye model with a moving viewpoint')
     shift = lens.viewpoint_shift
+    if shift is None and (lens.image_field is not None or worst > _TOLERANCE):
+        return _document(*mrcal_splined.fit_model(lens), (0.0, 0.0, 0.0), lens)
+    if worst > _TOLERANCE:
+        raise LensError(f'lens {lens.name!r}: its curve is {worst:.2g} px from any CAHVORE, and '
+                        'mrcal has no other fisheye model with a viewpoint shift; --range writes '
+                        'it for one distance, without the shift')
     if shift is not None and not isinstance(shift, Gennery):
         raise LensError(f'lens {lens.name!r}: CAHVORE has no viewpoint shift but gennery')
     e = [shift.e0, shift.e1, shift.e2] if shift is not None else [0.0] * 3
