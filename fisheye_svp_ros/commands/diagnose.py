@@ -178,7 +178,7 @@ def _read(
         raise LensError(f'{path}: {cause}') from cause
     check_sizes(path, sizes, lenses)
     one = set(given) == {''} and not (given.in_file and len(table.cameras) > 1)
-    lens = given[''] if one else lenses
+    lens = next(iter(lenses.values())) if one else lenses
     observations, left_out = posable_observations(table, lens)
     note_left_out(table, left_out)
     observations, again = remove_copies(observations)

@@ -46,9 +46,11 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
 class Lenses(dict[str, 'Lens']):
     """Lenses by camera; '' is that of every camera without its own.
 
-    in_file: cameras of a file that holds several, in its order; '' is the first of them.
+    in_file: cameras of a file that holds several, in its order; '' is the first of them; file: it,
+    as given.
     """
 
+    file: str = ''
     in_file: tuple[Lens, ...] = ()
     names: tuple[str, ...] = ()
 
@@ -70,7 +72,7 @@ def load_lenses(given: Sequence[str]) -> Lenses:
         file = lens_path(path)
         lenses[camera] = load_with_notes(file)
         if not camera:
-            lenses.names = cameras_in(file)
+            lenses.file, lenses.names = path, cameras_in(file)
             lenses.in_file = tuple(load_lens(f'{file}#{name}') for name in lenses.names)
     return lenses
 
@@ -78,11 +80,15 @@ def load_lenses(given: Sequence[str]) -> Lenses:
 def lenses_of(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     """Return the lens of each camera of the observations.
 
-    Those of a file go by their names, or else by their order: the first is that of `left`.
+    Those of a file go by their names, or else by their order: the first is that of `left`.  A
+    camera without a name has the first, which a note says.
     Raises LensError for a camera without a lens, and for a name that is no camera of theirs.
     """
-    if len(lenses) == 1 and len(lenses.in_file) > 1 and len(cameras) > 1:
-        return _in_order(cameras, lenses)
+    if len(lenses) == 1 and len(lenses.in_file) > 1:
+        if any(cameras):
+            return _in_order(cameras, lenses)
+        say(f'{lenses.file}: it holds {", ".join(lenses.names)}, and no camera is named; the lens '
+            f'of {lenses.names[0]} is used; use {lenses.file}#{lenses.names[1]} for another')
     unknown = [camera for camera in lenses if camera and camera not in cameras]
     if unknown:
         held = ', '.join(filter(None, cameras)) or 'one camera without a name'
@@ -99,7 +105,7 @@ def _in_order(cameras: Sequence[str], lenses: Lenses) -> dict[str, Lens]:
     if set(cameras) <= set(named):
         return {camera: named[camera] for camera in cameras}
     if len(cameras) != len(named):
-        raise LensError(f'the lens file holds {", ".join(named)}, the observations '
+        raise LensError(f'{lenses.file}: it holds {", ".join(named)}, the observations '
                         f'{", ".join(cameras)}; assign them: --lens '
-                        f'{cameras[0]}=FILE#{lenses.names[0]} ...')
+                        f'{cameras[0]}={lenses.file}#{lenses.names[0]} ...')
     return dict(zip(sorted(cameras), lenses.in_file, strict=True))

@@ -18,6 +18,7 @@ from helpers.nodes import SHARED
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
 from fisheye_svp_ros import cli
+from fisheye_svp_ros.commands.diagnose import _read as read_views
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
 from fisheye_svp_ros.commands.photographs import read_input
 from fisheye_svp_ros.errors import LensError
@@ -224,6 +225,32 @@ def test_lenses_of_a_folder_may_have_any_name(
         assert [lens.fx - LENS.fx for lens in lenses.values()] == pytest.approx([0, 1])
         one = load_lenses([f'{given}#{cameras[1]}'])['']
         assert one.fx == pytest.approx(LENS.fx + 1)
+
+
+@pytest.mark.parametrize(('camera', 'lens', 'note'), [
+    ('right', 'right', ''),
+    ('', 'left', 'rig/: it holds left, right, and no camera is named; the lens of left is used; '
+     'use {0}#right for another'),
+])
+def test_one_camera_of_a_rig_has_its_own_lens(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], camera: str, lens: str, note: str
+) -> None:
+    for i, name in enumerate(('left', 'right')):
+        save_lens(replace(LENS, name=name, fx=LENS.fx - 20 * i), tmp_path / 'rig' / f'{name}.yaml')
+    of_lens = load_lens(tmp_path / 'rig' / f'{lens}.yaml')
+    image = project(of_lens, poses(4, 3).into_body(PRINTED.corners))
+    frame, corner = np.nonzero(image.valid)
+    table, rig_folder = tmp_path / 'one.csv', f'{tmp_path}/rig/'
+    write_observations(table, make_observations(
+        frame, corner, image.uv[frame, corner], PRINTED.corners[corner], cameras=(camera,)))
+    out = tmp_path / 'out'
+    assert cli.main(['localize', str(table), '--lens', rig_folder, '-o', str(out)]) == 0
+    assert note.format(rig_folder) in capsys.readouterr().err
+    assert json.loads((out / camera / 'localize.json').read_text())['rms_px'] < 1e-3
+    args = Namespace(board=None)
+    assert read_views(str(table), args, load_lenses([rig_folder]))[1] == of_lens
+    with pytest.raises(LensError, match=r'rig/: it holds left, right, the observations top;'):
+        lenses_of(('top',), load_lenses([rig_folder]))
 
 
 def test_what_does_not_fit_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
