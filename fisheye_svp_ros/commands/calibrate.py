@@ -28,6 +28,7 @@ from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
+from fisheye_svp_ros.io.rig_files import check_camera_names
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
@@ -87,10 +88,8 @@ def run(args: argparse.Namespace) -> None:
         head = f'{unknown[0]}=' if unknown[0] and sizes else ''
         raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
                              f'{head}1280x800')
-    if args.output and args.output.suffix in ('.yaml', '.yml') and len(observations.cameras) > 1:
-        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(observations.cameras)} '
-                             'and their rig are written to a folder; use -o '
-                             f'{args.output.with_suffix("")}')
+    if args.output and len(observations.cameras) > 1:
+        _check_output(args, observations.cameras)
     found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
@@ -127,6 +126,14 @@ def run(args: argparse.Namespace) -> None:
         print(f'{", ".join(map(str, paths.values()))}; report: {report}')
     if rig:
         print_rig(rig)
+
+
+def _check_output(args: argparse.Namespace, cameras: Sequence[str]) -> None:
+    """Raise FisheyeSvpError where the lenses of several cameras cannot be written."""
+    if args.output.suffix in ('.yaml', '.yml'):
+        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(cameras)} and their rig '
+                             f'are written to a folder; use -o {args.output.with_suffix("")}')
+    check_camera_names(cameras, args.observations)
 
 
 def _join_tables(tables: Sequence[Observations]) -> Observations:

@@ -41,7 +41,7 @@ MAX_LENS_BYTES = 1 << 26  # bytes; a .cameramodel may hold all that it was fitte
 _MAX_NUMBER = 1e12  # any number of a lens
 _DEPTH = 3  # folders, one in the other
 _COLMAP_BINARY = 'cameras.bin'
-_NO_LENSES = ('rig', 'camchain', 'tf_static')  # files of a rig beside those of its lenses
+FILES_OF_RIG = ('rig', 'camchain', 'tf_static')  # beside those of its lenses
 OWN_SECTIONS = re.compile(r'\b(projection|image)\b')  # of our own lens files
 _LEGACY_KEY = 'effects'  # what older files call corrections, of the lens and of the target alike
 
@@ -185,7 +185,7 @@ def _in_folder(folder: Path) -> dict[str, Path]:
         above = '*/' * depth
         found = found or {
             str(file.relative_to(folder).with_suffix('')): file
-            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem not in _NO_LENSES
+            for file in sorted(folder.glob(f'{above}*.yaml')) if file.stem not in FILES_OF_RIG
         } or {
             str(file.parent.relative_to(folder)): file
             for file in sorted(folder.glob(f'{above}*/extended_lens.yaml'))

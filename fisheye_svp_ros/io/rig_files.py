@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
-from fisheye_svp_ros.io.lens_files import MAX_LENS_BYTES, read_lens_file
+from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
 from fisheye_svp_ros.io.lens_formats import read_foreign
+from fisheye_svp_ros.io.lens_formats.rig import cameras_of, pose_keys
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
 
@@ -22,10 +22,21 @@ def save_rig(rig: Pose | Sequence[Pose], path: str | Path,
     rig: the first camera in the second, or so many as there are cameras after the first.
     """
     steps = [rig] if isinstance(rig, Pose) else rig
-    write_text(path, dump_yaml({f'{one}_in_{other}': {
+    write_text(path, dump_yaml({key: {
         'position': step.position.tolist(),
         'quaternion': quaternion_from_rotation(step.rotation).tolist(),
-    } for (one, other), step in zip(pairwise(cameras), steps, strict=True)}))
+    } for key, step in zip(pose_keys(cameras), steps, strict=True)}))
+
+
+def check_camera_names(cameras: Sequence[str], where: str) -> None:
+    """Raise LensError for cameras whose names the files of a rig cannot hold."""
+    if taken := [name for name in cameras if name in FILES_OF_RIG]:
+        raise LensError(f'{where}: camera {taken[0]!r} has the name of a file of the rig, '
+                        f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0')
+    if cameras_of(pose_keys(cameras)) != tuple(cameras):
+        named = ', '.join(name for name in cameras if '_in_' in name)
+        raise LensError(f'{where}: camera {named}: with _in_ in its name, rig.yaml does not say '
+                        'which camera is in which; rename it')
 
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:

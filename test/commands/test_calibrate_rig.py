@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.commands import refused
 from helpers.moving_rig import moving_rig
 from helpers.surround import CAMERAS, LENS, NOISE, RIG, photographs
 
@@ -15,7 +17,13 @@ from fisheye_svp_ros.commands.calibrate_rig import fit_rig, print_rig, write_rig
 from fisheye_svp_ros.commands.notes import note_unconnected
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
-from fisheye_svp_ros.io.rig_files import cameras_in_first, load_rigs, save_rig
+from fisheye_svp_ros.io.rig_files import (
+    cameras_in_first,
+    check_camera_names,
+    load_cameras,
+    load_rigs,
+    save_rig,
+)
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
@@ -118,6 +126,38 @@ def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
     text = (tmp_path / 'rig.yaml').read_text()
     (tmp_path / 'broken.yaml').write_text(text.replace('cam1_in_cam2', 'cam2_in_cam1'))
     assert cli.main(['lens', str(tmp_path / 'broken.yaml')]) == 2
+
+
+@pytest.mark.parametrize('cameras', [
+    ('front-cam', 'front cam', 'cam.0', "d'Orsay: #2"),
+    ('car_in_front', 'car_in_back', 'car_in_left'),
+    ('base', 'car_in_back'),
+])
+def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str, ...]) -> None:
+    check_camera_names(cameras, 'rig.csv')
+    steps = [Pose(np.eye(3), np.array([i, 0.0, 0.0])) for i in range(1, len(cameras))]
+    save_rig(steps, tmp_path / 'rig.yaml', cameras)
+    names, places = load_cameras(tmp_path / 'rig.yaml')
+    assert names == cameras
+    assert places.position[:, 0].tolist() == [-i * (i + 1) / 2 for i in range(len(cameras))]
+
+
+@pytest.mark.parametrize(('cameras', 'said'), [
+    (('cam0', 'rig'), "obs.csv: camera 'rig' has the name of a file of the rig, rig.yaml; rename "
+     'the camera, for example rig0'),
+    (('camchain', 'left'), "camera 'camchain' has the name of a file of the rig, camchain.yaml"),
+    (('car_in_back', 'car_in_front'), 'obs.csv: camera car_in_back, car_in_front: with _in_ in '
+     'its name, rig.yaml does not say which camera is in which; rename it'),
+])
+def test_names_that_a_rig_cannot_hold_are_refused_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], cameras: tuple[str, str], said: str
+) -> None:
+    table = photographs(2, (45.0,), 2)
+    write_observations(tmp_path / 'obs.csv', replace(
+        table.take(table.camera < 2), cameras=(*cameras, *table.cameras[2:])))
+    assert said in refused(capsys, 'calibrate', tmp_path / 'obs.csv', '--image-size', '1280x800',
+                           '-o', tmp_path / 'out')
+    assert not (tmp_path / 'out').exists()
 
 
 def test_a_rig_of_three_is_posed_and_diagnosed_as_one(

@@ -2,32 +2,67 @@
 
 from __future__ import annotations
 
-import itertools
 import re
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 
+_IN = '_in_'
 _POSE_KEY = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
 
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    return _POSE_KEY.search(text) is not None
+    if _IN not in text:
+        return False
+    try:
+        document = parse_yaml(text, '', LensError)
+    except LensError:  # `read` names the line that is broken
+        return _POSE_KEY.search(text) is not None
+    return bool(_steps(document))
 
 
 def read(text: str, where: str) -> Foreign:
     """Read position, m, and quaternion x, y, z, w; raises LensError, naming the field."""
-    document = parse_yaml(text, where, LensError)
-    names = [name for name in map(str, document) if '_in_' in name] or ['left_in_right']
-    rigs = []
-    for name in names:
-        entry, place = fields.section(document, name, where), f'{where}: {name}'
+    names, rigs = _steps(parse_yaml(text, where, LensError)), []
+    for name, entry in names.items():
+        place = f'{where}: {name}'
         rigs.append(fields.pose(fields.numbers(entry, 'position', 3, place),
                                 fields.numbers(entry, 'quaternion', 4, place), place))
-    for one, other in itertools.pairwise(names):
-        if one.partition('_in_')[2] != other.partition('_in_')[0]:
-            raise LensError(f'{where}: {other} does not continue where {one} ends')
-    cameras = (*(name.partition('_in_')[0] for name in names), names[-1].partition('_in_')[2])
+    cameras = cameras_of(list(names))
+    if not cameras:
+        raise LensError(f'{where}: {", ".join(names)} are no chain; each must begin with the '
+                        'camera in which the one before ends')
     return Foreign('rig', {}, tuple(rigs), {}, cameras)
+
+
+def pose_keys(cameras: Sequence[str]) -> list[str]:
+    """Return the key of each camera in the next one."""
+    return [f'{one}{_IN}{other}' for one, other in pairwise(cameras)]
+
+
+def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
+    """Return the cameras of a chain of such keys, none where the keys are no chain.
+
+    A camera may have `_in_` in its name: the first division with which all keys agree counts.
+    """
+    first, *others = keys
+    for place in (match.start() for match in re.finditer(f'(?={_IN})', first)):
+        cameras = [first[:place], first[place + len(_IN):]]
+        for key in others:
+            if not key.startswith(cameras[-1] + _IN):
+                break
+            cameras.append(key.removeprefix(cameras[-1] + _IN))
+        else:
+            return tuple(cameras)
+    return ()
+
+
+def _steps(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the entries that hold a pose."""
+    return {str(name): entry for name, entry in document.items()
+            if _IN in str(name) and isinstance(entry, dict) and 'position' in entry}
