@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.calibrate_rig import fit_rig, print_rig, write_rig
+from fisheye_svp_ros.commands.calibrate_rig import check_names, fit_rig, print_rig, write_rig
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
 from fisheye_svp_ros.commands.outputs import output_path
@@ -28,7 +28,6 @@ from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
-from fisheye_svp_ros.io.rig_files import check_camera_names
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
                              f'{head}1280x800')
     if args.output and len(observations.cameras) > 1:
-        _check_output(args, observations.cameras)
+        _check_output(args, observations)
     found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
         table = observations.take(observations.camera == number)
@@ -128,12 +127,13 @@ def run(args: argparse.Namespace) -> None:
         print_rig(rig)
 
 
-def _check_output(args: argparse.Namespace, cameras: Sequence[str]) -> None:
+def _check_output(args: argparse.Namespace, table: Observations) -> None:
     """Raise FisheyeSvpError where the lenses of several cameras cannot be written."""
     if args.output.suffix in ('.yaml', '.yml'):
-        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(cameras)} and their rig '
-                             f'are written to a folder; use -o {args.output.with_suffix("")}')
-    check_camera_names(cameras, args.observations)
+        raise ParameterError(f'-o {args.output}: the lenses of {", ".join(table.cameras)} and '
+                             'their rig are written to a folder; use -o '
+                             f'{args.output.with_suffix("")}')
+    check_names(table, args.observations)
 
 
 def _join_tables(tables: Sequence[Observations]) -> Observations:

@@ -12,7 +12,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_json, write_text
 from fisheye_svp_ros.io.lens_formats import kalibr, transforms
-from fisheye_svp_ros.io.rig_files import save_rig
+from fisheye_svp_ros.io.rig_files import check_camera_names, save_rig
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import quaternion_from_rotation
 from fisheye_svp_ros.reporting.tables import print_table
@@ -26,6 +26,12 @@ from fisheye_svp_ros.solve.rig_calibration import (
     connected_cameras,
 )
 from fisheye_svp_ros.solve.rig_checks import MAX_RIG_RATIO, MIN_SHARED_FRAMES
+
+
+def check_names(table: Observations, where: str) -> None:
+    """Raise LensError for names of cameras that the files of their rig cannot hold."""
+    largest = max(connected_cameras(table), key=len)
+    check_camera_names(table.cameras, rig_cameras(largest) or largest, where)
 
 
 def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration | None:
@@ -45,8 +51,7 @@ def fit_rig(table: Observations, lenses: Mapping[str, Lens]) -> RigCalibration |
                     'photographs the same frame number')
         if len(largest) < 2:
             return None
-        pair = rig_cameras(largest)
-        found = calibrate_rig(table, lenses, pair or largest)
+        found = calibrate_rig(table, lenses, rig_cameras(largest) or largest)
     except FisheyeSvpError as cause:
         say(f'rig: {cause}')
         return None

@@ -16,14 +16,16 @@ from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_files import cameras_in, read_lens_file, save_lens
-from fisheye_svp_ros.io.lens_formats import WRITABLE, Foreign, read_foreign, write_foreign
-from fisheye_svp_ros.io.rig_files import save_rig
+from fisheye_svp_ros.io.lens_formats import WRITABLE, read_foreign, write_foreign
+from fisheye_svp_ros.io.rig_files import rigs_of_lenses, save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import IMAGE_FIELD, PORT, Lens
+from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.maps import MAX_RANGE
 from fisheye_svp_ros.rectify.svp import nearest_svp_lens
 from fisheye_svp_ros.reporting.tables import print_table, range_text
+from fisheye_svp_ros.scene.observations import STEREO
 
 _ANGLES, _RANGES = (20, 40, 60, 75, 85, 95), (0.1, 0.2, 0.5, 2.0)  # deg, m
 _AZIMUTHS = np.radians(np.arange(0, 360, 15))  # the axis
@@ -52,14 +54,14 @@ def run(args: argparse.Namespace) -> None:
     path = lens_path(args.lens)
     foreign = read_lens_file(path)
     if foreign is not None and not foreign.lenses and not args.format:
-        _rigs(foreign)
+        _print_rig(foreign.rigs)
         if args.output:
-            save_rig(foreign.rigs[0], args.output)
+            save_rig(foreign.rigs, args.output, foreign.cameras or STEREO)
         return
     lens = load_with_notes(path)
     if several := cameras_in(path):
-        say(f'{path}: it holds {", ".join(several)}; the first is shown; use {path}#{several[1]} '
-            'for another')
+        say(f'{path}: it holds {", ".join(several)}; the first is shown; use '
+            f'{args.lens}#{several[1]} for another')
     print(f'{lens.name}: {lens.width}x{lens.height} px, up to {np.degrees(lens.max_incidence):.2f}'
           ' deg')
     for name, value in lens.parameters.items():
@@ -75,7 +77,7 @@ def run(args: argparse.Namespace) -> None:
             if worst > 0:
                 print(f'  {camera}: kannala_brandt fitted to {foreign.form}, at most {worst:.2g} '
                       'px off')
-        _rigs(foreign)
+    _print_rig(rigs_of_lenses(path))
     if args.output and args.format:
         _convert(lens, args)
     elif args.output:
@@ -99,8 +101,8 @@ def _convert(lens: Lens, args: argparse.Namespace) -> None:
         _print_loss(lens, next(iter(written.lenses.values())), ranges, args.range_m is None)
 
 
-def _rigs(foreign: Foreign) -> None:
-    for number, rig in enumerate(foreign.rigs):
+def _print_rig(steps: Sequence[Pose]) -> None:
+    for number, rig in enumerate(steps):
         print(f'  camera {number} in camera {number + 1} at '
               + ', '.join(f'{1000 * value:.3f}' for value in rig.position) + ' mm')
 

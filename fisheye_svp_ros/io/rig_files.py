@@ -28,13 +28,13 @@ def save_rig(rig: Pose | Sequence[Pose], path: str | Path,
     } for key, step in zip(pose_keys(cameras), steps, strict=True)}))
 
 
-def check_camera_names(cameras: Sequence[str], where: str) -> None:
-    """Raise LensError for cameras whose names the files of a rig cannot hold."""
+def check_camera_names(cameras: Sequence[str], chain: Sequence[str], where: str) -> None:
+    """Raise LensError for cameras, or a chain of some of them, that rig files cannot hold."""
     if taken := [name for name in cameras if name in FILES_OF_RIG]:
         raise LensError(f'{where}: camera {taken[0]!r} has the name of a file of the rig, '
                         f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0')
-    if cameras_of(pose_keys(cameras)) != tuple(cameras):
-        named = ', '.join(name for name in cameras if '_in_' in name)
+    if len(chain) > 1 and cameras_of(pose_keys(chain)) != tuple(chain):
+        named = ', '.join(name for name in chain if '_in_' in name)
         raise LensError(f'{where}: camera {named}: with _in_ in its name, rig.yaml does not say '
                         'which camera is in which; rename it')
 

@@ -134,7 +134,7 @@ def test_a_rig_file_of_many_cameras_is_a_chain(tmp_path: Path) -> None:
     ('base', 'car_in_back'),
 ])
 def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str, ...]) -> None:
-    check_camera_names(cameras, 'rig.csv')
+    check_camera_names(cameras, cameras, 'rig.csv')
     steps = [Pose(np.eye(3), np.array([i, 0.0, 0.0])) for i in range(1, len(cameras))]
     save_rig(steps, tmp_path / 'rig.yaml', cameras)
     names, places = load_cameras(tmp_path / 'rig.yaml')
@@ -146,6 +146,7 @@ def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str
     (('cam0', 'rig'), "obs.csv: camera 'rig' has the name of a file of the rig, rig.yaml; rename "
      'the camera, for example rig0'),
     (('camchain', 'left'), "camera 'camchain' has the name of a file of the rig, camchain.yaml"),
+    (('front', 'car_in_back'), 'obs.csv: camera car_in_back: with _in_ in its name'),
     (('car_in_back', 'car_in_front'), 'obs.csv: camera car_in_back, car_in_front: with _in_ in '
      'its name, rig.yaml does not say which camera is in which; rename it'),
 ])

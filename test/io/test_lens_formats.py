@@ -19,7 +19,7 @@ from fisheye_svp_ros.commands.lenses import load_lenses
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.lens_formats import WRITABLE, write_foreign
-from fisheye_svp_ros.io.rig_files import load_rig, save_rig
+from fisheye_svp_ros.io.rig_files import load_cameras, load_rig, save_rig
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes.lenses import lenses_of as of_rig
 from fisheye_svp_ros.optics.camera import project
@@ -386,6 +386,29 @@ def test_command_shows_the_rig_of_calibrate(
     assert 'camera 0 in camera 1 at -150.000, 10.000, 2.000 mm' in capsys.readouterr().out
     assert cli.main(['localize', 'none.csv', '--lens', str(tmp_path / 'rig.yaml')]) == 2
     assert 'rig.yaml: it holds a rig, but no lens' in capsys.readouterr().err
+
+
+def test_command_shows_and_writes_all_cameras_of_a_rig(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = 'left', 'front', 'right'
+    for name in names:
+        save_lens(replace(LENS, name=name), tmp_path / 'rig' / f'{name}.yaml')
+    save_rig([RIG, RIG.inverse()], tmp_path / 'rig' / 'rig.yaml', names)
+    out = tmp_path / 'out.yaml'
+    assert cli.main(['lens', str(tmp_path / 'rig' / 'rig.yaml'), '-o', str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert 'camera 0 in camera 1 at -150.000, 10.000, 2.000 mm\n  camera 1 in camera 2' in shown
+    cameras, places = load_cameras(out)
+    assert cameras == names
+    assert np.abs(places.position[2]).max() < 1e-12 < np.abs(places.position[1]).max()
+    assert cli.main(['lens', f'{tmp_path}/rig/']) == 0
+    said = capsys.readouterr()
+    assert said.out.endswith(shown)
+    other = said.err.split('use ')[1].split(' for another')[0]
+    assert other == f'{tmp_path}/rig/#left'
+    assert cli.main(['lens', other]) == 0
+    assert capsys.readouterr().out.startswith('left: 848x800 px')
 
 
 RIG = Pose(rotation_from_vector(np.array([0.02, -0.3, 0.1])), np.array([-0.15, 0.01, 0.002]))
