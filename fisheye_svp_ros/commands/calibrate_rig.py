@@ -75,9 +75,11 @@ def _warnings(
                'lens is wrong')
     for name, shared in zip(found.cameras, found.shared.tolist(), strict=True):
         if shared < MIN_SHARED_FRAMES:
-            what = 'are shared' if len(found.cameras) == 2 else f'relate {name} to the others'
-            yield (f'only {shared} frames {what}; take more photographs of the target with two '
-                   'cameras at once')
+            one = shared == 1
+            what = (f'relate{"s" if one else ""} {name} to the others'
+                    if len(found.cameras) > 2 else 'is shared' if one else 'are shared')
+            yield (f'only {shared} frame{"" if one else "s"} {what}, and it is assumed that all '
+                   'cameras saw one target; take more photographs of it with two cameras at once')
             if len(found.cameras) == 2:
                 return
 

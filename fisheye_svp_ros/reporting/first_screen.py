@@ -109,7 +109,8 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 
 
 def _facts(d: Diagnosis, source: str) -> str:
-    kind = 'photographs' if d.problem.observations.photographs else 'frames'
+    kind = 'photograph' if d.problem.observations.photographs else 'frame'
+    kind += 's' if d.frames > 1 else ''
     figures = d.figures
     base, named, extended = (
         one.heldout_rms_px for one in (figures.base, figures.named, figures.extended))

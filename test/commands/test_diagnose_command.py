@@ -190,6 +190,8 @@ class TestFiles:
         assert '@import' not in page and '<script' not in page
         for word in ('Explained', 'viewpoint_shift', 'mm', 'extended_lens.yaml', 'untestable'):
             assert word in page
+        assert re.search(r'lens \(stays in the image\): \d+ % \(\d+ identified: viewpoint_shift\)',
+                         page)
         pictures = {path.stem for path in output.glob('*.png')}
         assert pictures == {'field', 'theta', 'range', 'landmark', 'frame', 'phase', 'histogram',
                             'evidence', 'uncertainty'}

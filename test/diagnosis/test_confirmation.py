@@ -127,5 +127,7 @@ def test_one_frame_confirms_nothing_and_is_not_adequate():
     assert found.decision['lens'].say == 'undecided'
     assert {one.why for one in found.candidates} <= {NO_OTHER_FRAME, REFUTED_BY_FRAMES}
     assert headline(found).startswith('Errors show in one frame')
-    listed = first_screen(found, 'table').candidates
+    screen = first_screen(found, 'table')
+    assert 'points in 1 frame;' in screen.facts
+    listed = screen.candidates
     assert listed.count('viewpoint_shift (') <= 1
