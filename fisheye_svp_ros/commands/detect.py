@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.outputs import output_path
+from fisheye_svp_ros.commands.outputs import output_file, output_folder
 from fisheye_svp_ros.commands.photographs import add_board_arguments, search
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_observations
@@ -23,10 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='image files or folders (left/ and right/ for a rig), videos, '
                         'rosbag2 recordings with Image or CompressedImage')
     add_board_arguments(parser, required=True)
-    parser.add_argument('-o', '--output', type=output_path, metavar='OBS.csv',
+    parser.add_argument('-o', '--output', type=output_file, metavar='OBS.csv',
                         help='observations to write; the details by photograph are written next '
                         'to them as .detect.json')
-    parser.add_argument('--overlays', type=Path, metavar='DIR',
+    parser.add_argument('--overlays', type=partial(output_folder, option='--overlays'),
+                        metavar='DIR',
                         help='folder to write each photograph with its corners to, and a map of '
                         'the coverage')
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
-from fisheye_svp_ros.commands.outputs import output_path
+from fisheye_svp_ros.commands.outputs import output_file
 from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.effects.target import LANDMARKS
 from fisheye_svp_ros.errors import ParameterError
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('lens', metavar='LENS',
                         help='lens file of this package or of another tool (FILE#cam1: another '
                         'camera than the first), or the name of a lens of this package')
-    parser.add_argument('-o', '--output', type=output_path, metavar='FILE', help='file to write')
+    parser.add_argument('-o', '--output', type=output_file, metavar='FILE', help='file to write')
     parser.add_argument('--format', choices=WRITABLE,
                         help='format of the file to write; default: a lens file of this package')
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',

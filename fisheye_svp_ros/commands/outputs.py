@@ -10,44 +10,70 @@ from pathlib import Path
 from fisheye_svp_ros.errors import OutputError
 
 _PHOTOGRAPHS = ('observations', 'photographs', 'inputs')  # arguments whose folders are read again
+_OUTPUTS = {'-o': 'output', '--overlays': 'overlays'}  # options and their arguments
 
 
-def output_folder(text: str) -> Path:
+def output_folder(text: str, option: str = '-o') -> Path:
     """Return the path of a folder that exists or can be made; raise OutputError otherwise."""
-    path = output_path(text)
+    path = output_path(text, option)
     if path.exists() and not path.is_dir():
-        raise OutputError(f'-o {text}: it is a file; name a folder')
+        raise OutputError(f'{option} {text}: it is a file; name a folder')
     return path
 
 
-def output_path(text: str) -> Path:
+def output_file(text: str) -> Path:
+    """Return the path of a file that can be written; raise OutputError for a folder, too."""
+    path = output_path(text)
+    if path.is_dir():
+        raise OutputError(f'-o {text}: it is a folder; name a file')
+    return path
+
+
+def output_path(text: str, option: str = '-o') -> Path:
     """Return a path whose parents are folders that can be written, or raise OutputError."""
     path = Path(text)
     parent = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
     if parent != path.absolute() and not parent.is_dir():
-        raise OutputError(f'-o {text}: {parent} is not a folder; choose another')
+        raise OutputError(f'{option} {text}: {parent} is not a folder; choose another')
     if not os.access(parent, os.W_OK):
-        raise OutputError(f'-o {text}: no permission to write in {parent}; choose another')
+        raise OutputError(f'{option} {text}: no permission to write in {parent}; choose another')
     return path
 
 
 def check_output(args: argparse.Namespace) -> None:
-    """Raise OutputError where `-o` is a file that is also an input, or holds the photographs."""
-    output = getattr(args, 'output', None)
-    if output is None or not output.exists():
-        return
-    for name, path in _paths(args):
-        # `undistort` writes PNG files under the names of the photographs.
-        taken = path.parent if name == 'inputs' and path.suffix == '.png' else path
-        if path.exists() and taken.samefile(output) and (
-                output.is_file() or name in _PHOTOGRAPHS):
-            raise OutputError(f'-o {output}: this would overwrite the input {path}; choose '
-                              'another name')
+    """Raise OutputError where an output is a file that is also an input, or among photographs."""
+    for option, name in _OUTPUTS.items():
+        output = getattr(args, name, None)
+        if output is None or not output.exists():
+            continue
+        for given, path in _paths(args):
+            if path.exists() and any(
+                    one.samefile(output) for one in _files_to_keep(given, path, output, name)):
+                raise OutputError(f'{option} {output}: this would overwrite the input {path}; '
+                                  'choose another name')
+
+
+def _files_to_keep(given: str, path: Path, output: Path, name: str) -> Iterator[Path]:
+    """Yield the files and folders that an output must not be, for one of the inputs."""
+    from fisheye_svp_ros.detect.photographs import IMAGES, photograph_folders
+
+    if output.is_file():
+        yield path
+        if given in _PHOTOGRAPHS and path.is_dir() and output.suffix.lower() in IMAGES:
+            for folder in photograph_folders(path):
+                yield folder / output.name
+    elif given in _PHOTOGRAPHS:
+        yield path
+        # `undistort` and overlays write PNG files under the names of the photographs.
+        if path.is_dir():
+            yield from photograph_folders(path)
+        elif path.suffix == '.png' and (given == 'inputs' or name == 'overlays'):
+            yield path.parent
 
 
 def _paths(args: argparse.Namespace) -> Iterator[tuple[str, Path]]:
     """Yield the arguments that may be paths: name, path."""
     for name, value in vars(args).items():
         for one in value if isinstance(value, list) else [value]:
-            if name != 'output' and isinstance(one, str | Path):
+            if name not in _OUTPUTS.values() and isinstance(one, str | Path):
                 yield name, Path(str(one).rpartition('=')[2])

@@ -113,7 +113,7 @@ def doubtful_folders(paths: Sequence[str]) -> Iterator[str]:
         if not folder.is_dir() or is_recording(folder):
             continue
         files = _images(folder)
-        for above in [folder] if files else _folders(folder):
+        for above in photograph_folders(folder):
             for sub in (p for p in sorted(above.iterdir()) if p.is_dir() and p not in given):
                 if count := sum(len(_images(one)) for one in (sub, *_folders(sub))):
                     yield (f'{sub}: its {count} images are skipped, since the folder above holds '
@@ -130,6 +130,11 @@ def is_photographs(path: Path) -> bool:
     if path.is_dir():
         return any(p.suffix.lower() in IMAGES for p in (*path.glob('*'), *path.glob('*/*')))
     return path.suffix.lower() in (*IMAGES, *VIDEOS)
+
+
+def photograph_folders(path: Path) -> list[Path]:
+    """Return the folders whose images are the photographs of a folder: itself, or those in it."""
+    return [path] if _images(path) else _folders(path)
 
 
 def decode_image(data: bytes, name: str, color: bool = False) -> Pixels:
@@ -228,7 +233,7 @@ def _folders(path: Path) -> list[Path]:
 
 def _folder(path: Path) -> Iterator[Photograph]:
     files = _images(path)
-    folders = [] if files else _folders(path)
+    folders = [] if files else photograph_folders(path)
     for folder in folders:
         camera = folder.name if len(folders) > 1 or folder.name in STEREO else ''
         yield from (_file(p, camera) for p in _images(folder))

@@ -199,12 +199,24 @@ class TestLocalize:
         code = cli.main(['localize', *map(str, arguments), '-o', str(tmp_path / 'file' / 'out')])
         assert code == 2
         assert 'file is not a folder; choose another' in capsys.readouterr().err
+        for command in ('detect {0} --board chessboard:9x6:25mm -o {0}',  # before it searches
+                        'calibrate {1} --image-size 1280x960 -o {0}', 'lens fish180 -o {0}'):
+            said = refused(capsys, *command.format(tmp_path, folder / 'observations.csv').split())
+            assert 'it is a folder; name a file' in said
+        said = refused(capsys, 'detect', tmp_path, '--board', 'chessboard:9x6:25mm', '--overlays',
+                       tmp_path / 'file')
+        assert '--overlays' in said and 'it is a file; name a folder' in said
 
     @pytest.mark.parametrize('command', [
         'localize {0}/observations.csv --lens {0}/lens.yaml -o {0}/lens.yaml',
         'calibrate {0}/observations.csv --image-size 1280x960 -o {0}/observations.csv',
         'lens {0}/lens.yaml -o {0}/lens.yaml', 'undistort fish180 {0} -o {0}',
         'undistort fish180 {0}/a.png -o {0}',
+        'detect {0} --board chessboard:9x6:25mm -o {0}/a.png',
+        'calibrate {0} --board chessboard:9x6:25mm -o {0}/a.png',
+        'detect {0} --board chessboard:9x6:25mm --overlays {0}',
+        'detect {0}/a.png --board chessboard:9x6:25mm --overlays {0}',
+        'detect {0}/.. --board chessboard:9x6:25mm --overlays {0}',
     ])
     def test_no_input_is_overwritten(self, scene, capsys, tmp_path, command):
         for name in ('observations.csv', 'lens.yaml'):
