@@ -17,6 +17,7 @@ from fisheye_svp_ros.effects import forward
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io import lens_files
+from fisheye_svp_ros.io.detect_files import check_size_given, check_sizes
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.poses_csv import FramePoses
 from fisheye_svp_ros.io.readers import read_observations, read_poses
@@ -106,7 +107,7 @@ def localize(
     Raises ObservationError for rows of several cameras, GeometryError where no frame can be posed,
     LensError for a lens that does not know its errors.
     """
-    table, known = table_of(observations), load_lens(lens)
+    table, known = table_and_lens(observations, lens)
     if model_error:
         from fisheye_svp_ros.diagnosis import LensErrors
         from fisheye_svp_ros.study.pose_errors import localize_with_errors
@@ -146,10 +147,12 @@ def calibrate(
     )
 
     size = check_size(image_size, 'image_size')
+    table = table_of(observations)
+    if not isinstance(observations, Observations):
+        check_size_given(str(observations), {}, {'': size}, 'image_size')
     progress('fitting the lens', 0.0)
     found, kept, _ = calibrate_without_outliers(
-        table_of(observations),
-        lambda rows: lens_calibration.calibrate(rows, model, size, free, name))
+        table, lambda rows: lens_calibration.calibrate(rows, model, size, free, name))
     if poses is not None:
         found, _ = lens_calibration.calibrate_hand_eye(found, kept, _by_frame(poses))
     adjusted = found.adjusted
@@ -167,9 +170,9 @@ def calibrate_stereo(
 
     Raises ObservationError for a missing camera, GeometryError where the views fix no rig.
     """
-    table = table_of(observations)
+    table, models = _stereo_inputs(observations, left, right)
     views = stereo_views(table)
-    found = stereo_calibration.calibrate_stereo(*_models(left, right), *views)
+    found = stereo_calibration.calibrate_stereo(*models, *views)
     residual = np.concatenate([found.left_residual, found.right_residual])
     sigma = 1.0 if sigma_known(table) else noise_sigma(
         float(found.cost[0]), int(np.isfinite(residual).sum()), 6 * (len(views[0].frame) + 1))
@@ -192,9 +195,10 @@ def stereo_depth(
     errors.
     """
     rig = check_pose(rig, 'rig')
-    one, other = stereo_views(table_of(observations))
+    table, models = _stereo_inputs(observations, left, right)
+    one, other = stereo_views(table)
     both = one.used & other.used
-    known = (*_models(left, right), rig, one.uv[both], other.uv[both])
+    known = (*models, rig, one.uv[both], other.uv[both])
     solved = triangulate(*known)
     frame = np.broadcast_to(one.frame[:, None], both.shape)
     covariance = None
@@ -257,9 +261,10 @@ def diagnose(
     from fisheye_svp_ros.diagnosis import diagnose as find_causes
     from fisheye_svp_ros.solve.measured_poses import posable_observations, poses_by_frame
 
-    known = load_lens(lens)
-    table, _ = posable_observations(table_of(observations), known)
-    test = None if held_out is None else posable_observations(table_of(held_out), known)[0]
+    table, known = table_and_lens(observations, lens)
+    table, _ = posable_observations(table, known)
+    test = None if held_out is None else posable_observations(
+        *table_and_lens(held_out, known))[0]
     given = None if poses is None else poses_by_frame(table, _by_frame(poses), 'poses')
     found = find_causes(table, known, free_intrinsics=free_intrinsics, held_out=test,
                         poses=given, progress=progress)
@@ -343,5 +348,23 @@ def table_of(given: AnyObservations) -> Observations:
     return given if isinstance(given, Observations) else read_observations(given)
 
 
-def _models(left: AnyLens, right: AnyLens) -> tuple[ForwardModel, ForwardModel]:
-    return ForwardModel(load_lens(left)), ForwardModel(load_lens(right))
+def check_images(given: AnyObservations, lenses: Mapping[str, Lens]) -> None:
+    """Raise LensError where `detect` found images of another size than the lens of a camera."""
+    if not isinstance(given, Observations):
+        check_sizes(str(given), {}, lenses)
+
+
+def table_and_lens(given: AnyObservations, lens: AnyLens) -> tuple[Observations, Lens]:
+    """Return a table and the lens of all its cameras; raise LensError as `check_images` does."""
+    table, known = table_of(given), load_lens(lens)
+    check_images(given, dict.fromkeys(table.cameras, known))
+    return table, known
+
+
+def _stereo_inputs(
+    observations: AnyObservations, left: AnyLens, right: AnyLens
+) -> tuple[Observations, tuple[ForwardModel, ForwardModel]]:
+    table = table_of(observations)
+    lenses = {'left': load_lens(left), 'right': load_lens(right)}
+    check_images(observations, lenses)
+    return table, (ForwardModel(lenses['left']), ForwardModel(lenses['right']))

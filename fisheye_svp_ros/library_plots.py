@@ -14,7 +14,7 @@ from fisheye_svp_ros.library import (
     AnyObservations,
     load_lens,
     localize,
-    table_of,
+    table_and_lens,
 )
 from fisheye_svp_ros.library_checks import check_type
 from fisheye_svp_ros.library_results import Budgeted
@@ -54,7 +54,7 @@ def plot_residuals(observations: AnyObservations, lens: AnyLens) -> Figure:
 
     Outliers are not drawn.  Raises what `localize` raises.
     """
-    table, lens = table_of(observations), load_lens(lens)
+    table, lens = table_and_lens(observations, lens)
     residual = localize(table, lens).residual
     used = np.isfinite(residual).all(axis=1)
     figure = Figure(figsize=(8, 1 + 8 * lens.height / lens.width), layout='constrained')

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.rig_files import load_cameras
-from fisheye_svp_ros.library import AnyLens, AnyObservations, load_lens, table_of
+from fisheye_svp_ros.library import AnyLens, AnyObservations, check_images, load_lens, table_of
 from fisheye_svp_ros.library_checks import check_type
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -62,7 +62,9 @@ def _inputs(
 ) -> tuple[Observations, dict[str, Lens]]:
     table = table_of(observations)
     check_type(lenses, Mapping, 'lenses', 'a mapping of cameras to lenses')
-    return table, rig_lenses(table, {name: load_lens(lens) for name, lens in lenses.items()})
+    known = {name: load_lens(lens) for name, lens in lenses.items()}
+    check_images(observations, known)
+    return table, rig_lenses(table, known)
 
 
 def _cameras(rig: RigCalibration | str | Path) -> tuple[tuple[str, ...], Pose]:

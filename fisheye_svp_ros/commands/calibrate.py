@@ -17,14 +17,18 @@ from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
 from fisheye_svp_ros.commands.outputs import output_path
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
-    check_sizes,
     image_sizes,
     read_input,
     search_options,
-    sizes_beside,
 )
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
-from fisheye_svp_ros.errors import GeometryError, ParameterError
+from fisheye_svp_ros.errors import GeometryError, OutputError, ParameterError
+from fisheye_svp_ros.io.detect_files import (
+    Sizes,
+    check_size_given,
+    check_sizes,
+    sizes_beside,
+)
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
@@ -77,17 +81,8 @@ def run(args: argparse.Namespace) -> None:
         raise ParameterError(f'--lens {args.lens} needs --medium (for example water) or --port: '
                              'what the camera looked through')
     observations, sizes = read_input(args.observations, args)
-    sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
-    if args.lens:
-        air = load_with_notes(args.lens)
-        check_sizes(args.observations, sizes, {'': air})
-        sizes = {'': (air.width, air.height)}
-    unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
-    if unknown:
-        head = f'{unknown[0]}=' if unknown[0] and sizes else ''
-        raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
-                             f'{head}1280x800')
-    if args.output and len(observations.cameras) > 1:
+    sizes = _known_sizes(args, observations, sizes)
+    if args.output:
         _check_output(args, observations)
     found: dict[str, CalibratedCamera] = {}
     for number, camera in enumerate(observations.cameras):
@@ -127,8 +122,31 @@ def run(args: argparse.Namespace) -> None:
         print_rig(rig)
 
 
+def _known_sizes(args: argparse.Namespace, observations: Observations, sizes: Sizes) -> Sizes:
+    """Return the image size of each camera: given, of the photographs, or that of `--lens`.
+
+    Raises ParameterError where one is unknown, or another one than `detect` found.
+    """
+    check_size_given(args.observations, sizes, args.image_size or {}, '--image-size')
+    sizes = args.image_size or sizes or sizes_beside(Path(args.observations))
+    if args.lens:
+        air = load_with_notes(args.lens)
+        check_sizes(args.observations, sizes, {'': air})
+        return {'': (air.width, air.height)}
+    unknown = [name for name in observations.cameras if not {name, ''} & set(sizes)]
+    if unknown:
+        head = f'{unknown[0]}=' if unknown[0] and sizes else ''
+        raise ParameterError(f'{args.observations}: the image size is unknown; add --image-size '
+                             f'{head}1280x800')
+    return sizes
+
+
 def _check_output(args: argparse.Namespace, table: Observations) -> None:
-    """Raise FisheyeSvpError where the lenses of several cameras cannot be written."""
+    """Raise FisheyeSvpError where the lens of a camera, or those of several, cannot be written."""
+    if not table.cameras[0] and args.output.is_dir():
+        raise OutputError(f'-o {args.output}: it is a folder; name a file')
+    if len(table.cameras) == 1:
+        return
     if args.output.suffix in ('.yaml', '.yml'):
         raise ParameterError(f'-o {args.output}: the lenses of {", ".join(table.cameras)} and '
                              'their rig are written to a folder; use -o '

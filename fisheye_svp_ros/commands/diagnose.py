@@ -19,7 +19,6 @@ from fisheye_svp_ros.commands.notes import (
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
-    check_sizes,
     read_input,
     search_options,
 )
@@ -27,6 +26,7 @@ from fisheye_svp_ros.commands.plan import view_limits
 from fisheye_svp_ros.commands.ports import add_dome_arguments, dome_of
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
+from fisheye_svp_ros.io.detect_files import check_sizes
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses

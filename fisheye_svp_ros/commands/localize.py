@@ -11,11 +11,12 @@ from fisheye_svp_ros.commands.lenses import add_lens_argument, lenses_of, load_l
 from fisheye_svp_ros.commands.localize_rig import AXES, MAX_TABLE_ROWS, localize_cameras
 from fisheye_svp_ros.commands.notes import note_doubtful, note_left_out
 from fisheye_svp_ros.commands.outputs import output_folder
-from fisheye_svp_ros.commands.photographs import add_observation_arguments, check_sizes
+from fisheye_svp_ros.commands.photographs import add_observation_arguments
 from fisheye_svp_ros.commands.photographs import read_input as read
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
+from fisheye_svp_ros.io.detect_files import check_sizes
 from fisheye_svp_ros.io.files import write_json, write_together
 from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.reporting.progress import progress

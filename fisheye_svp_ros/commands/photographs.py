@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.finders import DETECTORS
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
-from fisheye_svp_ros.io.documents import read_json
+from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.io.detect_files import Sizes, photographs_beside
 from fisheye_svp_ros.io.readers import read_observations
-from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.scene.observations import Observations
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.detect.detection import Detection
 
-Sizes = dict[str, tuple[int, int]]  # width and height, px, by camera
 _MAX_LISTED = 12
 _UNCERTAIN = 0.9
 _MIN_LARGER_SHARE = 0.2  # of all boards: a wrong count shows where the next squares are visible
@@ -78,40 +76,7 @@ def read_input(path: str, args: argparse.Namespace) -> tuple[Observations, Sizes
         raise ParameterError(f'{path}: these are photographs; name their board, for example '
                              '--board chessboard:9x6:24mm')
     table = read_observations(path)
-    return replace(table, photographs=_photographs_beside(Path(path), table.cameras)), {}
-
-
-def _photographs_beside(
-    path: Path, cameras: Sequence[str]
-) -> tuple[tuple[int, str, str], ...]:
-    """Return frame, camera and path of the photographs that `detect` wrote beside observations."""
-    beside = path.with_suffix('.detect.json')
-    if not beside.exists():
-        return ()
-    try:
-        entries = [(int(one['frame']), str(one['camera']), str(one['name']))
-                   for one in read_json(beside, ObservationError).get('photographs', ())]
-    except (KeyError, TypeError, ValueError) as cause:
-        raise ObservationError(f'{beside}: photographs is not a list of name, camera and frame '
-                               f'({cause}); run `fisheye-svp detect` again') from cause
-    return tuple(one for one in entries if one[0] >= 0 and one[1] in cameras)
-
-
-def sizes_beside(path: Path) -> Sizes:
-    """Return the image size of each camera that `detect` wrote beside its observations."""
-    beside = path.with_suffix('.detect.json')
-    if not beside.exists():
-        return {}
-    document = read_json(beside, ObservationError)
-    entries = document.get('image_sizes', {'': document.get('image_size')})
-    sizes: Sizes = {}
-    for camera, entry in entries.items() if isinstance(entries, dict) else ():
-        match entry:
-            case [int(width), int(height)] if width > 0 < height:
-                sizes[camera] = width, height
-    if not sizes:
-        raise ObservationError(f'{beside}: image_sizes must be whole numbers; give --image-size')
-    return sizes
+    return replace(table, photographs=photographs_beside(Path(path), table.cameras)), {}
 
 
 def image_sizes(text: str) -> Sizes:
@@ -130,20 +95,6 @@ def image_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
         raise argparse.ArgumentTypeError(f'{text!r} is not of the form 1280x800')
     return int(width), int(height)
-
-
-def check_sizes(path: str, sizes: Sizes, lenses: Mapping[str, Lens]) -> None:
-    """Raise LensError where images are of another size than their lens.
-
-    sizes: as far as they are known from elsewhere than from what `detect` wrote.
-    """
-    sizes = sizes or sizes_beside(Path(path))
-    for camera, lens in lenses.items():
-        size = sizes.get(camera) or sizes.get('')
-        if size and size != (lens.width, lens.height):
-            raise LensError(f'{path}: images are {size[0]}x{size[1]} px, lens {lens.name!r} is '
-                            f'for {lens.width}x{lens.height} px; give the lens of this camera at '
-                            'this size')
 
 
 def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:

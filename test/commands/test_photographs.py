@@ -17,11 +17,12 @@ from helpers.kalibr import write_camchain
 from helpers.nodes import SHARED
 from helpers.photographs import BOARD, LENS, PRINTED, photograph, poses, write
 
+import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.commands.diagnose import _read as read_views
 from fisheye_svp_ros.commands.lenses import lenses_of, load_lenses
 from fisheye_svp_ros.commands.photographs import read_input
-from fisheye_svp_ros.errors import LensError
+from fisheye_svp_ros.errors import LensError, ParameterError
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_observations, read_poses, write_observations
 from fisheye_svp_ros.optics.camera import project
@@ -155,6 +156,14 @@ def test_a_lens_of_another_image_size_is_refused(
         assert cli.main([command, *rest, '--lens', str(tmp_path / 'large.yaml')]) == 2
         said = capsys.readouterr().err
         assert "424x400 px, lens 'small' is for 848x800 px" in said
+    for call in (lambda: fsvp.localize(table, tmp_path / 'large.yaml'),
+                 lambda: fsvp.diagnose(str(table), tmp_path / 'large.yaml')):
+        with pytest.raises(LensError, match='is for 848x800 px'):
+            call()
+    said = refused(capsys, 'calibrate', table, '--image-size', '400x424')
+    assert 'images are 424x400 px, --image-size is 400x424' in said
+    with pytest.raises(ParameterError, match='424x400 px, image_size is 400x424'):
+        fsvp.calibrate(table, 'equidistant', (400, 424))
 
 
 def test_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
