@@ -269,6 +269,10 @@ def _table(
     number = {key: i for i, key in enumerate(keys)}
     cameras = tuple(sorted({one.camera for one in searched if one.points}))
     found = [one for one in searched if one.points is not None]
+    if '' in cameras and len(cameras) > 1:
+        lone = next(one.name for one in found if not one.camera)
+        raise ObservationError(f'{lone}: of no camera, others are of {", ".join(cameras[1:])}; '
+                               'put it into a folder named after its camera')
     certainty = np.ones(len(searched))
     if len(pattern.symmetries) > 1:
         found, sure = _agree_on_order(found, pattern, cameras, number, source)

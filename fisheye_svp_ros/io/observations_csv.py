@@ -31,6 +31,9 @@ def read(path: str | Path) -> Observations:
     # Results of a camera go to a folder of its name, in that of all.
     table.refuse([name.startswith('/') or '..' in name.split('/') for name in names], 'camera',
                  'a name without .. that does not begin with /')
+    if len(cameras) > 1:
+        named = next(filter(None, cameras))
+        table.refuse([not name for name in names], 'camera', f'a name, as {named!r} elsewhere,')
     camera = np.array([cameras.index(name) for name in names], dtype=np.int64)
     table.refuse_repeats(
         np.stack([frame, camera, landmark], axis=-1), 'frame, camera and landmark'

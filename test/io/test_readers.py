@@ -158,6 +158,7 @@ class TestObservationsCsv:
     @pytest.mark.parametrize(('name', 'cell', 'says'), [
         ('camera', '../left', "camera is '../left'; a name without .."),
         ('camera', '/left', "camera is '/left'; a name without .."),
+        ('camera', '', "camera is ''; a name, as '1' elsewhere, is needed"),
         ('sigma', '0', "sigma is '0'; a number above 0"),
         ('sigma', '-0.1', "sigma is '-0.1'; a number above 0"),
         ('sigma', '', "sigma is ''; a number"),
