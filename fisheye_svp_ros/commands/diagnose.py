@@ -19,6 +19,7 @@ from fisheye_svp_ros.commands.notes import (
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
+    positive_count,
     read_input,
     search_options,
 )
@@ -71,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
                         help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 '
                         'm')
-    parser.add_argument('--next', type=int, default=0, metavar='N', dest='count',
+    parser.add_argument('--next', type=positive_count, default=0, metavar='N', dest='count',
                         help='list the N photographs to take next: those that separate the '
                         'confounded causes best')
     parser.add_argument('--for', dest='number', metavar='NAME',
@@ -93,8 +94,7 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.solve.rig_state import free_parameters
     from fisheye_svp_ros.study.known_errors import known_errors
 
-    if (args.number or args.room) and not args.count:
-        raise ParameterError('--for and --room need --next N')
+    _check_options(args)
     given = load_lenses(args.lens)
     if args.count and len(given) > 1:
         raise ParameterError('--next plans the photographs of one camera; give one lens')
@@ -140,6 +140,16 @@ def run(args: argparse.Namespace) -> None:
         note_unconnected(observations)
     if impossible is not None:
         raise impossible
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Raise ParameterError for options that need another one or contradict each other."""
+    if (args.number or args.room) and not args.count:
+        raise ParameterError('--for and --room need --next N')
+    for name in args.included:
+        if name in args.left_out:
+            raise ParameterError(f'--with {name} and --without {name} contradict each other; '
+                                 'remove one of them')
 
 
 def _plan_next_views(

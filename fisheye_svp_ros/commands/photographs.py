@@ -37,7 +37,7 @@ def add_board_arguments(parser: argparse.ArgumentParser, required: bool = False)
                         'squares:3x4:30mm:30mm (side, gap)')
     parser.add_argument('--detector', choices=DETECTORS, default='',
                         help='detector; default: the most accurate one for the board')
-    parser.add_argument('--every', type=_count, default=1, metavar='N',
+    parser.add_argument('--every', type=positive_count, default=1, metavar='N',
                         help='use every Nth photograph or video frame')
     parser.add_argument('--sync', type=_seconds, metavar='TIME',
                         help='for a rig: largest difference between the stamps of simultaneous '
@@ -163,7 +163,8 @@ def _seconds(text: str) -> float:
     return value
 
 
-def _count(text: str) -> int:
+def positive_count(text: str) -> int:
+    """Return a whole number above 0 of a text."""
     if not text.isdecimal() or not int(text):
         raise argparse.ArgumentTypeError(f'{text!r} is not a whole number above 0')
     return int(text)

@@ -20,6 +20,7 @@ from fisheye_svp_ros.io.recording import (
     residual_sets,
     tabulate,
 )
+from fisheye_svp_ros.io.recording_files import is_recording
 from fisheye_svp_ros.reporting.progress import progress
 
 _FIELDS = 4  # residual fields a lens
@@ -49,8 +50,8 @@ def run(args: argparse.Namespace) -> None:
 def _table_in(source: Path) -> Path | None:
     if source.suffix in _TABLES:
         return source
-    table = source / 'sweep.csv'
-    return table if table.exists() else None
+    names = ['sweep.csv'] if is_recording(source) else ['sweep.csv', 'table.csv']
+    return next((source / name for name in names if (source / name).exists()), None)
 
 
 def _of_table(path: Path, folder: Path) -> list[Path]:

@@ -292,6 +292,15 @@ class TestTerminal:
             ' '.join(once.split()))
         assert 'image points repeat those of an earlier frame: frame 99' in twice.err
 
+    def test_options_that_cannot_be(self, scene, capsys):
+        name = 'viewpoint_shift'
+        assert run('shift.csv', scene, '--with', name, '--without', name) == 2
+        assert f'--with {name} and --without {name} contradict' in capsys.readouterr().err
+        for count in ('-1', '0'):
+            with pytest.raises(SystemExit):
+                run('shift.csv', scene, '--next', count)
+            assert f"'{count}' is not a whole number above 0" in capsys.readouterr().err
+
     def test_frames_that_cannot_be_posed_are_named(self, scene, capsys):
         assert run('poor.csv', scene) == 0
         out, err = capsys.readouterr()

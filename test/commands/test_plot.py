@@ -102,6 +102,12 @@ def test_a_sweep_is_drawn_against_everything_that_was_swept(tmp_path: Path) -> N
         assert image.shape[1] > 500 and np.ptp(image) > 0.5
 
 
+def test_a_table_is_found_in_its_folder(tmp_path: Path) -> None:
+    write_columns(tmp_path / 'table', TABLE)
+    assert main(['plot', str(tmp_path), '-o', str(tmp_path / 'plots')]) == 0
+    assert (tmp_path / 'plots' / 'error_against_radius.png').exists()
+
+
 def test_a_rig_is_drawn(tmp_path: Path) -> None:
     plan = plan_sweep({'synthetic_camera': {'style': 'parallel', 'sweep.baseline': [0.1, 0.2]}})
     files = draw_table(sweep_rows(plan, range(2)), tmp_path)
