@@ -14,7 +14,7 @@ from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.detect.patterns import parse_pattern
-from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.errors import GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.files import write_bytes, write_together
 from fisheye_svp_ros.io.lens_files import cameras_in
 from fisheye_svp_ros.io.readers import read_poses, write_observations, write_poses
@@ -28,6 +28,7 @@ from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, p
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
 Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
+_MIN_SIZE = 10.0  # px of the corners in sight; in millimetres, poses are a thousand times too far
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -78,7 +79,7 @@ def run(args: argparse.Namespace) -> None:
                         bow=parabola(printed.corners, 1e-3 * args.bow))
     boards = TARGETS.get(args.target, board)(printed)
     if args.poses:
-        poses = read_poses(args.poses).pose
+        poses = _read_poses(args.poses, cameras, boards)
     else:
         poses = _random_poses(cameras, boards, args, rng)
     with write_together():
@@ -97,11 +98,28 @@ def _cameras(given: str) -> Cameras:
     path = lens_path(given)
     names = cameras_in(path)
     rigs = rigs_of_lenses(path) if names else ()
-    if len(rigs) + 1 != len(names):
+    if not names:
         return {'': (load_with_notes(path), identity())}
+    if len(rigs) + 1 != len(names):
+        raise LensError(f'{path}: it holds {", ".join(names)} but not their relative poses; add '
+                        f'rig.yaml, or name one camera, {path}#{names[0]}')
     places = cameras_in_first(rigs)
     return {name: (load_with_notes(f'{path}#{name}'), places.take(i))
             for i, name in enumerate(names)}
+
+
+def _read_poses(path: str, cameras: Cameras, boards: tuple[BoardPose, ...]) -> Pose:
+    """Return poses (P,) of a file; raise GeometryError where no photograph would show a board."""
+    poses = read_poses(path).pose
+    for i in range(len(poses.position)):
+        for lens, place in cameras.values():
+            uv, seen = visible(lens, boards, poses.take(i).compose(place))
+            if seen.any() and np.ptp(uv[seen], axis=0).max() > _MIN_SIZE:
+                return poses
+    nearest = np.linalg.norm(poses.position, axis=-1).min()
+    raise GeometryError(f'{path}: from none of its poses the target is seen larger than '
+                        f'{_MIN_SIZE:g} px, the nearest is {nearest:.3g} m from its origin; poses '
+                        'of the camera in the frame of the target, in m, are needed')
 
 
 def _random_poses(
@@ -110,7 +128,7 @@ def _random_poses(
 ) -> Pose:
     """Return poses (P,) of the first camera; the cameras of a rig look at the target in turn."""
     poses = identity(args.count)
-    for number, (lens, place) in enumerate(cameras.values()):
+    for number, (lens, place) in enumerate([*cameras.values()][:args.count]):
         mine = np.arange(number, args.count, len(cameras))
         if len(boards) > 1:
             own = target_views(lens, args.target, boards, len(mine), tuple(args.ranges), rng)

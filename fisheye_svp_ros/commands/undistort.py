@@ -15,6 +15,7 @@ from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import image_size
 from fisheye_svp_ros.detect.photographs import (
+    IMAGES,
     Photograph,
     count_photographs,
     doubtful_folders,
@@ -85,6 +86,9 @@ def run(args: argparse.Namespace) -> None:
     sides, pair, paths = _rectifications(args)
     with write_together(), progress('undistorting', count_photographs(paths)) as done:
         counts = _write_photographs(sides, pair, paths, args.output, done)
+        if paths and not any(counts.values()):
+            raise ObservationError(f'{", ".join(paths)}: no photograph can be read; images are '
+                                   f'{" ".join(IMAGES)}')
         left = {name: shift_left(side) for name, side in sides.items() if _has_shift(side.lens)}
         rows = rows_left(pair) if pair and left else None
         document: dict[str, Any] = {

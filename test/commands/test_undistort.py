@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 import fisheye_svp_ros as fsvp
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.io.lens_files import load_lens, save_lens
+from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.rig_files import save_rig
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
@@ -184,6 +186,9 @@ def test_what_cannot_be_done_is_said_in_a_line(
     said = refused(capsys, 'undistort', lens, small, *end)
     assert "x.png: the image is 42x40 px, lens 'small' is for 424x400 px" in said
     twice = [photos / 'left' / '00.png', photos / 'right' / '00.png']
+    (tmp_path / 'a.csv').write_text('frame')
+    assert cli.main(['undistort', str(lens), str(tmp_path / 'a.csv'), '-o', str(out)]) == 2
+    assert 'no photograph can be read; images are .png' in capsys.readouterr().err
     assert 'another photograph is also called 00' in refused(
         capsys, 'undistort', lens, *twice, *end)
     assert not out.exists() or not [*out.rglob('*.*')]
@@ -255,3 +260,28 @@ def test_a_rendered_rig_has_its_truth(folder: Path, tmp_path: Path) -> None:
             f'{frame:03d}.png' for frame in np.unique(mine.frame)}
     run(f'{folder / "lenses"}/', tmp_path, '-o', tmp_path / 'out', '--range', 0.2)
     assert (tmp_path / 'out' / 'pair.png').exists()
+
+
+@pytest.mark.parametrize('more', [(), ('--target', 'cube')])
+def test_a_rig_of_more_cameras_than_photographs_is_rendered(
+    folder: Path, tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    assert cli.main(['render', '--lens', f'{folder / "lenses"}/', '--board', 'chessboard:6x5:20mm',
+                     '--count', '1', *more, '--ranges', '0.15', '0.2', '-o', str(tmp_path)]) == 0
+    assert len(fsvp.read_poses(tmp_path / 'poses.csv').frame) == 1
+
+
+def test_what_cannot_be_rendered_is_said_in_a_line(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    away = Pose.stack([Pose(pose.rotation, 1000 * pose.position)
+                       for pose in (poses(2).take(i) for i in range(2))])
+    write_poses(tmp_path / 'mm.csv', np.arange(2), away)
+    end = '--board', 'chessboard:6x5:30mm', '-o', tmp_path / 'out'
+    said = refused(capsys, 'render', '--lens', 'fish180', '--poses', tmp_path / 'mm.csv', *end)
+    assert 'mm.csv: from none of its poses the target' in said and 'in m, are needed' in said
+    for name in ('left', 'right'):
+        shutil.copy(folder / 'lenses' / f'{name}.yaml', tmp_path)
+    said = refused(capsys, 'render', '--lens', f'{tmp_path}/', '--count', 1, *end)
+    assert 'it holds left, right but not their relative poses; add rig.yaml' in said
+    assert not (tmp_path / 'out').exists()
