@@ -11,6 +11,8 @@ from fisheye_svp_ros.solve.hand_eye import HandEye
 HEADER = ('transform', 'x, mm', 'y, mm', 'z, mm', 'rx, deg', 'ry, deg', 'rz, deg')
 _LARGE_SHARE = 0.5  # of the squares of all frames: such a pose is wrong
 _MIN_FRAMES = 6
+_MAX_SCALE = 2.0  # of lengths, either way: more is another unit, or the size of another board
+_MIN_MM = 100.0  # such a factor, too large for a mistaken board, is that of mm
 
 
 def hand_eye_sentence(found: HandEye) -> str:
@@ -29,6 +31,21 @@ def hand_eye_rows(found: HandEye) -> list[tuple[str, ...]]:
 
 def hand_eye_warnings(found: HandEye) -> list[str]:
     """Return what there is to say against the poses."""
+    return [*_unit_warnings(found.scale), *_pose_warnings(found)]
+
+
+def _unit_warnings(scale: float) -> list[str]:
+    """Return that lengths of robot and target are in different units, if it seems so."""
+    if 1 / _MAX_SCALE <= scale <= _MAX_SCALE:
+        return []
+    factor = max(scale, 1 / scale)
+    longer = 'the poses' if scale < 1 else 'the target'
+    likely = f': {longer} may be in mm' if factor > _MIN_MM else ''
+    return [f'lengths of robot and target differ by a factor of {factor:.4g}{likely}; both are '
+            'needed in m']
+
+
+def _pose_warnings(found: HandEye) -> list[str]:
     noise = np.repeat((found.noise_m, found.noise_rad), 3)
     squares = ((found.residual / noise) ** 2).sum(axis=1)
     worst = int(np.argmax(squares))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from helpers.differences import jacobian
@@ -9,6 +11,7 @@ from helpers.robot import LENS, TRUTH, robot
 
 from fisheye_svp_ros.errors import GeometryError, ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
+from fisheye_svp_ros.reporting.hand_eye_text import hand_eye_warnings
 from fisheye_svp_ros.solve.hand_eye import (
     HandEye,
     Transforms,
@@ -93,6 +96,15 @@ def test_a_robot_holds_the_lens() -> None:
             alone.adjusted.lens.calibration['rms_px'])
     before, after = np.mean(off, axis=0)
     assert after < 0.7 * before
+
+
+@pytest.mark.parametrize(('scale', 'said'), [
+    (0.9, ''), (2.5, 'a factor of 2.5; both'), (0.001, 'a factor of 1000: the poses may be in mm'),
+    (1001.0, 'a factor of 1001: the target may be in mm; both are needed in m'),
+])
+def test_lengths_in_other_units_are_told(scale: float, said: str) -> None:
+    warnings = hand_eye_warnings(replace(fit(1)[1], scale=scale))
+    assert [said in one for one in warnings] == [True] * bool(said)
 
 
 def test_frames_without_a_pose_have_none() -> None:
