@@ -34,10 +34,10 @@ from fisheye_svp_ros.io.lens_files import save_lens
 from fisheye_svp_ros.io.readers import read_poses
 from fisheye_svp_ros.optics.curves import IMAGE_HEIGHTS
 from fisheye_svp_ros.optics.lens import parameter_values
-from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
+from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
 from fisheye_svp_ros.reporting.hand_eye_text import HEADER, hand_eye_rows, hand_eye_sentence
 from fisheye_svp_ros.reporting.progress import progress, stages
-from fisheye_svp_ros.reporting.tables import noise_text, print_table
+from fisheye_svp_ros.reporting.tables import print_table
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.solve.lens_calibration import (
     Calibration,
@@ -231,7 +231,7 @@ def _print(found: CalibratedCamera) -> None:
     if open_ones:
         print('  with any target: 95 %, with shape, scale and boards of the target estimated too')
     print(f'  max_incidence_deg {np.degrees(lens.max_incidence):.2f}, image points up to '
-          f'{np.degrees(found.result.reached):.2f}; {noise_text(found.result.sigma)}')
+          f'{np.degrees(found.result.reached):.2f}; {STANDARD_ERRORS}')
     if found.hand_eye:
         print_table(hand_eye_sentence(found.hand_eye), HEADER, hand_eye_rows(found.hand_eye))
 

@@ -13,7 +13,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.optics.lens import Lens, parameter_values
 from fisheye_svp_ros.reporting.blocks import page, png_uri
-from fisheye_svp_ros.reporting.calibration_text import CalibratedCamera
+from fisheye_svp_ros.reporting.calibration_text import STANDARD_ERRORS, CalibratedCamera
 from fisheye_svp_ros.reporting.plots import FAINT, OURS, PUBLISHED, drawing, round_number
 from fisheye_svp_ros.scene.photograph_names import frame_name
 from fisheye_svp_ros.solve.ray_errors import RANGES, RayModel, ray_model, typical_points
@@ -30,8 +30,9 @@ def write_calibration_report(
 
     Raises OutputError where it cannot be written.
     """
-    write_text(path, page('calibration.html', command=command, cameras=[
-        _camera(name, one) for name, one in cameras.items()]))
+    write_text(path, page(
+        'calibration.html', command=command, standard_errors=STANDARD_ERRORS,
+        cameras=[_camera(name, one) for name, one in cameras.items()]))
 
 
 def _camera(name: str, one: CalibratedCamera) -> dict[str, Any]:

@@ -276,6 +276,7 @@ class TestCalibrate:
         shown, err = capsys.readouterr()
         assert f'{len(table)} points in 6 frames' in shown
         assert err == ''
+        assert '; standard errors include local errors of target, frames and image' in shown
         assert 'std. error   unit' in shown  # no column of ranges where all are settled
         lens = load_lens(out)
         assert lens.name == 'mine'
