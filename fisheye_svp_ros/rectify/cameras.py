@@ -23,11 +23,12 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.lens import Lens
 
 PROJECTIONS = ('pinhole', 'cylindrical', 'equirectangular', 'fisheye')
-_PINHOLE_FIELD = np.radians(90.0)  # where the user names none
+_STRAIGHT_FIELD = np.radians(90.0)  # where u is a tangent and the user names none
 _MAX_SIZE = 32_000  # px, of an image that cv2.remap takes
 # Widest field of view, deg, and what is beyond it
 _WIDEST = {'pinhole': 175.0, 'cylindrical': 360.0, 'equirectangular': 360.0, 'fisheye': 360.0}
 _WIDEST_STEREO = {'pinhole': 175.0, 'cylindrical': 175.0, 'equirectangular': 180.0}
+STEREO_PROJECTIONS = tuple(_WIDEST_STEREO)
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,8 @@ class RectifiedCamera:
     def field_of_view(self) -> float:
         """The field of view over the width of the image, rad."""
         half = self.width / 2 / self.f
-        return float(2 * (np.arctan(half) if _is_straight(self) else half))
+        return float(2 * (np.arctan(half) if _is_straight(self.projection, self.along_baseline)
+                          else half))
 
     def directions(self, u: Array, v: Array) -> Array:
         """Return unit vectors (..., 3) of pixels u, v, px, that broadcast together.
@@ -125,7 +127,8 @@ def rectified_camera(
     camera = RectifiedCamera(projection, width, height, 1.0, (width - 1) / 2, (height - 1) / 2,
                              along_baseline and projection != 'pinhole')
     half = field_of_view / 2
-    return replace(camera, f=float(width / 2 / (np.tan(half) if _is_straight(camera) else half)))
+    straight = _is_straight(projection, along_baseline)
+    return replace(camera, f=float(width / 2 / (np.tan(half) if straight else half)))
 
 
 def camera_for(
@@ -134,12 +137,12 @@ def camera_for(
 ) -> RectifiedCamera:
     """Return the rectified camera of a lens, or of both lenses of a pair, as `rectified_camera`.
 
-    size: by default that of the first lens; field_of_view: by default 90 degrees of a pinhole,
-    otherwise what the lenses see over the width of their images.
+    size: by default that of the first lens; field_of_view: by default 90 degrees of a pinhole and
+    of a cylinder along the baseline, otherwise what the lenses see over the width of their images.
     """
     if field_of_view is None:
-        widest = _widest_field(projection, along_baseline)
-        most = _PINHOLE_FIELD if projection == 'pinhole' else np.radians(widest)
+        widest = np.radians(_widest_field(projection, along_baseline))
+        most = _STRAIGHT_FIELD if _is_straight(projection, along_baseline) else widest
         field_of_view = min(float(most), *map(_field_over_width, lenses))
     return rectified_camera(projection, size or (lenses[0].width, lenses[0].height), field_of_view,
                             along_baseline)
@@ -161,7 +164,6 @@ def _widest_field(projection: str, along_baseline: bool) -> float:
     return widest[projection]
 
 
-def _is_straight(camera: RectifiedCamera) -> bool:
+def _is_straight(projection: str, along_baseline: bool) -> bool:
     """Say whether u is a tangent rather than an angle."""
-    return camera.projection == 'pinhole' or (
-        camera.projection == 'cylindrical' and camera.along_baseline)
+    return projection == 'pinhole' or (projection == 'cylindrical' and along_baseline)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.rectify.cameras import RectifiedCamera
 from fisheye_svp_ros.rectify.maps import Rectification
 from fisheye_svp_ros.rectify.stereo import RectifiedPair
 
@@ -38,13 +39,16 @@ class PairError(NamedTuple):
 
 
 def image_error(side: Rectification, ranges: Array) -> ImageError:
-    """Return how far points at other ranges lie from their places in the rectified camera."""
+    """Return how far points at other ranges lie from their places in the rectified camera.
+
+    Of a sphere along great circles: near its poles a small angle takes many pixels of azimuth.
+    """
     pixels, directions = _samples(side)
     px = np.full((len(ranges), len(pixels)), np.nan)
     for row, range_m in enumerate(ranges):
         uv, seen = side.image_points(directions, range_m)
         found = side.rectified_points(np.where(seen[:, None], uv, np.nan))
-        px[row] = np.linalg.norm(found - pixels, axis=-1)
+        px[row] = _distances(side.camera, found, pixels)
     return ImageError(ranges, pixels, px)
 
 
@@ -104,6 +108,16 @@ def quantiles(errors: Array) -> Array:
     rows = (np.abs(row[np.isfinite(row)]) for row in errors)
     return np.array([np.quantile(row, (0.5, 0.95, 1.0)) if row.size else np.full(3, np.nan)
                      for row in rows])
+
+
+def _distances(camera: RectifiedCamera, found: Array, pixels: Array) -> Array:
+    """Return the distances (N,), px, between pixels (N, 2); NaN where `found` is."""
+    straight: Array = np.linalg.norm(found - pixels, axis=-1)
+    if camera.projection != 'equirectangular':
+        return straight
+    chord = np.linalg.norm(camera.directions(*found.T) - camera.directions(*pixels.T), axis=-1)
+    along = camera.f * 2 * np.arcsin(np.minimum(chord / 2, 1.0))
+    return np.asarray(np.where(np.isfinite(straight), along, np.nan))
 
 
 def _samples(side: Rectification) -> tuple[Array, Array]:

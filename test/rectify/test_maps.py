@@ -66,6 +66,27 @@ def test_a_whole_turn_and_what_lies_past_the_poles() -> None:
     assert mask[120, 180] and not mask[120, 0]  # ahead, and behind
 
 
+@pytest.mark.parametrize(('projection', 'along_baseline', 'degrees'), [
+    ('pinhole', True, 90.0), ('cylindrical', True, 90.0), ('cylindrical', False, 180.6),
+    ('equirectangular', True, 180.0),
+])
+def test_where_u_is_a_tangent_the_field_of_view_is_90_degrees(
+    projection: str, along_baseline: bool, degrees: float
+) -> None:
+    camera = camera_for([SVP], projection, along_baseline=along_baseline)
+    assert np.degrees(camera.field_of_view) == pytest.approx(degrees, abs=0.1)
+
+
+def test_errors_near_the_poles_of_a_sphere_are_angles() -> None:
+    camera = rectified_camera('equirectangular', (180, 180), np.radians(180.0))
+    side = Rectification(replace(SHIFTED, max_incidence=np.radians(95.0)), camera, 0.3)
+    error = image_error(side, np.array([np.inf]))
+    directions = camera.directions(*error.pixels.T)
+    image, seen = side.image_points(directions, np.inf)
+    angles = np.arccos((camera.directions(*side.rectified_points(image).T) * directions).sum(1))
+    assert error.px[0][seen] == pytest.approx(camera.f * angles[seen], abs=1e-4)
+
+
 @pytest.mark.parametrize('lens', LENSES, ids=lambda lens: lens.name)
 @pytest.mark.parametrize('projection', PROJECTIONS)
 def test_what_is_at_the_range_is_where_an_ideal_camera_has_it(
