@@ -25,11 +25,11 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import write_bytes, write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.map_files import save_maps
-from fisheye_svp_ros.io.rig_files import load_rig, rig_of_lenses
+from fisheye_svp_ros.io.rig_files import load_pair, rigs_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
-from fisheye_svp_ros.rectify.cameras import PROJECTIONS, camera_for
+from fisheye_svp_ros.rectify.cameras import PROJECTIONS, STEREO_PROJECTIONS, camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification
 from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
 from fisheye_svp_ros.reporting.progress import progress
@@ -47,11 +47,12 @@ from fisheye_svp_ros.reporting.undistort_report import (
 
 # What camera_info calls the rectified cameras that it can describe, and its coefficients
 _CAMERA_INFO = {'pinhole': ('plumb_bob', 5), 'fisheye': ('equidistant', 4)}
+_PICTURES = ('mask.png', 'shift.png')  # of each camera, beside its photographs
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
-    parser.add_argument('inputs', nargs='+', metavar='LENS PHOTOS',
+    parser.add_argument('inputs', nargs='*', metavar='LENS PHOTOS',
                         help='lens file, also of other tools, or the name of a lens of this '
                         'package; for a stereo pair, a file or folder with both lenses and '
                         'the rig; then photographs: files, folders (left/ and right/ for a '
@@ -60,8 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--lens', action='append', metavar='CAMERA=LENS',
                         help='left=LENS and right=LENS, in place of the argument LENS')
     parser.add_argument('--rig', metavar='FILE',
-                        help='pose of the left camera in the right one, if the lens files do not '
-                        'hold it')
+                        help='pose of the left camera in the right one: a file, or a folder with '
+                        'rig.yaml; if the lens files do not hold it')
     parser.add_argument('-o', '--output', type=output_folder, required=True, metavar='DIR',
                         help='folder to write the photographs, maps.npz and maps.yml (map1 and '
                         'map2 for cv2.remap, mask, K, R, P), mask.png, camera_info.yaml, '
@@ -71,8 +72,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help='projection of the rectified camera; fisheye: equidistant; default: '
                         'pinhole')
     parser.add_argument('--fov', type=float, metavar='DEG',
-                        help='its field of view over the width; default: 90 for a pinhole, '
-                        'otherwise that of the lens')
+                        help='its field of view over the width; default: 90 for a pinhole '
+                        'and for a cylindrical pair, otherwise that of the lens')
     parser.add_argument('--size', type=image_size, metavar='WxH',
                         help='size of the rectified images, px; default: that of the photographs')
     parser.add_argument('--range', type=float, default=RANGE, metavar='M', dest='range_m',
@@ -119,6 +120,8 @@ def _rectifications(
     args: argparse.Namespace
 ) -> tuple[dict[str, Rectification], RectifiedPair | None, list[str]]:
     """Return the rectifications by camera, of a rig also as a pair, and the photographs."""
+    if not (args.lens or args.inputs):
+        raise ParameterError('no lens is named; give LENS, or --lens left=LENS --lens right=LENS')
     paths = list(args.inputs) if args.lens else args.inputs[1:]
     lenses = load_lenses(args.lens or args.inputs[:1])
     for line in doubtful_folders(paths):
@@ -129,6 +132,8 @@ def _rectifications(
     field = None if args.fov is None else float(np.radians(args.fov))
     wanted = args.projection, args.size, field
     if rig is None:
+        if len(lenses.in_file or lenses) > 1 and args.projection in STEREO_PROJECTIONS:
+            _note_unrectified(list(by_camera))
         sides = {name: Rectification(lens, camera_for([lens], *wanted), args.range_m)
                  for name, lens in by_camera.items()}
         return sides, None, paths
@@ -150,10 +155,21 @@ def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
         if len(lenses) != 2:
             raise ParameterError(f'--rig {args.rig}: a rig of two cameras needs two lenses, got '
                                  f'{len(lenses)}; give --lens left=LENS --lens right=LENS')
-        return load_rig(args.rig)
+        return load_pair(args.rig, list(lenses))
     if args.lens or len(lenses) != 2:
         return None
-    return rig_of_lenses(lens_path(args.inputs[0]))
+    path = lens_path(args.inputs[0])
+    return load_pair(path, list(lenses)) if rigs_of_lenses(path) else None
+
+
+def _note_unrectified(cameras: Sequence[str]) -> None:
+    """Say why the photographs of several cameras are not rectified as those of a pair."""
+    if len(cameras) == 2:
+        say(f'{" and ".join(cameras)} are not rectified as a pair, since no rig is named; add '
+            '--rig FILE')
+    elif len(cameras) > 2:
+        say(f'{len(cameras)} cameras are not rectified as a pair; name two of them and their rig: '
+            f'--lens {cameras[0]}=LENS --lens {cameras[1]}=LENS --rig FILE')
 
 
 def _write_photographs(
@@ -162,7 +178,7 @@ def _write_photographs(
 ) -> dict[str, int]:
     """Write the rectified photographs, and a picture of the first pair; return how many."""
     counts = dict.fromkeys(sides, 0)
-    written: set[Path] = set()
+    written = {folder / name / file for name in sides for file in _PICTURES}
     first: dict[str, tuple[str, Any]] = {}
     for photograph in find_photographs(paths):
         try:
@@ -174,6 +190,9 @@ def _write_photographs(
         key = Path(photograph.key).name
         path = folder / photograph.camera / f'{key}.png'
         if path in written:
+            if path.name in _PICTURES:
+                raise ParameterError(f'{photograph.name}: {path.name} is a result of this command '
+                                     'too; rename the photograph')
             raise ParameterError(f'{photograph.name}: another photograph is also called {key}; '
                                  'give one folder at a time')
         written.add(path)

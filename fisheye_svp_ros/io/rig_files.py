@@ -9,7 +9,7 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import read_text, write_text
 from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
-from fisheye_svp_ros.io.lens_formats import read_foreign
+from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.io.lens_formats.rig import cameras_of, pose_keys
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
@@ -40,13 +40,8 @@ def check_camera_names(cameras: Sequence[str], chain: Sequence[str], where: str)
 
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:
-    """Return each camera in the next one, of a file that `load_rig` reads."""
-    foreign = read_foreign(path, read_text(path, LensError, MAX_LENS_BYTES))
-    if foreign is None:
-        raise LensError(f'{path}: left_in_right with position and quaternion is needed')
-    if not foreign.rigs:
-        raise LensError(f'{path}: it holds one camera, or no transform between two')
-    return foreign.rigs
+    """Return each camera in the next one, of a file or folder that `load_rig` reads."""
+    return _read_rig(path).rigs
 
 
 def cameras_in_first(steps: Sequence[Pose]) -> Pose:
@@ -63,39 +58,57 @@ def load_cameras(path: str | Path) -> tuple[tuple[str, ...], Pose]:
     path: of a rig file, or of a file or folder that holds lenses and rig.
     Raises LensError where there is none.
     """
-    file = Path(path) / 'rig.yaml' if Path(path).is_dir() else path
-    steps = load_rigs(file)
-    foreign = read_foreign(file, read_text(file, LensError, MAX_LENS_BYTES))
-    assert foreign is not None
-    names = foreign.cameras or tuple(foreign.lenses) or STEREO
-    if len(names) != len(steps) + 1:
-        raise LensError(f'{file}: {len(names)} cameras, and {len(steps)} transforms between them; '
-                        'each camera in the next one is needed')
-    return names, cameras_in_first(steps)
+    held = _read_rig(path)
+    names = held.cameras or tuple(held.lenses) or STEREO
+    if len(names) != len(held.rigs) + 1:
+        raise LensError(f'{path}: {len(names)} cameras, and {len(held.rigs)} transforms between '
+                        'them; each camera in the next one is needed')
+    return names, cameras_in_first(held.rigs)
 
 
 def load_rig(path: str | Path) -> Pose:
     """Return the first (left) camera in the second one, of a rig file or what another tool wrote.
 
-    Kalibr's camchain, Basalt, OpenCV's R and T, URDF, what `ros2 topic echo /tf_static` prints.
+    Kalibr's camchain, Basalt, OpenCV's R and T, URDF, what `ros2 topic echo /tf_static` prints; of
+    a folder its rig.yaml.
     Raises LensError, naming file and field, where there is none.
     """
     return load_rigs(path)[0]
 
 
-def rig_of_lenses(path: str | Path) -> Pose | None:
-    """Return the rig that a file or folder of two lenses holds, None where it holds none.
+def load_pair(path: str | Path, cameras: Sequence[str]) -> Pose:
+    """Return the first of two cameras in the second one, of a file or folder as `load_cameras`.
 
-    The first camera in the second one.  Raises LensError for a file that cannot be read.
+    By name or, of a rig of two that are called otherwise, by order.
+    Raises LensError for a rig of more cameras that are called otherwise.
     """
-    rigs = rigs_of_lenses(path)
-    return rigs[0] if len(rigs) == 1 else None
+    names, places = load_cameras(path)
+    if len(names) == 2 and tuple(cameras) != names[::-1]:
+        return load_rig(path)
+    if unknown := [name for name in cameras if name not in names]:
+        raise LensError(f'{path}: a rig of {", ".join(names)}, without {unknown[0]}; give the '
+                        'lenses of two of these, by their names')
+    first, second = (places.take(names.index(name)) for name in cameras)
+    return second.inverse().compose(first)
 
 
 def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
     """Return each camera in the next one, as a file or folder of lenses holds them, if it does."""
     if Path(path).is_dir():
-        file = Path(path) / 'rig.yaml'
-        return load_rigs(file) if file.exists() else ()
+        return load_rigs(path) if _rig_file(path).exists() else ()
     foreign = read_lens_file(path)
     return foreign.rigs if foreign else ()
+
+
+def _rig_file(path: str | Path) -> Path:
+    return Path(path) / 'rig.yaml' if Path(path).is_dir() else Path(path)
+
+
+def _read_rig(path: str | Path) -> Foreign:
+    file = _rig_file(path)
+    foreign = read_foreign(file, read_text(file, LensError, MAX_LENS_BYTES))
+    if foreign is None:
+        raise LensError(f'{file}: left_in_right with position and quaternion is needed')
+    if not foreign.rigs:
+        raise LensError(f'{file}: it holds one camera, or no transform between two')
+    return foreign

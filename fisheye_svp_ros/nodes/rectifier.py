@@ -18,7 +18,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
 from fisheye_svp_ros.io.parameters import parameter
-from fisheye_svp_ros.io.rig_files import load_rig, rig_of_lenses
+from fisheye_svp_ros.io.rig_files import load_pair, rigs_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
@@ -50,8 +50,8 @@ class RectifierSettings(Settings):
         False, 'Rectify a stereo pair, the cameras in the namespaces left and right', fixed=True
     )
     rig: str = parameter(
-        '', 'Rig of the stereo pair: a file of `calibrate`, Kalibr, Basalt, OpenCV, or a URDF; '
-        'empty: the rig in the file or folder of the lenses', file=True
+        '', 'Rig of the stereo pair: `rig.yaml` or its folder, a file of Kalibr, Basalt, OpenCV, '
+        'or a URDF; empty: that of the lenses', file=True
     )
     field_of_view: float = parameter(
         1.5708, 'Field of view of the rectified images over their width', 'rad', (0.01, 3.05)
@@ -144,13 +144,17 @@ class Rectifier(BaseNode):
         """Return the rig of a pair, None for one camera; raise FisheyeSvpError where it lacks."""
         if not settings.stereo:
             return None
+        path = None if settings.lens == CAMERA_INFO else lens_path(settings.lens)
+        names = cameras_in(path) if path else ()
         if settings.rig:
-            return load_rig(settings.rig)
-        held = None if settings.lens == CAMERA_INFO else rig_of_lenses(lens_path(settings.lens))
-        if held is None:
+            return load_pair(settings.rig, names[:2] or STEREO)
+        if len(names) > 2:
+            raise ParameterError(f'lens {settings.lens!r} holds {len(names)} cameras, '
+                                 f'{", ".join(names)}; give a file or folder of two')
+        if not path or not rigs_of_lenses(path):
             raise ParameterError(f'rig is empty, and lens {settings.lens!r} holds none; name the '
                                  'file of the rig')
-        return held
+        return load_pair(path, names)
 
     def _rectifications(
         self, settings: RectifierSettings, rig: Pose | None, lenses: tuple[Lens, ...]

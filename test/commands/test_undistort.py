@@ -156,15 +156,55 @@ def test_a_rig(folder: Path, tmp_path: Path, way: str, capsys: pytest.CaptureFix
         assert cv2.imread(str(tmp_path / name)) is not None
 
 
+def lenses_by_name(folder: Path, *names: str) -> list[str]:
+    return [f'--lens={name}={folder / "lenses" / name}.yaml' for name in names]
+
+
+@pytest.mark.parametrize(('names', 'said'), [
+    (('left', 'right'), 'note: left and right are not rectified as a pair, since no rig is named; '
+     'add --rig FILE\n'),
+    (('left', 'right', 'rear'), 'note: 3 cameras are not rectified as a pair; name two of them '
+     'and their rig: --lens left=LENS --lens right=LENS --rig FILE\n'),
+])
 def test_lenses_without_a_rig_are_undistorted_each_by_itself(
-    folder: Path, tmp_path: Path
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], names: tuple[str, ...],
+    said: str
 ) -> None:
-    lenses = folder / 'lenses'
-    run('--lens', f'left={lenses / "left.yaml"}', '--lens', f'right={lenses / "right.yaml"}',
-        folder / 'photos', '-o', tmp_path)
+    lens = folder / 'lenses' / 'left.yaml'
+    run(*(f'--lens={name}={lens}' for name in names), '-o', tmp_path, '--size', '64x48')
+    assert capsys.readouterr().err.endswith(said)
     document = json.loads((tmp_path / 'undistort.json').read_text())
     assert 'rows' not in document
     assert all(camera['r'] == np.eye(3).tolist() for camera in document['cameras'].values())
+
+
+def test_two_cameras_of_a_larger_rig_go_by_name_and_need_no_photographs(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The rig is named by its folder, as for `localize --rig`."""
+    steps = [Pose(np.eye(3), np.array([-0.2, 0.0, 0.0])), RIG]
+    save_rig(steps, tmp_path / 'rig' / 'rig.yaml', ('top', 'left', 'right'))
+    end = '--rig', tmp_path / 'rig', '-o', tmp_path / 'out', '--size', '64x48'
+    run(*lenses_by_name(folder, 'left', 'right'), *end)
+    out = capsys.readouterr().out
+    assert 'baseline 60.21 mm' in out and 'out: 0 photographs' in out
+    lens = folder / 'lenses' / 'left.yaml'
+    said = refused(capsys, 'undistort', f'--lens=cam0={lens}', f'--lens=left={lens}', *end)
+    assert 'a rig of top, left, right, without cam0; give the lenses of two of these' in said
+    assert 'no lens is named; give LENS' in refused(capsys, 'undistort', *end)
+    assert fsvp.load_rig(tmp_path / 'rig').position[0] == -0.2
+
+
+@pytest.mark.parametrize('name', ['mask', 'shift'])
+def test_no_photograph_is_lost_to_a_result_of_its_name(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    photograph = tmp_path / f'{name}.jpg'
+    photograph.write_bytes((folder / 'color' / 'a.jpg').read_bytes())
+    said = refused(capsys, 'undistort', folder / 'lenses' / 'left.yaml', photograph, '-o',
+                   tmp_path / 'out')
+    assert f'{photograph}: {name}.png is a result of this command too; rename the photo' in said
+    assert not (tmp_path / 'out').exists()
 
 
 def test_what_cannot_be_done_is_said_in_a_line(

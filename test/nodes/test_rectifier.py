@@ -167,9 +167,10 @@ def lenses(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize('source', ['file', 'camera_info'])
+@pytest.mark.parametrize('source', ['file', 'camera_info', 'folder'])
 def test_a_stereo_pair(graph: Callable[..., Graph], lenses: Path, source: str) -> None:
-    given = [f'lens:={lenses}/'] if source == 'file' else [f'rig:={lenses}/rig.yaml']
+    given = [f'lens:={lenses}/'] if source == 'file' else [
+        f'rig:={lenses}/' + 'rig.yaml' * (source != 'folder')]
     g = graph('stereo:=true', f'field_of_view:={FIELD}', 'range:=0.2', *given)
     g.start(Rectifier)
     known = (LENS, RIGHT) if source == 'file' else (LENS.svp(), RIGHT.svp())
@@ -211,6 +212,14 @@ def test_what_cannot_be_rectified_is_refused(graph: Callable[..., Graph], lens: 
 def test_a_pair_without_a_rig_does_not_start(graph: Callable[..., Graph], lens: Path) -> None:
     g = graph('stereo:=true', f'lens:={lens}')
     with pytest.raises(ParameterError, match=r'rig is empty, and lens .* holds none'):
+        g.start(Rectifier)
+
+
+def test_a_rig_of_three_is_no_pair(graph: Callable[..., Graph], lenses: Path) -> None:
+    save_lens(LENS, lenses / 'top.yaml')
+    save_rig([RIG, RIG], lenses / 'rig.yaml', ('left', 'right', 'top'))
+    g = graph('stereo:=true', f'lens:={lenses}/')
+    with pytest.raises(ParameterError, match=r'holds 3 cameras, left, right, top; give a file'):
         g.start(Rectifier)
 
 
