@@ -89,7 +89,9 @@ def run(args: argparse.Namespace) -> None:
 def _convert(lens: Lens, args: argparse.Namespace) -> None:
     """Write another tool's form of the lens, or of the nearest SVP lens; say what that loses."""
     given, ranges = lens, _RANGES
-    if args.range_m is not None:
+    if args.range_m is not None and lens.is_svp:
+        say(f'--range {args.range_m:g} changes nothing: lens {lens.name!r} has a single viewpoint')
+    elif args.range_m is not None:
         given, worst = nearest_svp_lens(lens, args.range_m)
         ranges = tuple(sorted({*_RANGES, args.range_m}))
         print(f'  one viewpoint, fitted at {range_text(args.range_m)}: {worst:.2g} px off there '

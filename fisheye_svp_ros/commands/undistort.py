@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> None:
         if paths and not any(counts.values()):
             raise ObservationError(f'{", ".join(paths)}: no photograph can be read; images are '
                                    f'{" ".join(IMAGES)}')
-        left = {name: shift_left(side) for name, side in sides.items() if _has_shift(side.lens)}
+        left = {name: shift_left(side) for name, side in sides.items() if not side.lens.is_svp}
         rows = rows_left(pair) if pair and left else None
         document: dict[str, Any] = {
             'as': args.projection, 'range_m': args.range_m,
@@ -110,10 +110,6 @@ def run(args: argparse.Namespace) -> None:
                         'left and right', rows)
         print(f'  {tolerated_text(rows)}')
     print(f'{args.output}: {sum(counts.values())} photographs, maps for cv2.remap')
-
-
-def _has_shift(lens: Lens) -> bool:
-    return lens.viewpoint_shift is not None or lens.port is not None
 
 
 def _rectifications(

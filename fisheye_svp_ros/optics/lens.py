@@ -102,6 +102,11 @@ class Lens:
         return replace(self, viewpoint_shift=shift if own is None else own.plus(shift))
 
     @property
+    def is_svp(self) -> bool:
+        """Whether it has a single viewpoint, so that its image is the same at every range."""
+        return self.viewpoint_shift is None and self.port is None
+
+    @property
     def is_bare(self) -> bool:
         """Whether its curves are all there is, so that an engine solves with it by itself."""
         return self.port is None and self.image_field is None

@@ -120,7 +120,7 @@ def make_budget(setup: Setup, spreads: int = 10, ranges: int = 22) -> Budget:
     for a baseline with which nothing could be measured.
     """
     lens = setup.lens
-    if lens.viewpoint_shift is None and lens.port is None:
+    if lens.is_svp:
         raise LensError(f'lens {lens.name!r} has no viewpoint_shift: SVP is exact for it; '
                         'whether the camera has one is found by `fisheye-svp diagnose`')
     if not (np.isfinite(setup.noise) and setup.noise > 0):

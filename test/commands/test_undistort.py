@@ -272,6 +272,17 @@ class TestLensForOneViewpoint:
         dropped = np.abs(fsvp.project(tmp_path / 'there', points).uv - true).max()
         assert off < 0.01 < 0.3 < dropped
 
+    def test_a_range_changes_nothing_where_the_viewpoint_does_not_move(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        skew = {'skew': {'parameters': {'shear': 0.001}}}
+        save_lens(replace(LENS.svp(), corrections=skew), tmp_path / 'lens.yaml')
+        end = 'lens', str(tmp_path / 'lens.yaml'), '--format', 'ros', '-o'
+        assert cli.main([*end, str(tmp_path / 'a')]) == 0
+        assert cli.main([*end, str(tmp_path / 'b'), '--range', '1']) == 0
+        assert '--range 1 changes nothing' in capsys.readouterr().err
+        assert (tmp_path / 'a').read_text() == (tmp_path / 'b').read_text()
+
     def test_what_it_needs(
         self, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
