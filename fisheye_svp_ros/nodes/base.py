@@ -148,8 +148,13 @@ class BaseNode(Node):  # type: ignore[misc]
 
     def has_listeners(self) -> bool:
         """Say whether as many subscriptions are there as the parameters ask for."""
+        return not self.unheard_topics()
+
+    def unheard_topics(self) -> list[str]:
+        """Return the topics with fewer subscriptions than the parameters ask for."""
         wanted = self.settings.wait_for_subscribers
-        return not wanted or all(p.get_subscription_count() >= wanted for p in self._waited_for)
+        return [one.topic_name for one in self._waited_for
+                if wanted and one.get_subscription_count() < wanted]
 
     def listen(
         self,

@@ -23,6 +23,7 @@ from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode, NodeExit, NodeFailure
 from fisheye_svp_ros.nodes.quality import LATCHED_SETS, SENSOR
 from fisheye_svp_ros.nodes.session import RCLError
+from fisheye_svp_ros.nodes.silence import LIMIT
 from fisheye_svp_ros.nodes.transforms import Transforms
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -75,6 +76,11 @@ class CameraTopics:
         """Whether somebody looks at the images, where there are any."""
         return self._images is None or self._images.get_subscription_count() > 0
 
+    @property
+    def image_topic(self) -> str:
+        """The topic of the images; empty where there are none."""
+        return '' if self._images is None else str(self._images.topic_name)
+
     def publish(
         self, stamp: int, seen: Observations | Pixels, pose: Pose | None, lens: Lens | None
     ) -> None:
@@ -111,6 +117,7 @@ class CameraNode(BaseNode):
         self._step: Any = None
         self._stamp = 0
         self._sent = 0.0
+        self._begun, self._is_reported = time.monotonic(), False
 
     def prepare(self, settings: Any) -> Any:
         """Refuse topics to wait for whose names are none."""
@@ -119,11 +126,15 @@ class CameraNode(BaseNode):
                 raise ParameterError(f'lock_step: {topic[:100]!r} is not the name of a topic')
         return settings
 
-    def has_listeners(self) -> bool:
-        """Say whether as many listen as the parameters ask for, and somebody to the images."""
-        return super().has_listeners() and (
-            not self.settings.wait_for_subscribers
-            or all(camera.is_watched for camera in self._cameras.values()))
+    def unheard_topics(self) -> list[str]:
+        """Return the topics that more have to listen to, images that nobody looks at among them.
+
+        That is of all cameras: one that is heard later would miss the first sets.
+        """
+        if not self.settings.wait_for_subscribers:
+            return []
+        return [*super().unheard_topics(), *(
+            camera.image_topic for camera in self._cameras.values() if not camera.is_watched)]
 
     @abstractmethod
     def publish_set(self, step: Any, stamp: int) -> None:
@@ -180,11 +191,22 @@ class CameraNode(BaseNode):
         if not self._unanswered:
             if self.has_listeners():
                 self._advance()
+            else:
+                self._report_unheard()
         elif time.monotonic() - self._sent > _REPUBLISH_TIMEOUT:
             # Who answers may not have known of this node yet when it did.
             waiting = ' '.join(sorted(self._unanswered))
             self.get_logger().warning(f'no answer on {waiting}; the set is published again')
             self._send()
+
+    def _report_unheard(self) -> None:
+        """Log once which topics the camera waits for, where that takes long."""
+        if not self._is_reported and time.monotonic() - self._begun > LIMIT:
+            self._is_reported = True
+            self.get_logger().warning(
+                'nothing is published yet: wait_for_subscribers is '
+                f'{self.settings.wait_for_subscribers}, and too few listen to '
+                + ', '.join(self.unheard_topics()))
 
     def _advance(self) -> None:
         try:

@@ -202,8 +202,10 @@ def test_from_rendered_images_to_the_true_pose(
 
 
 def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
-    graph: Callable[..., Graph], tmp_path: Path
+    graph: Callable[..., Graph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setattr('fisheye_svp_ros.nodes.camera.LIMIT', 0.0)
     lens = tmp_path / 'small.yaml'
     save_lens(LENS, lens)
     g = graph(f'photograph:={BOARD}', f'lens:={lens}', 'rate:=20.0', 'wait_for_subscribers:=1')
@@ -211,6 +213,8 @@ def test_a_camera_that_photographs_waits_for_who_compares_with_its_truth(
     camera = g.start(SyntheticCamera)
     g.until(lambda: camera.camera('').is_watched)
     assert not camera.has_listeners() and not images
+    g.idle(0.3)
+    assert capfd.readouterr().err.count('too few listen to /true_pose') == 1
     g.hear(PoseStamped, 'true_pose')
     g.until(lambda: images)
 
