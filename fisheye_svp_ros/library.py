@@ -1,7 +1,8 @@
 """The library, `import fisheye_svp_ros as fsvp`: what commands and nodes call, on plain objects.
 
 A lens is a `Lens`, a lens file or the name of one that comes with the package; observations are
-an `Observations` table or a file that `read_observations` reads.
+an `Observations` table or a file that `read_observations` reads; a rig is the left camera in the
+right one, or a file or folder that holds it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,15 @@ from fisheye_svp_ros.io.detect_files import check_size_given, check_sizes
 from fisheye_svp_ros.io.parameters import SWEEP, rows, with_values
 from fisheye_svp_ros.io.poses_csv import FramePoses
 from fisheye_svp_ros.io.readers import read_observations, read_poses
+from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import lens_path
-from fisheye_svp_ros.library_checks import check_list, check_pose, check_size
+from fisheye_svp_ros.library_checks import (
+    check_list,
+    check_pose,
+    check_size,
+    check_type,
+    is_at_most,
+)
 from fisheye_svp_ros.library_results import (
     Budgeted,
     Calibrated,
@@ -38,7 +46,7 @@ from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.rectify.cameras import camera_for
 from fisheye_svp_ros.rectify.maps import RANGE, Rectification
 from fisheye_svp_ros.rectify.stereo import RectifiedPair, rectify_pair
-from fisheye_svp_ros.scene.observations import Observations, stereo_views
+from fisheye_svp_ros.scene.observations import STEREO, Observations, stereo_views
 from fisheye_svp_ros.scene.rigs import BASELINE, rig
 from fisheye_svp_ros.simulate import scenario as scenarios
 from fisheye_svp_ros.solve import lens_calibration, stereo_calibration
@@ -55,6 +63,7 @@ if TYPE_CHECKING:
 AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
 AnyPoses = FramePoses | str | Path
+AnyRig = Pose | str | Path
 # Called with a stage of long work and the share (0 to 1) that is done.
 Progress = Callable[[str, float], None]
 
@@ -72,8 +81,8 @@ def load_lens(lens: AnyLens) -> Lens:
 
 
 def save_lens(lens: Lens, path: str | Path) -> None:
-    """Write a lens file.  Raises OutputError where it cannot be written."""
-    lens_files.save_lens(lens, path)
+    """Write a lens file; raise OutputError where it cannot be written."""
+    lens_files.save_lens(check_type(lens, Lens, 'lens', 'a Lens'), path)
 
 
 def project(lens: AnyLens, points: Array) -> Image:
@@ -91,7 +100,10 @@ def _by_frame(poses: AnyPoses) -> dict[int, Pose]:
 
 
 def _check_last_axis(size: int, values: Array, name: str) -> Array:
-    numbers = np.asarray(values, dtype=float)
+    try:
+        numbers = np.asarray(values, dtype=float)
+    except (TypeError, ValueError) as cause:
+        raise ParameterError(f'{name} are no numbers; (..., {size}) is needed') from cause
     if numbers.shape[-1:] != (size,):
         raise ParameterError(f'{name} has the shape {numbers.shape}; (..., {size}) is needed')
     return numbers
@@ -184,7 +196,7 @@ def calibrate_stereo(
 
 @limit_threads
 def stereo_depth(
-    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: Pose, *,
+    observations: AnyObservations, left: AnyLens, right: AnyLens, rig: AnyRig, *,
     model_error: bool = False,
 ) -> StereoDepth:
     """Measure every landmark that both cameras of a rig (left in right) see, with SVP or not.
@@ -194,7 +206,7 @@ def stereo_depth(
     Raises ObservationError for a missing camera, LensError for a lens that does not know its
     errors.
     """
-    rig = check_pose(rig, 'rig')
+    rig = _rig_of(rig)
     table, models = _stereo_inputs(observations, left, right)
     one, other = stereo_views(table)
     both = one.used & other.used
@@ -296,12 +308,12 @@ def undistort_maps(
     Raises ParameterError for what no such camera has.
     """
     lens = load_lens(lens)
-    view = _check_view(size, field_of_view)
+    view = _check_view(size, field_of_view, range_m)
     return Rectification(lens, camera_for([lens], projection, *view), range_m)
 
 
 def rectify_maps(
-    left: AnyLens, right: AnyLens, rig: Pose, projection: str = 'pinhole', *,
+    left: AnyLens, right: AnyLens, rig: AnyRig, projection: str = 'pinhole', *,
     size: tuple[int, int] | None = None, field_of_view: float | None = None,
     range_m: float = RANGE,
 ) -> RectifiedPair:
@@ -313,16 +325,23 @@ def rectify_maps(
     side by side.
     """
     lenses = load_lens(left), load_lens(right)
-    view = _check_view(size, field_of_view)
+    view = _check_view(size, field_of_view, range_m)
     camera = camera_for(lenses, projection, *view, along_baseline=True)
-    return rectify_pair(*lenses, check_pose(rig, 'rig'), camera, range_m)
+    return rectify_pair(*lenses, _rig_of(rig), camera, range_m)
+
+
+def _rig_of(rig: AnyRig) -> Pose:
+    """Return the left camera in the right one, read where a path is given."""
+    return load_pair(rig, STEREO) if isinstance(rig, str | Path) else check_pose(rig, 'rig')
 
 
 def _check_view(
-    size: tuple[int, int] | None, field_of_view: float | None
+    size: tuple[int, int] | None, field_of_view: float | None, range_m: float
 ) -> tuple[tuple[int, int] | None, float | None]:
-    if field_of_view is not None and field_of_view > 2 * np.pi:
+    if field_of_view is not None and not is_at_most(field_of_view, 2 * np.pi):
         raise ParameterError(f'field_of_view is {field_of_view!r}; rad are needed')
+    if not is_at_most(range_m, np.inf):
+        raise ParameterError(f'range_m is {range_m!r}; m are needed')
     return None if size is None else check_size(size, 'size'), field_of_view
 
 

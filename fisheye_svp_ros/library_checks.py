@@ -51,7 +51,12 @@ def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:
     return float(numbers[0]), float(numbers[1])
 
 
+def is_at_most(value: Any, most: float) -> bool:
+    """Say whether a value is a number of at most `most`."""
+    return isinstance(value, int | float | np.number) and bool(value <= most)
+
+
 def check_above(value: float, limit: float, name: str, unit: str = '') -> None:
     """Raise ParameterError for what is not a finite number above a limit."""
-    if not isinstance(value, int | float | np.number) or not limit < value < np.inf:
+    if not is_at_most(value, np.finfo(float).max) or not limit < value:
         raise ParameterError(f'{name} is {value!r}; a number above {limit:g}{unit} is needed')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,12 @@ import pytest
 from helpers.photographs import BOARD, LENS, poses, true_corners
 
 import fisheye_svp_ros as fsvp
+from fisheye_svp_ros.io.rig_files import save_rig
 
 TABLE = fsvp.observations(*true_corners(poses(4).take(0)).T, np.arange(30), BOARD)
 RIG = fsvp.rig('parallel')
 ROOM = (0.1, 0.3)
+SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
 
 
 @pytest.mark.parametrize(('call', 'said'), [
@@ -44,7 +47,23 @@ ROOM = (0.1, 0.3)
     (lambda: fsvp.undistort_maps(LENS, size=(10,)), 'size is (10,); (width, height) in whole px'),
     (lambda: fsvp.undistort_maps(LENS, size='4x4'), "size is '4x4'; (width, height) in whole px"),
     (lambda: fsvp.undistort_maps(LENS, field_of_view=120), 'field_of_view is 120; rad are needed'),
-    (lambda: fsvp.rectify_maps(LENS, LENS, 'rig.yaml'), 'rig is of type str; a Pose is needed'),
+    (lambda: fsvp.undistort_maps(LENS, field_of_view='90'), "field_of_view is '90'; rad are need"),
+    (lambda: fsvp.undistort_maps(LENS, range_m='1'), "range_m is '1'; m are needed"),
+    (lambda: SIDE.remap(None), 'the image is NoneType; an array (H, W) or (H, W, C) of uint8, '),
+    (lambda: SIDE.remap([[1]]), 'the image is list; an array (H, W) or'),
+    (lambda: SIDE.remap(IMAGE.astype(np.int64)), 'the image is int64 (400, 424); an array (H, W'),
+    (lambda: SIDE.remap(IMAGE > 0), 'the image is bool (400, 424); an array (H, W)'),
+    (lambda: fsvp.project(LENS, 'abc'), 'points are no numbers; (..., 3) is needed'),
+    (lambda: fsvp.back_project(LENS, [[1, 2], [3]]), 'uv are no numbers; (..., 2) is needed'),
+    (lambda: fsvp.read_observations(None), 'a NoneType is no path; the name of a file is needed'),
+    (lambda: fsvp.read_poses(None), 'a NoneType is no path; the name of a file is needed'),
+    (lambda: fsvp.load_rig(None), 'a NoneType is no path; the name of a file is needed'),
+    (lambda: fsvp.save_lens(None, 'x.yaml'), 'lens is of type NoneType; a Lens is needed'),
+    (lambda: fsvp.save_lens('x.yaml', LENS), 'lens is of type str; a Lens is needed'),
+    (lambda: fsvp.save_lens(LENS, None), 'a NoneType is no path; the name of a file is needed'),
+    (lambda: fsvp.write_observations(TABLE, 'x.csv'), 'observations are of type str; a table is'),
+    (lambda: fsvp.rectify_maps(LENS, LENS, 'rig.yaml'), 'rig.yaml: cannot be read (No such file'),
+    (lambda: fsvp.rectify_maps(LENS, LENS, None), 'rig is of type NoneType; a Pose is needed'),
     (lambda: fsvp.stereo_depth(TABLE, LENS, LENS, None), 'rig is of type NoneType; a Pose is'),
     (lambda: fsvp.plot_lens(), 'no lens to draw; give at least one'),
     (lambda: fsvp.plot_budget(None), 'budget is of type NoneType; the result of fsvp.budget'),
@@ -64,8 +83,12 @@ def test_what_is_wrong_is_named(call: Callable[[], Any], said: str) -> None:
     assert '\n' not in str(error.value)
 
 
-def test_what_is_near_is_taken() -> None:
-    """Arrays in place of tuples and lists, and the same landmark in two frames."""
+def test_what_is_near_is_taken(tmp_path: Path) -> None:
+    """Arrays in place of tuples and lists, the same landmark in two frames, files of a rig."""
+    save_rig(RIG, tmp_path / 'rig.yaml')
+    for given in (tmp_path, str(tmp_path / 'rig.yaml')):
+        pair = fsvp.rectify_maps(LENS, LENS, given)
+        assert pair.right.p[0, 3] == fsvp.rectify_maps(LENS, LENS, RIG).right.p[0, 3]
     assert len(fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD, frame=[0, 1])) == 2
     assert fsvp.undistort_maps(LENS, size=np.array([40, 30])).maps.u.shape == (30, 40)
     assert len(fsvp.sweep({'radius': np.array([0.5, 1.0])}).table()['radius']) == 2

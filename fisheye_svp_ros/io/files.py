@@ -15,12 +15,19 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
-from fisheye_svp_ros.errors import FisheyeSvpError, OutputError
+from fisheye_svp_ros.errors import FisheyeSvpError, OutputError, ParameterError
 
 MAX_BYTES = 1 << 30  # bytes of a table or a photograph
 
 _BLOCK_BYTES = 1 << 20  # bytes
 _waiting: ContextVar[dict[Path, Path] | None] = ContextVar('_waiting', default=None)
+
+
+def path_of(given: str | Path) -> Path:
+    """Return a path; raise ParameterError for what is none."""
+    if not isinstance(given, str | os.PathLike):
+        raise ParameterError(f'a {type(given).__name__} is no path; the name of a file is needed')
+    return Path(given)
 
 
 def read_bytes(path: str | Path, error: type[FisheyeSvpError], most: int = MAX_BYTES) -> bytes:
@@ -58,7 +65,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
     In a block of `together`, when that succeeds.  Raises OutputError, naming the path, where it
     cannot be written.
     """
-    target, waiting = Path(path), _waiting.get()
+    target, waiting = path_of(path), _waiting.get()
     if target.exists() and not target.is_file():
         raise OutputError(f'{path}: it exists and is not a regular file; choose another name')
     temporary = None

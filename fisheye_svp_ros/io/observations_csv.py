@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Array, Index
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
 from fisheye_svp_ros.scene.landmarks import MOST_LANDMARK
 from fisheye_svp_ros.scene.observations import Observations, make_observations
@@ -81,6 +81,9 @@ def write_observations(path: str | Path, observations: Observations) -> None:
     Raises ObservationError where t or sigma is known for some rows only, OutputError where the
     file cannot be written.
     """
+    if not isinstance(observations, Observations):
+        raise ParameterError(f'observations are of type {type(observations).__name__}; a table is '
+                             'needed, after the path')
     table = observations
     columns: dict[str, NDArray[Any]] = {
         'frame': table.frame, 'landmark': table.landmark, 'u': table.uv[:, 0], 'v': table.uv[:, 1],

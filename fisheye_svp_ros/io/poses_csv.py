@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fisheye_svp_ros.arrays import Index
 from fisheye_svp_ros.io.csv_table import CsvTable, write_table
+from fisheye_svp_ros.io.files import path_of
 from fisheye_svp_ros.pose import Pose, quaternion_from_rotation, rotation_from_quaternion
 
 COLUMNS = ('frame', 'x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')
@@ -32,7 +33,7 @@ def read_poses(path: str | Path) -> FramePoses:
 
     Raises ObservationError, naming file, line and column.
     """
-    table = CsvTable(Path(path), COLUMNS)
+    table = CsvTable(path_of(path), COLUMNS)
     frame = table.integers('frame')
     table.refuse_repeats(frame[:, None], 'frame')
     quaternion = table.numbers('qx', 'qy', 'qz', 'qw')

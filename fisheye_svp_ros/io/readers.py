@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.io.files import path_of
 from fisheye_svp_ros.io.observations_csv import write_observations
 from fisheye_svp_ros.io.poses_csv import FramePoses, read_poses, write_poses
 from fisheye_svp_ros.io.recording_files import is_recording
@@ -53,7 +54,7 @@ def read_observations(path: str | Path) -> Observations:
 
     Raises ObservationError, naming file, line and field, for anything missing or malformed.
     """
-    given = Path(path)
+    given = path_of(path)
     for reader in READERS.values():
         if reader.recognises(given):
             read: Callable[[Path], Observations] = import_module(reader.module).read

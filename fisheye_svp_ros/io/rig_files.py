@@ -7,7 +7,7 @@ from pathlib import Path
 
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import dump_yaml
-from fisheye_svp_ros.io.files import read_text, write_text
+from fisheye_svp_ros.io.files import path_of, read_text, write_text
 from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
 from fisheye_svp_ros.io.lens_formats.rig import cameras_of, pose_keys
@@ -101,7 +101,8 @@ def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
 
 
 def _rig_file(path: str | Path) -> Path:
-    return Path(path) / 'rig.yaml' if Path(path).is_dir() else Path(path)
+    given = path_of(path)
+    return given / 'rig.yaml' if given.is_dir() else given
 
 
 def _read_rig(path: str | Path) -> Foreign:

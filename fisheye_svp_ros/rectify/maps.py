@@ -28,6 +28,7 @@ from fisheye_svp_ros.rectify.cameras import RectifiedCamera
 RANGE = 2.0  # m, where the user names none
 MAX_RANGE = 1e6  # m, as far as any range
 _OUTSIDE_PX = -16.0  # px: further out than the widest interpolation of cv2.remap reaches
+_PIXEL_TYPES = ('uint8', 'uint16', 'int16', 'float32', 'float64')  # of cv2.remap
 _BLOCK = 20_000  # points at once, whose arrays stay in a processor's cache
 
 Map = NDArray[np.float32]
@@ -109,8 +110,15 @@ class Rectification:
     def remap(self, pixels: NDArray[Any], interpolation: int = cv2.INTER_LINEAR) -> NDArray[Any]:
         """Return the rectified image of a photograph (H, W) or (H, W, C); 0 where no ray reaches.
 
-        Raises ParameterError for a photograph of another size than that of the lens.
+        Raises ParameterError for a photograph of another size than that of the lens, or for pixels
+        of another type than uint8, uint16, int16, float32 or float64.
         """
+        if not isinstance(pixels, np.ndarray) or pixels.ndim not in (2, 3) or (
+                pixels.dtype not in _PIXEL_TYPES):
+            given = (f'{pixels.dtype} {pixels.shape}' if isinstance(pixels, np.ndarray)
+                     else type(pixels).__name__)
+            raise ParameterError(f'the image is {given}; an array (H, W) or (H, W, C) of '
+                                 f'{", ".join(_PIXEL_TYPES)} is needed')
         height, width = pixels.shape[:2]
         if (width, height) != (self.lens.width, self.lens.height):
             raise ParameterError(
