@@ -44,7 +44,7 @@ class Outcome:
     decision, target: the answers; bound: of the viewpoint shift, m, NaN where none is stated;
     shift: the true one; gain: the `file` figure; true_gain: 1 - ray error of the extended lens
     over that of the given one, by the truth; same_data: the same over that of a lens which
-    `calibrate` makes of the data that are diagnosed.
+    `calibrate` makes of the data that are diagnosed; moved: the intrinsic that was put off.
     """
 
     kind: str
@@ -56,6 +56,12 @@ class Outcome:
     gain: float
     true_gain: float
     same_data: float
+    moved: str = ''
+
+    @property
+    def given_over_same(self) -> float:
+        """Ray error of the lens as given over that of `calibrate` on the diagnosed data."""
+        return (1 - self.same_data) / (1 - self.true_gain)
 
     @property
     def offered(self) -> bool:
@@ -72,8 +78,9 @@ def run(task: tuple[str, int]) -> Outcome:
     tables = [_photograph(rng, lens, shift, noise) for _ in range(2)]
     given, same = (fsvp.calibrate(one, 'kannala_brandt', (lens.width, lens.height)).lens
                    for one in tables)
+    moved = ''
     if kind == 'off':
-        given = _move(given, rng)
+        given, moved = _move(given, rng)
     found = fsvp.diagnose(tables[1], given)
     document = found.document
     answer = document['decision']['lens']
@@ -84,7 +91,7 @@ def run(task: tuple[str, int]) -> Outcome:
         kind, answer['say'], document['decision']['target']['say'],
         tuple(cause['effect'] for cause in document['causes']),
         bounds.get('viewpoint_shift', np.nan), shift, document['file']['gain'],
-        1 - after / before, 1 - after / now)
+        1 - after / before, 1 - after / now, moved)
 
 
 def _photograph(rng: np.random.Generator, lens: TrueLens, shift: float, noise: float
@@ -105,14 +112,14 @@ def _gennery(theta: Array) -> Array:
     return np.asarray(safe / np.sin(safe) - 1)
 
 
-def _move(lens: Lens, rng: np.random.Generator) -> Lens:
-    """Return a lens with one intrinsic off by some of its stated standard errors."""
+def _move(lens: Lens, rng: np.random.Generator) -> tuple[Lens, str]:
+    """Return a lens with one intrinsic off by some of its stated standard errors, and which."""
     stated = (lens.calibration or {})['stderr']
     names: Sequence[str] = [('fx', 'fy'), ('cx',), ('cy',)][rng.integers(3)]
     sign = rng.choice([-1, 1])
     return replace(lens.with_parameters(
         names, [lens.parameters[name] + sign * OFF * stated[name] for name in names]),
-        calibration=lens.calibration)
+        calibration=lens.calibration), 'focal length' if len(names) > 1 else 'principal point'
 
 
 def _ray_error(lens: Lens, true: TrueLens, shift: float, table: Observations) -> float:
@@ -172,7 +179,15 @@ def report(outcomes: Sequence[Outcome], command: str) -> str:
     finite = [one for one in outcomes if np.isfinite(one.true_gain)]
     rank = spearmanr([one.gain for one in finite], [one.true_gain for one in finite])
     most = norm.sf(norm.isf(0.025) - OFF / 2**0.5)
-    lines += ['', f'- A test of the one parameter that is off, on data as good as those of the '
+    lines.append('')
+    for what in sorted({one.moved for one in of['off']}):
+        mine = [one for one in of['off'] if one.moved == what]
+        lines.append(
+            f'- Off in the {what}: recalibrate in '
+            f'{_share([one.decision == "recalibrate" for one in mine])}; the rays of such a lens '
+            f'err {np.median([one.given_over_same for one in mine]):.2f} times as much as those '
+            'of a calibration on the same data, median.')
+    lines += [f'- A test of the one parameter that is off, on data as good as those of the '
               f'calibration, would find {100 * most:.0f} % at a level of 5 %.',
               f'- The bound of the viewpoint shift covers the truth in {_share(covered)}.',
               f'- Rank correlation of `file` with the true gain of rays: {rank.statistic:.2f}.',
