@@ -253,10 +253,12 @@ def _curve_to_dict(curve: Curve, registry: Registry[Any], listed: str) -> dict[s
 
 def _effects(document: Mapping[str, Any], name: str, where: str) -> dict[str, Any]:
     section = document.get(name) or {}
-    if not isinstance(section, dict) or not all(
-        isinstance(entry, dict) for key, entry in section.items() if key != LANDMARKS
-    ):
-        raise LensError(f'{where}: {name} must map each effect name to its parameters')
+    wrong = [f'.{key}' for key, entry in section.items()
+             if key != LANDMARKS and not isinstance(entry, dict)
+             ] if isinstance(section, dict) else ['']
+    if wrong:
+        raise LensError(f'{where}: {name}{wrong[0]}: {name} must map each effect name to its '
+                        'parameters, as in decentering: {parameters: {p1: 0.001, p2: 0.0}}')
     return section
 
 

@@ -17,7 +17,8 @@ from fisheye_svp_ros.effects.forward import project
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.lens_files import load_lens, read_lens_file, save_lens
 from fisheye_svp_ros.io.rig_files import load_rig
-from fisheye_svp_ros.optics.curves import KannalaBrandt
+from fisheye_svp_ros.io.share import lens_path
+from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens
 
 # Two points at 18 and 40 degrees, and where pycolmap 4.2.1 projects them, in COLMAP's own pixels
@@ -427,6 +428,19 @@ mirror_offset: 0.0125
     save_lens(replace(load_lens(path), cx=1500.0, cy=1500.0), tmp_path / 'inside.yaml')
     assert cli.main(['lens', str(tmp_path / 'inside.yaml')]) == 0
     assert capsys.readouterr().err == ''
+
+
+@pytest.mark.parametrize(('changes', 'told'), [
+    ({'viewpoint_shift': Gennery(0.0, 4.0)}, r'the viewpoint shift is 2\.3 m at 90 deg; its'),
+    ({'max_incidence': np.radians(1.6)}, r'max_incidence_deg is 1\.6; it is in degrees'),
+    ({'viewpoint_shift': Gennery(0.0, 0.004)}, ''),
+])
+def test_other_units_in_a_lens_file_are_told(
+    changes: dict[str, object], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_lens(replace(load_lens(lens_path('fish180')), **changes), tmp_path / 'lens.yaml')
+    assert cli.main(['lens', str(tmp_path / 'lens.yaml')]) == 0
+    assert re.search(told, capsys.readouterr().err) if told else not capsys.readouterr().err
 
 
 def test_files_that_others_wrote() -> None:

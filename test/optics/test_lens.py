@@ -187,7 +187,7 @@ def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model
     ('viewpoint_shift', [{'model': 'gennery'}, 1], 'viewpoint_shift must be a mapping with a'),
     ('viewpoint_shift', [], 'viewpoint_shift must be a mapping with a model'),
     ('corrections', [1], 'corrections must map each effect name to its parameters'),
-    ('corrections.skew', 0.001, 'corrections must map each effect name to its parameters'),
+    ('corrections.skew', 0.001, r'corrections\.skew: corrections must map .*p1: 0\.001'),
     ('corrections.skew', {'parameters': {}}, 'effect skew is incomplete'),
     ('corrections.bend', {}, "effect 'bend' is unknown; known are"),
     ('effects', {'skew': 1}, 'effects must map each effect name to its parameters'),
