@@ -106,14 +106,16 @@ class Localizer(SolverNode):
         """Solve from where the camera was, which is faster; from anywhere if that is not near.
 
         A wrong lens is wrong in every set; to search each for outliers would take 20 ms more.
+        Where a scenario names the lens, its error is what is measured: no point is an outlier.
         """
         start, before = self._before
-        searched = self._misfits % OUTLIER_SEARCH_INTERVAL == 0
+        measured = bool(self.settings.lens)
+        searched = measured and self._misfits % OUTLIER_SEARCH_INTERVAL == 0
         found = localize_sets(model, views, true, start, examined=True, searched=searched)
         if start is not None and not (
             _rms_px(found) < MAX_RMS_RATIO * before and _is_near(start, found.solution.pose, views)
         ):
-            found = localize_sets(model, views, true, examined=True)
+            found = localize_sets(model, views, true, examined=True, searched=measured)
         rms, pose = _rms_px(found), found.solution.pose
         self._before = (pose, max(rms, PERFECT_FIT_PX)) if np.isfinite(rms) else (None, 0.0)
         whole = found.metrics['points'][0] == views.used.sum()

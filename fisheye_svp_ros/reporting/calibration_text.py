@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fisheye_svp_ros.study.lens_trust import LensTrust
 
 STANDARD_ERRORS = ('standard errors include local errors of target, frames and image, and the '
-                   'shape of the target')
+                   'shape and scale of the target')
 _POOR, _LOST = 10.0, 5.0  # times the noise of the points, and px, that a lens should not leave
 _MODEL_ERROR_RATIO = 2.0  # times the noise, from which residuals show a model error
 _MAX_CENTER_OFFSET = 0.1  # of the image, by which a principal point is seldom off its centre

@@ -144,8 +144,8 @@ def _check_turns(flange: Pose) -> None:
             return
         raise GeometryError('the flange turns about one axis at most; turn it about two axes or '
                             'more, by 20 degrees or more')
-    raise GeometryError(f'{len(flange.position)} frames have a pose of the robot; '
-                        f'{MIN_FRAMES} or more are needed')
+    raise GeometryError(f'{len(flange.position)} of the frames have a pose of the robot; '
+                        f'{MIN_FRAMES} or more are needed; check the frame numbers of the poses')
 
 
 def fit_hand_eye(

@@ -73,8 +73,8 @@ def localize_sets(
 ) -> SetSolutions[Localization]:
     """Localize the camera of every view (S,); true, start: poses (S,) where they are known.
 
-    examined: test the misfit against sigma and leave outliers out, which simulated sets do
-    not have: for them it changes nothing.  searched: as `examine` has it.
+    examined: test the misfit against sigma; searched: leave outliers out where that fails, as
+    `examine` does: not of sets whose errors by the SVP model are to be measured.
     Raises GeometryError as `localize` does.
     """
     found = localize(model, views, start)

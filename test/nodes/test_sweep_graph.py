@@ -36,10 +36,17 @@ synthetic_camera:
     poses: [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.05, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]
 stereo_depth: {ros__parameters: {optimal: true}}
 """
+# Tilted cameras, near: the error of the SVP model is far above the noise, and no outlier.
+SVP = """
+synthetic_camera: {ros__parameters: {
+  lens: fish214, noise_px: 0.2, radius: 0.5, poses_file: calibration, sweep.seed: [0]}}
+localizer: {ros__parameters: {svp: true}}
+"""
 FEW = 'landmark,x,y,z\n1,0,0,-1\n2,1,0,-1\n3,0,1,-1\n'
 
 
-@pytest.mark.parametrize(('text', 'scenarios', 'sets'), [(MONO, 12, 1), (RIG, 4, 2)])
+@pytest.mark.parametrize(('text', 'scenarios', 'sets'), [
+    (MONO, 12, 1), (RIG, 4, 2), (SVP, 1, 10)])
 def test_every_scenario_once_and_with_the_offline_numbers(
     ros_domain: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, text: str, scenarios: int,
     sets: int,
