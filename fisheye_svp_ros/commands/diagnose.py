@@ -19,11 +19,10 @@ from fisheye_svp_ros.commands.notes import (
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
-    positive_count,
     read_input,
     search_options,
 )
-from fisheye_svp_ros.commands.plan import view_limits
+from fisheye_svp_ros.commands.plan import view_count, view_limits
 from fisheye_svp_ros.commands.ports import add_dome_arguments, dome_of
 from fisheye_svp_ros.errors import FisheyeSvpError, GeometryError, LensError, ParameterError
 from fisheye_svp_ros.io.csv_table import write_table
@@ -72,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--range', type=float, metavar='M', dest='range_m',
                         help='state the ray errors at this distance too, m, besides 0.3, 1 and 5 '
                         'm')
-    parser.add_argument('--next', type=positive_count, default=0, metavar='N', dest='count',
+    parser.add_argument('--next', type=view_count, default=0, metavar='N', dest='count',
                         help='list the N photographs to take next: those that separate the '
                         'confounded causes best')
     parser.add_argument('--for', dest='number', metavar='NAME',
@@ -89,6 +88,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Diagnose, say what is wrong, write report and extended lens."""
     from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against
+    from fisheye_svp_ros.planning.plan import check_number
     from fisheye_svp_ros.reporting.progress import stages
     from fisheye_svp_ros.solve.measured_poses import poses_by_frame, rig_lenses
     from fisheye_svp_ros.solve.rig_state import free_parameters
@@ -107,6 +107,8 @@ def run(args: argparse.Namespace) -> None:
     if args.poses:
         poses = poses_by_frame(observations, read_poses(args.poses).by_frame(), args.poses)
     other = _read(args.against, args, given)[0] if args.against else None
+    if args.number and isinstance(lens, Lens):
+        check_number(args.number, observations, lens, names)
     with stages('diagnosing') as progress:
         settings: dict[str, Any] = {
             'free_intrinsics': free, 'poses': poses, 'held_out': held_out,
@@ -122,14 +124,7 @@ def run(args: argparse.Namespace) -> None:
             progress('errors where the truth is known', 0.88)
             known = known_errors(diagnosis.simulation, diagnosis.model, names)
         except (GeometryError, np.linalg.LinAlgError) as cause:
-            poses_too = (f' Check that the poses of {args.poses} are those of the camera in the '
-                         'world.'
-                         if args.poses else '')
-            raise GeometryError(
-                f'{args.observations}: its views cannot be fitted with this lens: {cause}; check '
-                'camera and image size of the lens; `localize` lists the residual of each '
-                f'view.{poses_too}'
-            ) from cause
+            raise _unfitted(args, cause) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
@@ -150,6 +145,15 @@ def _check_options(args: argparse.Namespace) -> None:
         if name in args.left_out:
             raise ParameterError(f'--with {name} and --without {name} contradict each other; '
                                  'remove one of them')
+
+
+def _unfitted(args: argparse.Namespace, cause: Exception) -> GeometryError:
+    """Return what says that views cannot be fitted, and what to check."""
+    poses_too = (f' Check that the poses of {args.poses} are those of the camera in the world.'
+                 if args.poses else '')
+    return GeometryError(
+        f'{args.observations}: its views cannot be fitted with this lens: {cause}; check camera '
+        f'and image size of the lens; `localize` lists the residual of each view.{poses_too}')
 
 
 def _plan_next_views(

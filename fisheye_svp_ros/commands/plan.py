@@ -11,7 +11,7 @@ import numpy as np
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.commands.outputs import output_folder
-from fisheye_svp_ros.commands.photographs import image_size
+from fisheye_svp_ros.commands.photographs import image_size, positive_count
 from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
@@ -20,6 +20,7 @@ from fisheye_svp_ros.io.readers import write_poses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.camera import incidence
 from fisheye_svp_ros.optics.lens import Lens
+from fisheye_svp_ros.planning import MAX_VIEWS
 
 if TYPE_CHECKING:
     from fisheye_svp_ros.planning.optimal_design import ViewLimits
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--room', type=float, nargs=2, required=True, metavar='M',
                         help='nearest and furthest distance at which the board is sharp and fits '
                         'into the room')
-    parser.add_argument('--count', type=int, default=12, metavar='N',
+    parser.add_argument('--count', type=view_count, default=12, metavar='N',
                         help='number of photographs; default: 12')
     parser.add_argument('--for', dest='number', metavar='NAME',
                         help='parameter to determine best: e0, fx, cx, k1, ...; default: the '
@@ -58,8 +59,8 @@ def run(args: argparse.Namespace) -> None:
     from fisheye_svp_ros.reporting import shot_list
     from fisheye_svp_ros.reporting.tables import UNITS, print_table
 
-    if args.count < 1 or not args.noise > 0:
-        raise ParameterError('--count and --noise must be above 0')
+    if not args.noise > 0:
+        raise ParameterError('--noise must be above 0')
     lens, pattern = _lens(args), parse_pattern(args.board)
     planned = plan(lens, pattern.points, view_limits(args.room), args.count, args.number,
                    args.noise)
@@ -67,7 +68,8 @@ def run(args: argparse.Namespace) -> None:
     if args.output:
         with write_together():
             shot_list.draw_shots(args.output / 'plan.pdf', ForwardModel(lens), wanted)
-            write_poses(args.output / 'poses.csv', np.arange(args.count), wanted.shots.camera)
+            write_poses(args.output / 'poses.csv', np.arange(len(wanted.shots.distance)),
+                        wanted.shots.camera)
             write_json(args.output / 'plan.json',
                        {'photographs': wanted.to_list(), 'stderr': planned.stderr})
     print_table(f'{lens.name}, {pattern.spec}: photographs to take, {shot_list.purpose(wanted)}',
@@ -78,6 +80,15 @@ def run(args: argparse.Namespace) -> None:
     _note_guessed(lens, wanted)
     if args.output:
         print(f'{args.output}: plan.pdf, plan.json, poses.csv')
+
+
+def view_count(text: str) -> int:
+    """Return the number of views to plan, of a text."""
+    count = positive_count(text)
+    if count > MAX_VIEWS:
+        raise argparse.ArgumentTypeError(f'{text!r} photographs are too many; at most '
+                                         f'{MAX_VIEWS} can be planned at once')
+    return count
 
 
 def view_limits(given: Sequence[float]) -> ViewLimits:

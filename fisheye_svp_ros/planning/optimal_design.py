@@ -229,7 +229,11 @@ class Design:
         return Criterion(interest, rest, self.values[interest] if others else None, groups)
 
     def choose(self, question: Criterion, count: int) -> tuple[Index, list[float]]:
-        """Return places of chosen shots, best first, and the answer with each one more."""
+        """Return places of chosen shots, best first, and the answer with each one more.
+
+        Where fewer than `count` are possible, all of them.
+        """
+        count = min(count, len(self.added))
         chosen: list[int] = []
         for _ in range(count):
             chosen.append(self._best_view(question, chosen))

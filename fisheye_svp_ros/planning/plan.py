@@ -30,8 +30,15 @@ from fisheye_svp_ros.planning.optimal_design import (
     max_view_angle,
 )
 from fisheye_svp_ros.pose import identity, quaternion_from_rotation
+from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
-from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
+from fisheye_svp_ros.solve.initial_rig import initial_state
+from fisheye_svp_ros.solve.rig_state import (
+    Linearization,
+    RigState,
+    RigViews,
+    group_by_frame,
+)
 
 # Over those of the photographs that there are: still sharp, still in reach
 _MIN_DISTANCE_RATIO, _MAX_DISTANCE_RATIO = 0.7, 1.5
@@ -126,10 +133,9 @@ def _choose_question(
     after: Linearization, causes: Sequence[Cause], number: str | None
 ) -> tuple[str, tuple[str, ...], list[Effect]]:
     """Return what is asked for, what it may be mistaken for, and effects to take in."""
-    fitted = {effect.name for effect, _ in after.state.terms}
     if number is not None:
-        known = {*after.free, *(p.name for e, _ in after.state.terms for p in e.parameters)}
-        return number, (), [] if number in known | fitted else [_holding(after, number)]
+        return number, (), _effects_with(number, after)
+    fitted = {effect.name for effect, _ in after.state.terms}
     mine = [c for c in causes if c.effect in fitted
             and c.effect_class.budget_stage() in ('lens', 'target')]
     for cause in mine:
@@ -143,11 +149,26 @@ def _choose_question(
     return 'e0', (), [ViewpointShiftEffect(1)]
 
 
-def _holding(after: Linearization, number: str) -> Effect:
+def check_number(
+    number: str, observations: Observations, lens: Lens, free: Sequence[str]
+) -> None:
+    """Raise ParameterError for a number that no diagnosis of a table determines.
+
+    How many parts an effect has, and their names (NAME.PART), only the diagnosis tells.
+    """
+    if number not in free and '.' not in number:
+        data = group_by_frame(observations)
+        _effects_with(number, Linearization(data, initial_state(data, lens), tuple(free)))
+
+
+def _effects_with(number: str, after: Linearization) -> list[Effect]:
     """Return the simplest form of an effect that has a number by this name, or this name itself.
 
-    Raises ParameterError where there is none.
+    None where the fit has it.  Raises ParameterError where no effect does.
     """
+    known = list(after.free)
+    if number in {*after.free, *(name for e, _ in after.state.terms for name in _names_of(e))}:
+        return []
     for name, kind in CATALOGUE.items():
         if kind.stage == 'noise':
             continue
@@ -156,9 +177,21 @@ def _holding(after: Linearization, number: str) -> Effect:
         except Untestable:
             continue
         for form in forms:
-            if number in (name, *(parameter.name for parameter in form.parameters)):
-                return form
-    raise ParameterError(f'--for {number}: no parameter of the lens or of an effect has this name')
+            if number in _names_of(form):
+                return [form]
+        parts = [parameter.name for form in forms for parameter in form.parameters]
+        known += [name] if '.' in ''.join(parts) else [
+            f'{name}.{part}' for part in dict.fromkeys(parts)]
+    if number in intrinsic_names(after.state.lens):
+        raise ParameterError(f'--for {number}: {number} is fixed; add --free intrinsics')
+    raise ParameterError(f'--for {number}: not a parameter of this lens or of an effect; known '
+                         f'are {", ".join(known)}')
+
+
+def _names_of(effect: Effect) -> set[str]:
+    """Return the names of an effect and of its parameters, these with and without its own."""
+    parts = {parameter.name for parameter in effect.parameters}
+    return {effect.name, *parts, *(f'{effect.name}.{part}' for part in parts)}
 
 
 class PhotographPlan(NamedTuple):

@@ -13,8 +13,9 @@ from fisheye_svp_ros.diagnosis import Cause
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
-from fisheye_svp_ros.io.lens_files import save_lens
+from fisheye_svp_ros.io.lens_files import load_lens, save_lens
 from fisheye_svp_ros.io.readers import read_poses, write_observations
+from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.planning.optimal_design import (
@@ -160,12 +161,14 @@ def test_the_question_is_the_doubt_then_the_cause_then_the_lens(linear, board):
     away = np.linalg.norm(board.points.mean(axis=0) - linear.state.pose.position, axis=1)
     anywhere = next_photographs(linear, [cause([])], NOISE, 2).shots.distance
     assert (0.5 * away.min() <= anywhere).all() and (anywhere <= 3 * away.max()).all()
-    named = next_photographs(linear, [], NOISE, 1, 'landmark_scale', ROOM)
-    assert named.asked == 'landmark_scale' and named.to_list()[0]['distance_m'] > 0.2
+    for name in ('landmark_scale', 'landmark_scale.relative', 'viewpoint_shift.e0'):
+        named = next_photographs(linear, [], NOISE, 1, name, ROOM)
+        assert named.asked == name and named.to_list()[0]['distance_m'] > 0.2
 
 
 def test_what_cannot_be_planned_is_refused(linear, board):
-    with pytest.raises(ParameterError, match='no parameter of the lens'):
+    known = r'are fx, fy, .*viewpoint_shift\.e0, .*landmark_survey, landmark_scale\.relative'
+    with pytest.raises(ParameterError, match=known):
         next_photographs(linear, [], NOISE, 1, 'colour', ROOM)
     with pytest.raises(GeometryError, match='does not see the whole board from 50 to 60 m'):
         candidate_shots(linear.state, board, ViewLimits(50.0, 60.0), np.random.default_rng(0))
@@ -173,6 +176,33 @@ def test_what_cannot_be_planned_is_refused(linear, board):
     bent = replace(seen, xyz=seen.xyz + [0, 0, 1] * np.abs(seen.xyz[:, :1]))
     with pytest.raises(GeometryError, match='not one flat board'):
         FlatBoard.from_observations(bent, linear.state.pose)
+
+
+@pytest.mark.parametrize(('options', 'said'), [
+    (['--next', '101'], "'101' photographs are too many; at most 100 can be planned at once"),
+    (['--next', '2', '--for', 'fx'], '--for fx: fx is fixed; add --free intrinsics'),
+    (['--next', '2', '--for', 'zz', '--free', 'intrinsics'], '--for zz: not a parameter of this '
+     'lens or of an effect; known are fx, '),
+])
+def test_what_cannot_be_planned_is_refused_before_the_diagnosis(
+    tmp_path, capsys, monkeypatch, options, said
+):
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.diagnose', lambda *_, **__: pytest.fail('ran'))
+    save_lens(AIR, tmp_path / 'lens.yaml')
+    write_observations(tmp_path / 'seen.csv', photographs(AIR, None, 3))
+    try:
+        code = main(['diagnose', str(tmp_path / 'seen.csv'), '--lens',
+                     str(tmp_path / 'lens.yaml'), *options])
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2 and said in capsys.readouterr().err
+
+
+def test_no_more_views_are_planned_than_there_are(board):
+    """A large board in a small room: only a few places show it whole."""
+    shots = plan(load_lens(lens_path('fish180')), parse_pattern('chessboard:9x6:100mm').points,
+                 ViewLimits(0.15, 0.2), 100, None, NOISE).wanted.shots
+    assert 1 < len(np.unique(shots.camera.position, axis=0)) <= len(shots.distance) < 100
 
 
 def test_diagnose_says_which_photographs_to_take_next(tmp_path, capsys):
