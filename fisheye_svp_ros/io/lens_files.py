@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Set
 from dataclasses import replace
 from functools import reduce
+from inspect import signature
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -237,11 +238,11 @@ def _curve(
         raise LensError(f'{where}.{listed} has {len(numbered)} values; this model takes {most}')
     values |= {f'{listed}{i}': value for i, value in enumerate(numbered, start=first)}
     _refuse_unknown(values, set(known), where)
-    try:
-        return kind(**{name: _number(values, name, where) for name in values})
-    except TypeError as cause:
-        needed = ', '.join(known)
-        raise LensError(f'{where}: a coefficient is missing; needed are {needed}') from cause
+    missing = [one.name for one in signature(kind).parameters.values()
+               if one.name in known and one.default is one.empty and one.name not in values]
+    if missing:
+        raise LensError(f'{where}: incomplete; add {", ".join(missing)}')
+    return kind(**{name: _number(values, name, where) for name in values})
 
 
 def _curve_to_dict(curve: Curve, registry: Registry[Any], listed: str) -> dict[str, Any]:

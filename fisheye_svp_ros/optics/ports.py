@@ -80,6 +80,8 @@ class Port(Curve, ABC):
                 return f'port: {name} is {value}; it must be from {_INDICES[0]} to {_INDICES[1]}'
             if name in ('thickness', 'distance') and value < 0:
                 return f'port: {name} is {value}; it must not be below 0'
+            if name.startswith('tilt') and not abs(value) < np.pi / 2:
+                return f'port: {name} is {value} rad; it must be within 1.57, a quarter turn'
         return ''
 
 

@@ -158,6 +158,21 @@ BASALT = json.dumps({'value0': {
     'resolution': [[512, 512], [512, 512]]}})
 
 
+BOOFCV = """model: omnidirectional_universal
+pinhole:
+  width: 640
+  height: 480
+  fx: 300.0
+  fy: 300.0
+  cx: 320.0
+  cy: 240.0
+mirror_offset: 1.2
+radial_tangential:
+  radial: [-0.2, 0.05]
+  t1: 0.0
+"""
+
+
 def test_opencv_xml_and_basalt(tmp_path: Path) -> None:
     import cv2
 
@@ -210,13 +225,24 @@ def test_boofcv() -> None:
     (CAMCHAIN + 'cam2: {}\n', "the key 'cam2' a second time"),
     (CAMCHAIN + CAMCHAIN[CAMCHAIN.index('cam1'):CAMCHAIN.index('cam2')].replace('cam1', 'cam3', 1),
      'cam2 has no T_cn_cnm1, and cam3 after it has one'),
-    ('{"camera_type": 1}', 'not a whole Basalt'),
+    ('{"camera_type": 1}', 'intrinsics is None; a list of mappings is needed'),
+    (BASALT.replace('"xi"', '"x"', 1), 'camera 0: xi is None; a finite number is needed'),
+    (BASALT.replace('"ds"', '"kb4"'), 'camera 0: k1 is None; a finite number is needed'),
+    (BASALT.replace('[512, 512], ', '', 1), 'a list of width and height of each of the 2 cameras'),
+    (BASALT.replace('[512, 512], ', '512, ', 1), 'camera 0: resolution must be a list of 2'),
+    (BASALT.replace('"qw"', '"w"', 1), 'T_imu_cam 0: qw is None'),
+    (BOOFCV.replace('mirror_offset: 1.2\n', ''), 'mirror_offset is None; a finite number'),
+    (BOOFCV.replace('fx: 300.0', ''), 'pinhole: fx is None; a finite number is needed'),
+    (BOOFCV.replace('[-0.2, 0.05]', '0.1'), 'radial_tangential: radial must be a list of 2'),
     ('{"camera_type": ' + '[' * 100_000, 'broken JSON'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE', 'a': " + '(' * 5000, 'not a whole .cameramodel'),
     ("'LENSMODEL_CAHVORE'" + '-1' * 120_000, 'more than 100000 values'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0...37', 'intrinsics': " + str([1.0] * 12)
      + ", 'imagersize': [2, 2]}", 'can be read'),
-    ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}", 'can be read'),
+    ("{'lensmodel': 'LENSMODEL_CAHVORE_linearity=0', 'intrinsics': " + str([1.0] * 11)
+     + ", 'imagersize': [2, 2]}", 'has 11 values; LENSMODEL_CAHVORE_linearity=0 needs 12'),
+    ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}",
+     'intrinsics has 1 values; LENSMODEL_OPENCV8 needs 12'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
     ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
      'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',
@@ -507,7 +533,7 @@ def test_a_robot_is_shown_and_is_no_lens(tmp_path: Path, capsys: pytest.CaptureF
     ('left_in_right: {position: [0, 0, 0], quaternion: [0, 0, 0, 0]}', 'unit length'),
     (CAMCHAIN.replace('0.99998854', '1.99998854'), 'cam1: T_cn_cnm1: .* rotation matrix'),
     (BASALT.replace('"qw": 1', '"qw": 0'), 'T_imu_cam: .* unit length'),
-    (BASALT.replace('"px": 0.1', '"px": NaN'), 'T_imu_cam: a translation'),
+    (BASALT.replace('"px": 0.1', '"px": NaN'), 'T_imu_cam 0: px is nan'),
     ('name: lens', 'left_in_right'),
 ])
 def test_what_is_no_rig_is_refused(tmp_path: Path, text: str, said: str) -> None:

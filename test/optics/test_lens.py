@@ -179,7 +179,7 @@ def test_a_field_that_is_left_out_ends_at_the_curve_or_the_farthest_corner(model
     ('viewpoint_shift.s0', 'x', "viewpoint_shift: s0 is 'x'; a number is needed"),
     ('viewpoint_shift.e', [0.0] * 4, 'viewpoint_shift.e has 4 values; this model takes 3'),
     ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01},
-     'viewpoint_shift: a coefficient is missing; needed are thickness, refractive_index'),
+     'viewpoint_shift: incomplete; add refractive_index$'),
     ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.0},
      'refractive_index is 1.0; it must be above 1'),
     ('viewpoint_shift', {'model': 'flat_port', 'thickness': 0.01, 'refractive_index': 1.5},

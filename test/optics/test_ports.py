@@ -157,9 +157,10 @@ def test_a_port_is_read_back(port):
 
 
 @pytest.mark.parametrize(('port', 'reason'), [
-    ({'model': 'flat', 'distance': 0.03}, 'a coefficient is missing; needed are distance, medium'),
+    ({'model': 'flat', 'distance': 0.03}, 'port: incomplete; add medium_index$'),
     ({'model': 'flat', 'distance': 0.03, 'medium_index': 0.7}, 'medium_index is 0.7; it must be'),
     ({'model': 'flat', 'distance': -0.1, 'medium_index': 1.3}, 'distance is -0.1'),
+    ({'model': 'flat', 'distance': 0.03, 'medium_index': 1.3, 'tilt_x': -2.0}, 'tilt_x is -2.0'),
     ({'model': 'dome', 'radius': 0.03, 'medium_index': 1.3, 'z': 0.04}, 'inside the dome'),
     ({'model': 'oval'}, "corrections.port.model is 'oval'; known are flat, dome"),
 ])

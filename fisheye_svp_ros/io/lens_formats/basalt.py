@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from fisheye_svp_ros.errors import LensError
@@ -35,33 +35,38 @@ def recognises(text: str) -> bool:
 
 def read(text: str, where: str) -> Foreign:
     """Read all cameras and the rigs between them; raises LensError, naming the field."""
-    document = parse_json(text, where, LensError)
-    try:
-        document = document.get('value0', document)
-        cameras, sizes = document['intrinsics'], document['resolution']
-        lenses, worst = {}, {}
-        for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
-            lens, off = _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
-            lenses[f'cam{i}'], worst[f'cam{i}'] = lens, off
-        rigs = _rigs(document.get('T_imu_cam', []), where)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as cause:
-        raise LensError(f'{where}: not a whole Basalt calibration ({cause!r})') from cause
+    document: Mapping[str, Any] = parse_json(text, where, LensError)
+    if 'value0' in document:
+        document = fields.section(document, 'value0', where)
+    cameras = fields.sections(document, 'intrinsics', where)
+    sizes = document.get('resolution')
+    if not isinstance(sizes, list) or len(sizes) != len(cameras):
+        raise LensError(f'{where}: resolution is {sizes!r}; a list of width and height of each of '
+                        f'the {len(cameras)} cameras of intrinsics is needed')
+    lenses, worst = {}, {}
+    for i, (camera, size) in enumerate(zip(cameras, sizes, strict=True)):
+        lens, off = _lens(f'cam{i}', camera, size, f'{where}: camera {i}')
+        lenses[f'cam{i}'], worst[f'cam{i}'] = lens, off
+    rigs = _rigs(fields.sections({'T_imu_cam': [], **document}, 'T_imu_cam', where), where)
     return Foreign('Basalt', lenses, rigs, worst)
 
 
-def _lens(name: str, camera: dict[str, Any], size: list[float], where: str) -> tuple[Lens, float]:
-    values, kind = camera['intrinsics'], camera['camera_type']
-    pinhole = [float(values[key]) for key in ('fx', 'fy', 'cx', 'cy')]
+def _lens(name: str, camera: Mapping[str, Any], size: Any, where: str) -> tuple[Lens, float]:
+    kind = str(camera.get('camera_type'))
     if kind not in _MODELS:
         raise LensError(f'{where}: camera_type is {kind!r}; those that can be read are '
                         f'{", ".join(_MODELS)}')
     names, distortion = _MODELS[kind]
+    given = fields.section(camera, 'intrinsics', where)
+    pinhole = fields.values(given, ('fx', 'fy', 'cx', 'cy'), where)
+    size = fields.numbers({'resolution': size}, 'resolution', 2, where)
     return nearest_lens(
-        name, size, pinhole, distortion(*(float(values[key]) for key in names)), where)
+        name, size, pinhole, distortion(*fields.values(given, names, where)), where)
 
 
-def _rigs(entries: list[dict[str, float]], where: str) -> tuple[Pose, ...]:
-    table = [[float(entry[name]) for name in _NAMES] for entry in entries]
+def _rigs(entries: Sequence[Mapping[str, Any]], where: str) -> tuple[Pose, ...]:
+    table = [fields.values(entry, _NAMES, f'{where}: T_imu_cam {i}')
+             for i, entry in enumerate(entries)]
     places = [fields.pose(row[:3], row[3:], f'{where}: T_imu_cam') for row in table]
     return tuple(later.inverse().compose(earlier)
                  for earlier, later in itertools.pairwise(places))

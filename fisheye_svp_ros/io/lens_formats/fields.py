@@ -25,6 +25,14 @@ def section(mapping: Mapping[str, Any], name: str, where: str) -> Mapping[str, A
     return found
 
 
+def sections(mapping: Mapping[str, Any], name: str, where: str) -> list[Mapping[str, Any]]:
+    """Return a list of mappings in a mapping; raise LensError naming the field."""
+    found = mapping.get(name)
+    if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
+        raise LensError(f'{where}: {name} is {found!r:.80}; a list of mappings is needed')
+    return found
+
+
 def numbers(mapping: Mapping[str, Any], name: str, count: int, where: str) -> list[float]:
     """Return a list of `count` numbers of a mapping; raise LensError naming the field."""
     values = mapping.get(name)

@@ -25,6 +25,9 @@ _LINEARITY = re.compile(
     r'LENSMODEL_CAHVORE_linearity=([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)$')
 # Those of cv2.calibrateCamera, and how many coefficients follow fx, fy, cx and cy
 _PERSPECTIVE = {'LENSMODEL_PINHOLE': 0} | {f'LENSMODEL_OPENCV{n}': n for n in (4, 5, 8)}
+_STEREOGRAPHIC = 'LENSMODEL_STEREOGRAPHIC'
+_COUNTS = {_STEREOGRAPHIC: 4} | {name: 4 + n for name, n in _PERSPECTIVE.items()}
+_OF_CAHVORE = 12
 _MOST_TOKENS = 100_000
 _AXIS = 1e-9  # rad, of CAHVORE's axis off the image's
 _TERMS, _GRID, _TOLERANCE = 3, 400, 0.01
@@ -47,19 +50,23 @@ def read(text: str, where: str) -> Foreign:
     except (AttributeError, LookupError, SyntaxError, TypeError, ValueError, MemoryError,
             RecursionError, OverflowError) as cause:
         raise LensError(f'{where}: not a whole .cameramodel ({cause})'.splitlines()[0]) from cause
-    if model == 'LENSMODEL_STEREOGRAPHIC' and len(values) == 4:
+    match = _LINEARITY.match(model)
+    needed = _OF_CAHVORE if match else _COUNTS.get(model, len(values))
+    if len(values) != needed:
+        raise LensError(f'{where}: intrinsics has {len(values)} values; {model} needs {needed}')
+    if model == _STEREOGRAPHIC:
         return _read_stereographic(size, values, where)
     if model.startswith(mrcal_splined.NAME):
         lens = mrcal_splined.read(model, values, size, where)
         return Foreign('mrcal', {'camera': lens}, (), {})
-    if len(values) == 4 + _PERSPECTIVE.get(model, len(values)):
+    if model in _PERSPECTIVE:
         distortion = brown(radial.PERSPECTIVE, dict(zip(OPENCV, values[4:], strict=False)))
         lens, worst = nearest_lens('camera', size, values[:4], distortion, where)
         return Foreign('mrcal', {'camera': lens}, (), {'camera': worst})
-    match = _LINEARITY.match(model)
-    if match is None or len(values) != 12:
-        raise LensError(f'{where}: {model} with {len(values)} values; CAHVORE, STEREOGRAPHIC, '
-                        'SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be read')
+    if match is None:
+        raise LensError(f'{where}: lensmodel is {model}; CAHVORE with its linearity, '
+                        'STEREOGRAPHIC, SPLINED_STEREOGRAPHIC, PINHOLE and OPENCV4 to 8 can be '
+                        'read')
     if max(map(abs, values[4:6])) > _AXIS:
         raise LensError(f'{where}: the axis of its CAHVORE is not square to the image (alpha, '
                         'beta); that is not supported')
