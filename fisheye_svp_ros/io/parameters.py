@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
@@ -17,7 +18,7 @@ S = TypeVar('S')
 class Row(NamedTuple):
     """One parameter: its default gives the type; low to high is the range, ends included.
 
-    fixed: it holds for the life of a node; file: it may name a file.
+    fixed: it holds for the life of a node; file: it may name a file; frame: it is a frame id.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Row(NamedTuple):
     choices: tuple[str, ...] = ()
     fixed: bool = False
     file: bool = False
+    frame: bool = False
 
     def constraint(self) -> str:
         """Say what values are allowed beyond the type; empty for any."""
@@ -62,6 +64,9 @@ class Row(NamedTuple):
         outside = self.low is not None and not self.low <= value <= (self.high or 0)
         if outside or (self.choices and value not in self.choices):
             raise ParameterError(f'{self.name} is {value!r}; allowed is {self.constraint()}')
+        if self.frame and re.search(r'^/|\s', value):  # which tf2 refuses, message by message
+            raise ParameterError(f'{self.name} is {value!r}; a frame id begins without a slash '
+                                 'and holds no blanks')
         return value
 
 
@@ -74,10 +79,11 @@ def parameter(
     *,
     fixed: bool = False,
     file: bool = False,
+    frame: bool = False,
 ) -> Any:
     """Return a dataclass field that is a row of the table; span: smallest and largest value."""
     low, high = span or (None, None)
-    row = Row('', default, description, unit, low, high, choices, fixed, file)
+    row = Row('', default, description, unit, low, high, choices, fixed, file, frame)
     return field(default=default, metadata={'row': row})
 
 

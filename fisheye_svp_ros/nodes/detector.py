@@ -52,7 +52,7 @@ class DetectorSettings(Settings):
         'chessboard:9x6:25mm', 'The board: chessboard:COLUMNSxROWS:SIZE (inner corners), '
         'charuco:..., aprilgrid:FILE, circles:..., squares:..., as for `fisheye-svp detect`'
     )
-    board_frame: str = parameter('board', 'Frame id of the landmarks')
+    board_frame: str = parameter('board', 'Frame id of the landmarks', frame=True)
     longest_search: float = parameter(
         1.0, 'Longest search in one image; after it, the image counts as without '
         'board', 's', (0.05, 60.0)

@@ -119,6 +119,8 @@ class ModelCritic(SolverNode):
         if settings.stereo and settings.lens == CAMERA_INFO:
             raise ParameterError('with rig, lens cannot be camera_info; name one lens file for '
                                  'both cameras')
+        if Path(settings.output).is_dir():
+            raise ParameterError(f'output is {settings.output!r}, a folder; name a file')
         return super().prepare(settings)
 
     def configure(self, settings: Any) -> None:

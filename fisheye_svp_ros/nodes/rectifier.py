@@ -143,6 +143,9 @@ class Rectifier(BaseNode):
     def _rig(self, settings: RectifierSettings) -> Pose | None:
         """Return the rig of a pair, None for one camera; raise FisheyeSvpError where it lacks."""
         if not settings.stereo:
+            if settings.rig:
+                raise ParameterError(f'rig is {settings.rig!r}, but stereo is false; start the '
+                                     'node with stereo:=true, or leave rig empty')
             return None
         path = None if settings.lens == CAMERA_INFO else lens_path(settings.lens)
         names = cameras_in(path) if path else ()

@@ -11,7 +11,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.errors import ObservationError
+from fisheye_svp_ros.errors import LensError, ObservationError, ParameterError
 from fisheye_svp_ros.io import decoding
 from fisheye_svp_ros.io.clouds import LANDMARKS, structured_array
 from fisheye_svp_ros.io.rig_files import load_rig
@@ -101,10 +101,14 @@ class StereoDepth(SolverNode):
 
 
 def _rig_file(settings: SolverSettings) -> Pose | None:
-    """Return the rig of a file, None where none is named; raise LensError for a bad one."""
+    """Return the rig of a file, None where none is named; raise ParameterError for a bad one."""
     assert isinstance(settings, StereoDepthSettings)
     rig = settings.rig
-    return None if rig in ('true', 'topic') else load_rig(rig)
+    try:
+        return None if rig in ('true', 'topic') else load_rig(rig)
+    except LensError as cause:
+        raise ParameterError(
+            f'rig is {rig!r}; true, topic or the file of a rig is needed ({cause})') from cause
 
 
 def _true_points(points: Array, items: Items) -> Array | None:

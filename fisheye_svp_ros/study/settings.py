@@ -32,11 +32,11 @@ class CameraSettings(Settings):
         '', 'Result topics, separated by blanks: each set waits, in place of `rate`, until all '
         'have answered the previous one. Empty: do not wait'
     )
-    world_frame: str = parameter('world', 'Frame id of the world', fixed=True)
+    world_frame: str = parameter('world', 'Frame id of the world', fixed=True, frame=True)
     camera_frame: str = parameter(
         '', 'Frame id of the camera; in a rig with the prefix left_ or right_. Empty: '
         'camera_optical_frame; in the namespace front, front_camera_optical_frame',
-        fixed=True
+        fixed=True, frame=True
     )
     publish_tf: bool = parameter(
         False, 'Publish the true pose on tf2, from `world_frame` to the frame of the camera with '
@@ -124,7 +124,8 @@ class LocalizerSettings(SolverSettings):
         'camera; only if no other node publishes the latter', fixed=True
     )
     camera_frame: str = parameter(
-        '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True
+        '', 'Frame id of the estimated camera; empty: that of the image points', fixed=True,
+        frame=True
     )
     model_error: bool = parameter(
         False, 'Include the errors of the lens in the covariance of the pose, besides `sigma_px`; '

@@ -101,6 +101,9 @@ def test_every_parameter_is_described_and_refuses_what_breaks_it(
     ('localizer', 'lens', 'nothere', "'nothere' is neither a file"),
     ('stereo_calibrator', 'lens', 'nothere', "'nothere' is neither a file"),
     ('stereo_depth', 'lens', 'nothere', "'nothere' is neither a file"),
+    ('stereo_depth', 'rig', 'fals', "rig is 'fals'; true, topic or the file of a rig is needed"),
+    ('rectifier', 'rig', 'x', "rig is 'x', but stereo is false; start the node with stereo:=true"),
+    ('detector', 'board_frame', '/board', "board_frame is '/board'; a frame id begins without a"),
 ])
 def test_a_value_that_cannot_be_used_is_refused_with_the_reason(
     name: str, parameter: str, value: Any, reason: str, start: Callable[..., Any]
@@ -159,6 +162,19 @@ def test_a_node_says_which_lens_it_solves_with(
         shift = node.model(0, {}).lens.viewpoint_shift
         assert (shift is None) is solves_svp
     assert said in ' '.join(capfd.readouterr().err.split())
+
+
+@pytest.mark.parametrize(('name', 'argument', 'reason'), [
+    ('localizer', 'camera_frame:=/a', "camera_frame is '/a'; a frame id begins without a slash"),
+    ('localizer', 'camera_frame:=a b', "camera_frame is 'a b'; a frame id begins without a slash"),
+    ('measured_camera', 'world_frame:=/map', "world_frame is '/map'; a frame id begins without"),
+    ('model_critic', 'output:=/tmp', "output is '/tmp', a folder; name a file"),
+])
+def test_a_node_does_not_start_with_a_wrong_name(
+    name: str, argument: str, reason: str, start: Callable[..., Any]
+) -> None:
+    with pytest.raises(ParameterError, match=f'^{reason}'):
+        start(name, '-p', argument)
 
 
 @pytest.mark.parametrize(('argument', 'reason'), [
