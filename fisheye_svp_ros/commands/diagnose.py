@@ -124,7 +124,7 @@ def run(args: argparse.Namespace) -> None:
             progress('errors where the truth is known', 0.88)
             known = known_errors(diagnosis.simulation, diagnosis.model, names)
         except (GeometryError, np.linalg.LinAlgError) as cause:
-            raise _unfitted(args, cause) from cause
+            raise _fit_error(args, cause) from cause
         wanted, impossible = _plan_next_views(args, diagnosis) if args.count else (None, None)
         if args.output:
             progress('report', 0.9)
@@ -147,7 +147,7 @@ def _check_options(args: argparse.Namespace) -> None:
                                  'remove one of them')
 
 
-def _unfitted(args: argparse.Namespace, cause: Exception) -> GeometryError:
+def _fit_error(args: argparse.Namespace, cause: Exception) -> GeometryError:
     """Return what says that views cannot be fitted, and what to check."""
     poses_too = (f' Check that the poses of {args.poses} are those of the camera in the world.'
                  if args.poses else '')

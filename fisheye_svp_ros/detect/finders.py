@@ -196,12 +196,11 @@ def dictionary_of(pattern: Pattern) -> Any:
     if _ARUCO is None:
         raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no markers; '
                              'install 4.7 or newer, or opencv-contrib')
-    number = getattr(_ARUCO, pattern.dictionary, None)
-    number = getattr(_ARUCO, pattern.dictionary.lower().replace('dict_apriltag',
-                     'DICT_APRILTAG'), None) if number is None else number
-    if number is None:
-        raise ParameterError(f'board {pattern.spec!r}: OpenCV has no dictionary '
+    named = [name for name in dir(_ARUCO) if name.upper() == pattern.dictionary]
+    if not named:
+        raise ParameterError(f'board {pattern.spec!r}: OpenCV {cv2.__version__} has no dictionary '
                              f'{pattern.dictionary}')
+    number = getattr(_ARUCO, named[0])
     if hasattr(_ARUCO, 'getPredefinedDictionary'):
         return _ARUCO.getPredefinedDictionary(number)
     return _ARUCO.Dictionary_get(number)

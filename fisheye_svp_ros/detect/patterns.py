@@ -19,7 +19,15 @@ _UNITS = {'mm': 1e-3, 'cm': 1e-2, 'm': 1.0}
 _LENGTH = re.compile(r'([0-9.]+(?:e-?[0-9]+)?) *(mm|cm|m)', re.IGNORECASE)
 _SIZE = re.compile(r'([0-9]{1,9})x([0-9]{1,9})', re.IGNORECASE)
 _MAX_POINTS = 10_000  # points
-_TAGS = 587  # of the family 36h11
+_APRILTAGS = 'DICT_APRILTAG_36H11'
+# Markers of OpenCV's dictionaries, whose names are as good in capitals
+_MARKERS = {
+    **{f'DICT_{bits}X{bits}_{count}': count
+       for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    'DICT_ARUCO_ORIGINAL': 1024, 'DICT_ARUCO_MIP_36H12': 250, 'DICT_APRILTAG_16H5': 30,
+    'DICT_APRILTAG_25H9': 35, 'DICT_APRILTAG_36H10': 2320, _APRILTAGS: 587,
+}
+_TAGS = _MARKERS[_APRILTAGS]
 _NEIGHBOURS = 6
 _MAX_SPACING = 10.0  # m; a larger spacing is a slip of the unit
 
@@ -120,6 +128,13 @@ def _charuco(spec: str, words: list[str]) -> Pattern:
     (columns, rows), (size, marker) = _numbers(spec, words, 2, least=3)
     if marker >= size:
         raise ParameterError(f'board {spec!r}: the marker must be smaller than its square')
+    if dictionary not in _MARKERS:
+        raise ParameterError(f'board {spec!r}: OpenCV has no dictionary {dictionary}; known are '
+                             f'{", ".join(_MARKERS)}')
+    needed, there = columns * rows // 2, _MARKERS[dictionary]
+    if needed > there:
+        raise ParameterError(f'board {spec!r}: it needs {needed} markers, and {dictionary} has '
+                             f'{there}; choose a larger dictionary')
     points = _grid(columns - 1, rows - 1, size)
     clearance = (size - marker) / np.sqrt(2)  # the corner of a marker is the nearest of it
     return Pattern('charuco', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
@@ -150,6 +165,9 @@ def _squares(spec: str, words: list[str]) -> Pattern:
 
 def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     path = Path(':'.join(words))
+    if path == Path():
+        raise ParameterError(f'board {spec!r}: the file of a Kalibr target is needed, as in '
+                             'aprilgrid:target.yaml')
     document = read_yaml(path, ParameterError)
     if document.get('target_type') != 'aprilgrid':
         raise ParameterError(f'{path}: target_type is {document.get("target_type")!r}; the YAML '
@@ -168,7 +186,7 @@ def _aprilgrid(spec: str, words: list[str]) -> Pattern:
     # The border of a tag is two of its ten cells: a corner of a cell is nearest.
     clearance = tag * min(ratio, 0.2 * np.sqrt(2))
     return Pattern('aprilgrid', spec, columns, rows, points, clearance, np.zeros((len(points), 2)),
-                   np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, 'DICT_APRILTAG_36H11')
+                   np.tile([-1.0, 1, -1, 1], columns * rows), tag, tag, _APRILTAGS)
 
 
 PATTERNS: dict[str, Callable[[str, list[str]], Pattern]] = {

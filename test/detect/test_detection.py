@@ -31,8 +31,8 @@ from rosbags.typesys import Stores, get_typestore
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.corner_fit import Corners, fit_corners
 from fisheye_svp_ros.detect.detection import Detection, _Task, detect, examine
-from fisheye_svp_ros.detect.finders import DETECTORS
-from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.finders import DETECTORS, dictionary_of
+from fisheye_svp_ros.detect.patterns import _MARKERS, parse_pattern
 from fisheye_svp_ros.detect.photographs import (
     Photograph,
     decode_image,
@@ -125,6 +125,23 @@ class TestPatterns:
         with pytest.raises(ParameterError) as error:
             parse_pattern(spec)
         assert '\n' not in str(error.value)
+
+    @pytest.mark.parametrize(('spec', 'said'), [
+        ('charuco:7x5:30mm:22mm:DICT_9X9_1', 'no dictionary DICT_9X9_1; known are DICT_4X4_50, '),
+        ('charuco:20x20:30mm:22mm:dict_5x5_100', 'it needs 200 markers, and DICT_5X5_100 has 100'),
+        ('aprilgrid:', "board 'aprilgrid:': the file of a Kalibr target is needed"),
+    ])
+    def test_what_is_refused_is_named(self, spec: str, said: str) -> None:
+        with pytest.raises(ParameterError, match=re.escape(said)):
+            parse_pattern(spec)
+
+    def test_dictionaries_are_those_of_opencv(self) -> None:
+        if not hasattr(cv2, 'aruco'):
+            pytest.skip('this OpenCV has no markers')
+        for name, count in _MARKERS.items():
+            pattern = parse_pattern(f'charuco:4x4:30mm:22mm:{name}')
+            if name != 'DICT_ARUCO_MIP_36H12' or hasattr(cv2.aruco, 'DICT_ARUCO_MIP_36h12'):
+                assert len(dictionary_of(pattern).bytesList) == count
 
     @pytest.mark.parametrize(('spec', 'ways'), [
         ('chessboard:9x6:24mm', 1), ('chessboard:6x4:24mm', 2), ('chessboard:5x3:24mm', 2),
