@@ -253,6 +253,7 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     for node, values in parameters.items():
         _check_names(node, values)
     plan = sweeps.plan_sweep(parameters)
+    sweeps.check_solvers(plan, nodes)
     return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
 
 

@@ -70,6 +70,8 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
     (lambda: fsvp.plot_residuals(LENS, TABLE), 'observations are of type Lens; a table or a path'),
     (lambda: fsvp.sweep({'radius': 0.5}), "over['radius'] is 0.5; a list of values is needed"),
     (lambda: fsvp.sweep({'style': 'mono'}), "over['style'] is 'mono'; a list of values is needed"),
+    (lambda: fsvp.sweep({'radius': [0.5]}, stereo_depth={'svp': True}),
+     'stereo_depth solves nothing in this sweep: it needs style parallel'),
     (lambda: fsvp.calibrate_rig(TABLE, [LENS, LENS]), 'lenses is of type list; a mapping of cam'),
     (lambda: fsvp.observations([1.0], [np.nan], [0], BOARD), 'u and v must be finite; leave out'),
     (lambda: fsvp.observations([1.0], [2.0], [0.5], BOARD), 'landmark must be whole numbers'),

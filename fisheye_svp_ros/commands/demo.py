@@ -68,17 +68,18 @@ def run(args: argparse.Namespace) -> None:
 
     Where no node can run, the same scenarios are computed in this process.
     """
+    lenses, radii = list(dict.fromkeys(args.lenses)), list(dict.fromkeys(args.radii))
     bag: Path | None = args.output / _RECORDING
     if reason := missing_rclpy():
         print(f'  ROS 2 is missing ({reason}): the same scenarios run in one process, without '
               'nodes.')
         bag = None
-        columns, fields = compute_demo(args.lenses, args.radii)
+        columns, fields = compute_demo(lenses, radii)
     else:
-        columns, fields = _record(args.output, args.lenses, args.radii)
-    rows = demo_rows(columns, args.lenses, args.radii)
+        columns, fields = _record(args.output, lenses, radii)
+    rows = demo_rows(columns, lenses, radii)
     with progress('rectifying a pair'):
-        pair, images = rectified_pair(load_lens(lens_path(args.lenses[0])))
+        pair, images = rectified_pair(load_lens(lens_path(lenses[0])))
         apart = rows_left(pair)
     with write_together():
         write_columns(args.output / 'table', columns)
@@ -90,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
         draw_pair(args.output / 'rectified.png', *images)
     note_formats()
     _print(rows)
-    print_remaining(f'A pair of {args.lenses[0]}, rectified at {range_text(pair.left.range)}: '
+    print_remaining(f'A pair of {lenses[0]}, rectified at {range_text(pair.left.range)}: '
                     'difference between the rows of left and right', apart)
     print(f'  {"recording, " if bag else ""}table, pictures: {args.output}')
 

@@ -10,7 +10,7 @@ from typing import Any
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
 from fisheye_svp_ros.io.parameters import SWEEP, rows
-from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, plan_sweep
+from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, check_solvers, plan_sweep
 
 
 def read_sweep(path: Path) -> Plan:
@@ -22,7 +22,10 @@ def read_sweep(path: Path) -> Plan:
         given = read_parameter_file(path)
         for pattern, values in given.items():
             _check_names(pattern, values)
-        return plan_sweep({node: parameters_of(f'/{node}', given) for node in TABLES})
+        plan = plan_sweep({node: parameters_of(f'/{node}', given) for node in TABLES})
+        # A pattern such as /** means those that there are; a name means that node.
+        check_solvers(plan, [node for node in TABLES if f'/{node}' in given])
+        return plan
     except FisheyeSvpError as error:
         text = ' '.join(str(error).split())
         raise ParameterError(text if str(path) in text else f'{path}: {text}') from error

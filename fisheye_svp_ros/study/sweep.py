@@ -15,6 +15,7 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.parameters import SWEEP, Sweep, rows, sweep_of, with_values
 from fisheye_svp_ros.io.recording import Columns
 from fisheye_svp_ros.optics import engines
+from fisheye_svp_ros.scene.rigs import STYLES
 from fisheye_svp_ros.simulate.scenario import (
     MONO,
     SCALARS,
@@ -38,6 +39,7 @@ CAMERA = 'synthetic_camera'
 TABLES: Mapping[str, type[Any]] = {
     CAMERA: SyntheticCameraSettings, **{name: s.settings for name, s in SOLVERS.items()}
 }
+_MONO_SOLVERS = ('localizer',)
 SCENARIO_COLUMNS = ('scenario', 'scenarios', 'set', 'sets')
 _EVALUATIONS = 10  # of all points, to solve a set
 _SETS_PER_TASK = 512  # sets a task: enough to solve them fast together, few enough to lose
@@ -83,7 +85,17 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
     mono = {style == MONO for style in sweep.lists.get('style', (base.style,))}
     if len(mono) > 1:
         raise ParameterError(f'{SWEEP}style has {MONO} together with rigs; make two sweeps of it')
-    return ('localizer',) if mono.pop() else ('stereo_calibrator', 'stereo_depth')
+    return _MONO_SOLVERS if mono.pop() else ('stereo_calibrator', 'stereo_depth')
+
+
+def check_solvers(plan: Plan, nodes: Iterable[str]) -> None:
+    """Raise ParameterError for a node that is asked for and has nothing to solve in a sweep."""
+    for node in nodes:
+        if node not in (CAMERA, *plan.solvers):
+            *others, last = STYLES
+            needed = MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
+            raise ParameterError(f'{node} solves nothing in this sweep: it needs style {needed}; '
+                                 f'choose that, or leave {node} out')
 
 
 def column_types(plan: Plan) -> dict[str, type]:

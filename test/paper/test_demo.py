@@ -134,7 +134,8 @@ def computed(
 ) -> Any:
     """Run the demo where there is no rclpy; return its folder and what it printed."""
     monkeypatch.setitem(sys.modules, 'rclpy', None)
-    assert main(['demo', '-o', str(tmp_path), '--lenses', 'fish180', '--radii', '0.5']) == 0
+    assert main(['demo', '-o', str(tmp_path), '--lenses', 'fish180', 'fish180', '--radii', '0.5',
+                 '0.5']) == 0
     return tmp_path, capsys.readouterr().out
 
 

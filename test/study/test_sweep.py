@@ -20,6 +20,7 @@ from helpers.nodes import ROOT, until
 
 from fisheye_svp_ros.cli import main
 from fisheye_svp_ros.commands.executors import process_pool
+from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
 from fisheye_svp_ros.io import columns as tables
 from fisheye_svp_ros.io.columns import read_columns
@@ -174,6 +175,12 @@ def test_every_set_of_a_rig_is_a_row() -> None:
     assert set(columns['stereo_depth.note']) == {None}
 
 
+def test_a_pattern_asks_for_no_node(write: Callable[[str], Path]) -> None:
+    plan = read_sweep(write('/**: {ros__parameters: {svp: true}}\nsynthetic_camera: '
+                            '{ros__parameters: {sweep.radius: [0.5]}}'))
+    assert list(plan.solvers) == ['localizer']
+
+
 def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> None:
     few = tmp_path / 'few.csv'
     few.write_text('landmark,x,y,z\n1,0,0,-1\n2,1,0,-1\n3,0,1,-1\n')
@@ -230,6 +237,11 @@ def test_a_bad_sweep_is_refused_before_anything_runs(
     ('a: [', 'broken YAML at line 2'),
     ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
      '{sweep.style: [parallel]}}', "rig is 'topic'"),
+    ('stereo_calibrator: {ros__parameters: {svp: true}}\nsynthetic_camera: {ros__parameters: '
+     '{style: mono, sweep.radius: [0.5]}}', 'stereo_calibrator solves nothing in this sweep: it '
+     'needs style parallel, vergent or divergent'),
+    ('localizer: {ros__parameters: {svp: true}}\nsynthetic_camera: {ros__parameters: '
+     '{sweep.style: [parallel, vergent]}}', 'it needs style mono; choose that'),
     ('localizer: {ros__parameters: {lens: nonsense}}\nsynthetic_camera: {ros__parameters: '
      '{sweep.seed: [1]}}', "'nonsense' is neither a file"),
 ])
