@@ -58,7 +58,8 @@ def _sweep(name: str, bag: Path) -> None:
     with progress('sweeping', len(plan.sweep)) as advance:
         record_sweep(path, plan, bag, logs, advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
-    say(f'{count} sets of {len(plan.sweep)} scenarios are in {bag}')
+    of = len(plan.sweep)
+    say(f'{count} sets of {of} scenario{"s"[:of - 1]} are in {bag}')
 
 
 def _record(args: argparse.Namespace) -> None:

@@ -117,14 +117,15 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     metrics = [name for name, kind in column_types(plan).items()
                if kind is float and '.' in name]
     found = {name: summarise(as_numbers(table[name])) for name in metrics}
+    count = len(plan.sweep)
     print_table(
-        f'{path}: {len(plan.sweep)} scenarios',
+        f'{path}: {count} scenario{"s"[:count - 1]}',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
         [(name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
          for name, s in found.items()],
     )
     write_json(folder / _SUMMARY, {
-        'fingerprint': mine, 'file': str(path), 'scenarios': len(plan.sweep),
+        'fingerprint': mine, 'file': str(path), 'scenarios': count,
         'swept': {name: list(values) for name, values in plan.sweep.lists.items()},
         'metrics': {name: s._asdict() for name, s in found.items()},
     })

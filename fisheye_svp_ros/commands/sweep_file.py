@@ -47,6 +47,9 @@ def _check_names(pattern: str, values: Mapping[str, Any]) -> None:
     known = {row.name for node in nodes for row in rows(TABLES[node])}
     for name in values:
         swept = name.startswith(SWEEP) and CAMERA in nodes  # the camera's own table says more
+        if name.startswith(SWEEP) and not swept:
+            raise ParameterError(f'{name}: only parameters of {CAMERA} can be swept, below its '
+                                 f'name; {", ".join(nodes)} takes one value of each of its own')
         if name not in known and not swept:
             raise ParameterError(f'{name} is not a parameter of {", ".join(nodes)}; known are '
                                  + ', '.join(sorted(known)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, TypeVar
 
@@ -125,12 +125,16 @@ class Sweep:
         return {name: values[name] for name in self.lists}
 
 
-def sweep_of(table: Any, parameters: Mapping[str, Any]) -> Sweep:
+def sweep_of(
+    table: Any, parameters: Mapping[str, Any], excluded: Collection[str] = ()
+) -> Sweep:
     """Return the sweep that the `sweep.<parameter>` entries of a parameter file ask for.
 
+    excluded: parameters that cannot be swept.
     Raises ParameterError for an unknown parameter, an empty list or a value that is not allowed.
     """
-    known = {row.name: row for row in rows(table) if not isinstance(row.default, tuple)}
+    known = {row.name: row for row in rows(table)
+             if not isinstance(row.default, tuple) and row.name not in excluded}
     lists = {}
     for name, values in parameters.items():
         if not name.startswith(SWEEP):
@@ -139,6 +143,8 @@ def sweep_of(table: Any, parameters: Mapping[str, Any]) -> Sweep:
         if row is None:
             raise ParameterError(f'{name}: no such parameter to sweep; known are '
                                  + ', '.join(known))
+        if values is None:  # as a parameter file has an empty list
+            values = []
         if isinstance(values, str) or not isinstance(values, Sequence) or not len(values):
             raise ParameterError(f'{name} is {values!r}; a list of at least one value is needed')
         lists[row.name] = [row.check(value) for value in values]

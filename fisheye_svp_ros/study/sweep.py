@@ -61,7 +61,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     and FisheyeSvpError for a lens, landmarks or poses that cannot be used.
     """
     camera = parameters.get(CAMERA, {})
-    base, sweep = with_values(Scenario(), camera), sweep_of(Scenario, camera)
+    base, sweep = with_values(Scenario(), camera), sweep_of(Scenario, camera, ('rig_file',))
     if not sweep.lists:
         raise ParameterError('no parameter is swept; add a list such as sweep.radius: [2.0, 0.5]')
     names = solvers_of(base, sweep)
@@ -79,7 +79,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
 
 def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
     """Return the solver nodes of a sweep; raise ParameterError where scenarios differ in them."""
-    if base.rig_file or sweep.lists.get('rig_file'):
+    if base.rig_file:
         raise ParameterError(f'{CAMERA}: rig_file names a rig; an offline sweep simulates one '
                              'camera or a pair: leave rig_file out, and choose a style')
     mono = {style == MONO for style in sweep.lists.get('style', (base.style,))}

@@ -200,7 +200,10 @@ def test_a_set_that_cannot_be_solved_is_a_row_that_says_why(tmp_path: Path) -> N
 
 BAD = {
     'sweep.radios: [1.0]': 'sweep.radios: no such parameter to sweep',
-    'sweep.radius: []': 'sweep.radius is None; a list of at least one value',
+    'sweep.rig_file: [rig.yaml]': 'sweep.rig_file: no such parameter to sweep; known are lens, '
+        'shift_scale, environment, radius, style, baseline, vergence, poses_file, '
+        'trajectory_steps, noise_px, seed\n',
+    'sweep.radius: []': 'sweep.radius is []; a list of at least one value',
     'sweep.radius: 2.0': 'sweep.radius is 2.0; a list of at least one value',
     'sweep.radius: [near, far]': "radius is 'near'; float is needed",
     'sweep.radius: [1.0, near]': 'differ in type',
@@ -230,9 +233,18 @@ def test_a_bad_sweep_is_refused_before_anything_runs(
     assert not (tmp_path / 'out').exists()
 
 
+def test_one_scenario_is_told_in_the_singular(
+    write: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = write('/**: {ros__parameters: {sweep.radius: [2.0]}}')
+    sweep(file, '-o', tmp_path / 'out')
+    assert f'{file}: 1 scenario\n' in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(('text', 'reason'), [
     ('localiser: {ros__parameters: {svp: true}}', 'is not a node of a sweep'),
-    ('localizer: {ros__parameters: {sweep.radius: [1.0]}}', 'is not a parameter of localizer'),
+    ('localizer: {ros__parameters: {sweep.svp: [true]}}', 'sweep.svp: only parameters of '
+     'synthetic_camera can be swept, below its name; localizer takes one value of each'),
     ('', 'should hold node names'),
     ('a: [', 'broken YAML at line 2'),
     ('stereo_depth: {ros__parameters: {rig: topic}}\nsynthetic_camera: {ros__parameters: '
