@@ -14,9 +14,10 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import Diagnosis
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting.diagnosis_plots import AFTER, BEFORE, INK
-from fisheye_svp_ros.reporting.plots import picture, round_number
+from fisheye_svp_ros.reporting.plots import legend_below, picture, round_number
 
 _REJECTED_COLOR = '#cbd5e1'
+_OVER_LINES = {'facecolor': 'white', 'edgecolor': 'none', 'pad': 1}  # behind a number
 _CELLS = 24  # over the longer side of the image
 _TITLES = {'noise': 'noise of a point', 'parameters': 'parameters of the lens',
            'misfit': 'unexplained model error'}
@@ -26,7 +27,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     """What each step of the search explains, and how well held-out data are predicted after it."""
     steps = [step for step in diagnosis.trace if step.statistic > 0]
     count = max(len(steps), len(diagnosis.causes) + 2)
-    with picture(path, 9.2, 1.4 + 0.3 * count) as figure:
+    with picture(path, 9.2, 1.6 + 0.3 * count) as figure:
         left, right = figure.subplots(1, 2)
         left.barh(
             [step.effect[:40] for step in steps], [step.statistic for step in steps],
@@ -39,11 +40,11 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
         left.xaxis.set_minor_formatter(NullFormatter())
         left.plot([], [], 's', color=AFTER, label='accepted')
         left.plot([], [], 's', color=_REJECTED_COLOR, label='refused')
-        left.legend(loc='lower right', fontsize=8)
         _plot_heldout_rms(right, diagnosis)
         for axis in (left, right):
             axis.invert_yaxis()
             axis.grid(visible=False, axis='y')
+        legend_below(figure, left, right)
 
 
 def _plot_heldout_rms(axis: Axes, diagnosis: Diagnosis) -> None:
@@ -53,11 +54,12 @@ def _plot_heldout_rms(axis: Axes, diagnosis: Diagnosis) -> None:
            diagnosis.figures.extended.heldout_rms_px]
     axis.barh(names, rms, color=[BEFORE, *[AFTER] * (len(causes) + 1)], height=0.6)
     for place, value in enumerate(rms):
-        axis.annotate(f' {value:.3f}', (value, place), va='center', fontsize=8.5)
+        axis.annotate(
+            f'{value:.3f}', (value, place), xytext=(5, 0), textcoords='offset points',
+            va='center', fontsize=8.5, bbox=_OVER_LINES)
     axis.axvline(math.sqrt(2) * diagnosis.noise_px, color=INK, ls=':', label='noise')
     axis.set(xlabel='rms residual of held-out data / px', title='prediction of held-out data')
     axis.margins(x=0.12)
-    axis.legend(loc='lower right', fontsize=8)
 
 
 def draw_target(path: Path, maps: list[tuple[str, BoardMap]]) -> None:

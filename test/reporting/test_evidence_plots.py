@@ -61,10 +61,17 @@ def test_no_tick_label_of_the_evidence_covers_another(
                for n, value in enumerate(statistics)]))
     canvas = FigureCanvasAgg(figures[0])
     canvas.draw()
-    left = figures[0].axes[0]
+    left, right = figures[0].axes
     labels = [label.get_window_extent() for label in left.get_xticklabels(which='both')
               if label.get_text()]
     places = sorted((box.x0, box.x1) for box in labels
                     if left.bbox.x0 - 1 <= (box.x0 + box.x1) / 2 <= left.bbox.x1 + 1)
     assert places and all(end < start for (_, end), (start, _) in pairwise(places))
     assert left.get_xlim()[0] < min(statistics)
+    line, = right.lines
+    for number in right.texts:  # the line of the noise does not run through them
+        box = number.get_bbox_patch()
+        assert box is not None and number.get_zorder() > line.get_zorder()
+    legend, = figures[0].legends
+    assert not any(axis.get_tightbbox().overlaps(legend.get_window_extent())
+                   for axis in (left, right))
