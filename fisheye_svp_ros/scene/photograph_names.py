@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import PurePath
 
@@ -14,12 +13,11 @@ from fisheye_svp_ros.scene.observations import Observations
 def photograph_names(table: Observations) -> dict[tuple[int, str], str]:
     """Return the file name of each photograph by frame and camera, unique among them.
 
-    Photographs of one file name in the folders of several cameras keep their folder.
+    All keep their folder where photographs in several folders have one file name.
     """
     paths = {(frame, camera): PurePath(path) for frame, camera, path in table.photographs}
-    count = Counter(path.name for path in paths.values())
-    return {key: path.name if count[path.name] == 1 else '/'.join(path.parts[-2:])
-            for key, path in paths.items()}
+    parts = 1 if len({path.name for path in paths.values()}) == len(paths) else 2
+    return {key: '/'.join(path.parts[-parts:]) for key, path in paths.items()}
 
 
 def frame_names(table: Observations, frame: int, camera: str | None = None) -> list[str]:

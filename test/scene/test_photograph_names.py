@@ -36,6 +36,12 @@ def test_one_file_name_in_two_folders_keeps_its_folder() -> None:
     assert photograph_entry(named, 0, 'left') == {'photograph': 'left19.jpg'}
 
 
+def test_all_keep_their_folder_where_one_needs_it() -> None:
+    table = rig((0, 'left', 'rig/left/19.jpg'), (0, 'right', 'rig/right/19.jpg'),
+                (1, 'right', 'rig/right/20.jpg'))
+    assert frame_name(table, 1) == 'right/20.jpg'
+
+
 def test_a_table_of_one_camera_names_that_camera_alone() -> None:
     left = FOLDERS.take(FOLDERS.camera == 0)
     assert list_frames(left, [0, 1, 0]) == 'left/19.jpg and left/20.jpg'
