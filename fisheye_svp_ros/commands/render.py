@@ -28,6 +28,8 @@ from fisheye_svp_ros.simulate.render import BoardPose, Exposure, Field, Print, p
 from fisheye_svp_ros.simulate.targets import TARGETS, board, board_views, target_views, visible
 
 Cameras = Mapping[str, tuple[Lens, Pose]]  # lens of each camera, and the camera in the first one
+Ranges = tuple[float, float]  # nearest and furthest, m
+_COUNT, _RANGES = 30, (0.12, 0.35)
 _MIN_SIZE = 10.0  # px of the corners in sight; in millimetres, poses are a thousand times too far
 
 
@@ -47,9 +49,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--poses', metavar='POSES.csv',
                         help='poses of the camera (of a rig, the first one) in the frame of the '
                         'board or target; default: random')
-    parser.add_argument('--count', type=int, default=30, metavar='N',
+    parser.add_argument('--count', type=int, metavar='N',
                         help='number of photographs from random poses; default: 30')
-    parser.add_argument('--ranges', type=float, nargs=2, default=(0.12, 0.35), metavar='M',
+    parser.add_argument('--ranges', type=float, nargs=2, metavar='M',
                         help='nearest and furthest distance of random poses, m; of a cube, to its '
                         'center; default: 0.12 0.35')
     parser.add_argument('--bow', type=float, default=0.0, metavar='MM',
@@ -66,9 +68,7 @@ def run(args: argparse.Namespace) -> None:
     pattern = parse_pattern(args.board)
     if pattern.kind != 'chessboard':
         raise ParameterError(f'--board {args.board}: only chessboards can be rendered')
-    if args.count < 1 or not 0 < args.ranges[0] <= args.ranges[1] < np.inf:
-        raise ParameterError('--count must be above 0, --ranges two distances above 0, the nearer '
-                             'first')
+    count, ranges = _of_random_poses(args)
     if not all(0 <= value < np.inf for value in (args.blur, args.noise, args.seed, abs(args.bow))):
         raise ParameterError('--blur, --noise and --seed must be finite and not below 0, --bow '
                              'finite')
@@ -81,7 +81,7 @@ def run(args: argparse.Namespace) -> None:
     if args.poses:
         poses = _read_poses(args.poses, cameras, boards)
     else:
-        poses = _random_poses(cameras, boards, args, rng)
+        poses = _random_poses(cameras, boards, args.target, count, ranges, rng)
     with write_together():
         count = write_photographs(cameras, boards, poses,
                                   Exposure(blur=args.blur, noise=args.noise), args.seed,
@@ -91,6 +91,22 @@ def run(args: argparse.Namespace) -> None:
         say(f'{args.output}: {others} other photographs are in it too; `detect` takes them all')
     print(f'{args.output}: {count} photographs, observations.csv with their true corners, '
           'poses.csv')
+
+
+def _of_random_poses(args: argparse.Namespace) -> tuple[int, Ranges]:
+    """Return number and ranges of random poses; raise ParameterError where nothing has them."""
+    for option, given in (('--count', args.count), ('--ranges', args.ranges)):
+        if args.poses and given is not None:
+            raise ParameterError(f'{option} is of random poses; leave out {option} or --poses')
+    if args.target == 'room' and args.ranges:
+        raise ParameterError('--ranges is of one board or a cube; the poses in a room are inside '
+                             'it: leave --ranges out')
+    count = _COUNT if args.count is None else args.count
+    near, far = args.ranges or _RANGES
+    if count < 1 or not 0 < near <= far < np.inf:
+        raise ParameterError('--count must be above 0, --ranges two distances above 0, the nearer '
+                             'first')
+    return count, (near, far)
 
 
 def _cameras(given: str) -> Cameras:
@@ -123,17 +139,17 @@ def _read_poses(path: str, cameras: Cameras, boards: tuple[BoardPose, ...]) -> P
 
 
 def _random_poses(
-    cameras: Cameras, boards: tuple[BoardPose, ...], args: argparse.Namespace,
+    cameras: Cameras, boards: tuple[BoardPose, ...], target: str, count: int, ranges: Ranges,
     rng: np.random.Generator,
 ) -> Pose:
     """Return poses (P,) of the first camera; the cameras of a rig look at the target in turn."""
-    poses = identity(args.count)
-    for number, (lens, place) in enumerate([*cameras.values()][:args.count]):
-        mine = np.arange(number, args.count, len(cameras))
+    poses = identity(count)
+    for number, (lens, place) in enumerate([*cameras.values()][:count]):
+        mine = np.arange(number, count, len(cameras))
         if len(boards) > 1:
-            own = target_views(lens, args.target, boards, len(mine), tuple(args.ranges), rng)
+            own = target_views(lens, target, boards, len(mine), ranges, rng)
         else:
-            own = board_views(lens, boards[0].printed, len(mine), tuple(args.ranges), rng)
+            own = board_views(lens, boards[0].printed, len(mine), ranges, rng)
         poses.put(mine, own.compose(place.inverse().broadcast_to(len(mine))))
     return poses
 

@@ -104,9 +104,10 @@ def target_views(
     def boards_visible(camera: Pose) -> bool:
         return bool((visible(lens, boards, camera)[1].sum(axis=1) > 3).sum() >= _MIN_BOARDS)
 
+    where = ('from inside it; take a lens with a larger field of view' if kind == 'room' else
+             f'at {ranges[0]:g} to {ranges[1]:g} m; choose other ranges')
     return _draw_poses(count, draw, boards_visible, (
-        f'lens {lens.name!r} does not see two boards of the {kind} at '
-        f'{ranges[0]:g} to {ranges[1]:g} m; choose other ranges'))
+        f'lens {lens.name!r} does not see two boards of the {kind} {where}'))
 
 
 def _draw_poses(

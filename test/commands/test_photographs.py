@@ -314,6 +314,20 @@ def test_render_with_what_is_no_size(said, tmp_path: Path, capsys: pytest.Captur
     assert not (tmp_path / 'a').exists()
 
 
+@pytest.mark.parametrize('said', [
+    ('--count', '3', '--poses', 'poses.csv'), ('--ranges', '0.1', '0.2', '--poses', 'poses.csv'),
+    ('--ranges', '0.1', '0.2', '--target', 'room'),
+])
+def test_render_refuses_what_has_no_effect(
+    said: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.main(['render', '--lens', 'fish180', '--board', BOARD, '-o', str(tmp_path / 'a'),
+                     *said]) == 2
+    err = capsys.readouterr().err
+    assert f'{said[0]} is of ' in err and err.count('\n') == 1
+    assert not (tmp_path / 'a').exists()
+
+
 def test_render_and_example_are_deterministic(tmp_path: Path) -> None:
     save_lens(LENS, tmp_path / 'lens.yaml')
     for name in ('one', 'two'):
