@@ -26,6 +26,8 @@ from fisheye_svp_ros.io.rig_files import load_pair
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.library_checks import (
     check_list,
+    check_numbers,
+    check_parameters,
     check_pose,
     check_size,
     check_type,
@@ -64,6 +66,7 @@ AnyLens = Lens | str | Path
 AnyObservations = Observations | str | Path
 AnyPoses = FramePoses | str | Path
 AnyRig = Pose | str | Path
+_MAX_DISTANCE = 1e50  # m
 # Called with a stage of long work and the share (0 to 1) that is done.
 Progress = Callable[[str, float], None]
 
@@ -87,7 +90,12 @@ def save_lens(lens: Lens, path: str | Path) -> None:
 
 def project(lens: AnyLens, points: Array) -> Image:
     """Project points (..., 3), m, in the camera frame; NaN and not valid outside the domain."""
-    return forward.project(load_lens(lens), _check_last_axis(3, points, 'points'))
+    points = _check_last_axis(3, points, 'points')
+    # Beyond, squares overflow; the image is that of the direction long before.
+    largest = np.abs(points).max(axis=-1, keepdims=True)
+    too_far = (largest > _MAX_DISTANCE) & (largest < np.inf)
+    scale = np.where(too_far, largest / _MAX_DISTANCE, 1.0)
+    return forward.project(load_lens(lens), points / scale)
 
 
 def back_project(lens: AnyLens, uv: Array) -> Rays:
@@ -100,10 +108,7 @@ def _by_frame(poses: AnyPoses) -> dict[int, Pose]:
 
 
 def _check_last_axis(size: int, values: Array, name: str) -> Array:
-    try:
-        numbers = np.asarray(values, dtype=float)
-    except (TypeError, ValueError) as cause:
-        raise ParameterError(f'{name} are no numbers; (..., {size}) is needed') from cause
+    numbers = check_numbers(values, name, f'(..., {size})')
     if numbers.shape[-1:] != (size,):
         raise ParameterError(f'{name} has the shape {numbers.shape}; (..., {size}) is needed')
     return numbers
@@ -234,7 +239,8 @@ def simulate_scenario(**scenario: Any) -> Simulated:
     _check_names(sweeps.CAMERA, scenario)
     lens = scenario.pop('lens', None)
     named = {} if lens is None or isinstance(lens, Lens) else {'lens': str(lens)}
-    seen = scenarios.simulate_scenario(with_values(scenarios.Scenario(), {**scenario, **named}),
+    given = {**check_parameters(scenario, 'scenario'), **named}
+    seen = scenarios.simulate_scenario(with_values(sweeps.TABLES[sweeps.CAMERA](), given),
                                        lens=lens if isinstance(lens, Lens) else None)
     return Simulated(seen.lens, seen.observations, seen.poses[-1], seen.rig)
 
@@ -248,8 +254,9 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     Raises ParameterError for an unknown parameter or a value that is not allowed.
     """
     swept = {f'{SWEEP}{name}': check_list(values, f'over[{name!r}]')
-             for name, values in over.items()}
-    parameters = {**nodes, sweeps.CAMERA: {**nodes.get(sweeps.CAMERA, {}), **swept}}
+             for name, values in check_type(over, Mapping, 'over', 'a mapping of lists').items()}
+    parameters = {node: check_parameters(values, node) for node, values in nodes.items()}
+    parameters[sweeps.CAMERA] = {**parameters.get(sweeps.CAMERA, {}), **swept}
     for node, values in parameters.items():
         _check_names(node, values)
     plan = sweeps.plan_sweep(parameters)

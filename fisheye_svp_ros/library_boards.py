@@ -14,7 +14,15 @@ from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.io.lens_formats import write_foreign
 from fisheye_svp_ros.library import AnyLens, load_lens, save_lens
-from fisheye_svp_ros.library_checks import check_above, check_pair, check_pose
+from fisheye_svp_ros.library_checks import (
+    check_above,
+    check_count,
+    check_numbers,
+    check_pair,
+    check_pose,
+    check_whole_numbers,
+)
+from fisheye_svp_ros.planning import MAX_VIEWS
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations, make_observations
 
@@ -31,26 +39,30 @@ def observations(
     Raises ParameterError for arrays of different lengths, image points that are not finite, and
     landmarks that are not there or twice in a frame.
     """
-    places = parse_pattern(board).points if isinstance(board, str) else np.asarray(board, float)
-    columns = np.broadcast_arrays(*map(np.atleast_1d, (u, v, landmark, frame))) if len(
-        {np.size(column) for column in (u, v, landmark)}) == 1 else []
-    if not columns or places.shape[1:] != (3,):
+    places = parse_pattern(board).points if isinstance(board, str) else (
+        check_numbers(board, 'board', '(L, 3)'))
+    image = [np.atleast_1d(check_numbers(values, name, '(N,)'))
+             for name, values in (('u', u), ('v', v))]
+    number = np.atleast_1d(check_whole_numbers(landmark, 'landmark'))
+    if {column.shape for column in (*image, number)} != {(len(number),)} or (
+            places.shape[1:] != (3,)):
         raise ParameterError('u, v and landmark must have one length, places the shape (L, 3)')
-    if not np.isfinite(np.array(columns[:2], dtype=float)).all():
+    frames = check_whole_numbers(frame, 'frame')
+    if frames.shape not in ((), (1,), number.shape):
+        raise ParameterError(f'frame has the shape {frames.shape}; one number, or one for each of '
+                             f'the {len(number)} points, is needed')
+    frames = np.broadcast_to(frames, number.shape)
+    if not np.isfinite(image).all():
         raise ParameterError('u and v must be finite; leave out what was not seen')
-    number, frames = _whole_numbers(columns[2], 'landmark'), _whole_numbers(columns[3], 'frame')
+    if not np.isfinite(places).all():
+        raise ParameterError('board has places that are not finite; number only landmarks whose '
+                             'place is known')
     if len(np.unique(np.stack([frames, number]), axis=1).T) < len(number):
         raise ParameterError('a landmark is twice in a frame; frame (N,) says which photograph')
-    if number.min(initial=0) < 0 or number.max(initial=0) >= len(places):
-        raise ParameterError(f'landmarks are 0 to {len(places) - 1}; there is {number.max()}')
-    return make_observations(frames, number, np.stack(columns[:2], axis=-1), places[number])
-
-
-def _whole_numbers(values: Array, name: str) -> Index:
-    whole = np.asarray(values).astype(np.int64)
-    if (whole != values).any():
-        raise ParameterError(f'{name} must be whole numbers')
-    return whole
+    outside = number[(number < 0) | (number >= len(places))]
+    if len(outside):
+        raise ParameterError(f'landmarks are 0 to {len(places) - 1}; there is {outside[0]}')
+    return make_observations(frames, number, np.stack(image, axis=-1), places[number])
 
 
 def render(
@@ -92,7 +104,7 @@ def plan(
     if not 0 < near < far < np.inf:
         raise ParameterError(f'room is {room!r}; two distances above 0, m, are needed, the nearer '
                              'first')
-    check_above(count, 0, 'count')
+    count = check_count(count, MAX_VIEWS, 'count')
     check_above(noise_px, 0, 'noise_px', ' px')
     return choose(load_lens(lens), parse_pattern(board).points, ViewLimits(near, far), count,
                   number, noise_px)

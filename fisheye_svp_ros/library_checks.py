@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
 
+from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.pose import Pose
 
@@ -40,7 +41,46 @@ def check_list(values: Any, name: str) -> list[Any]:
     """Return a list of values, those of NumPy as Python's; raise ParameterError for one value."""
     if isinstance(values, str) or not isinstance(values, Iterable):
         raise ParameterError(f'{name} is {values!r}; a list of values is needed')
-    return [value.item() if isinstance(value, np.generic) else value for value in values]
+    return [python_value(value) for value in values]
+
+
+def python_value(value: Any) -> Any:
+    """Return a value, numbers of NumPy as Python's and arrays as flat lists of them."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.ravel().tolist() if value.ndim else value.item()
+    return [python_value(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def check_parameters(values: Any, name: str) -> dict[str, Any]:
+    """Return parameters by name, those of NumPy as Python's; raise ParameterError for others."""
+    given: Mapping[str, Any] = check_type(values, Mapping, name, 'a mapping of parameters')
+    return {parameter: python_value(value) for parameter, value in given.items()}
+
+
+def check_numbers(values: Any, name: str, needed: str) -> Array:
+    """Return an array of numbers; raise ParameterError, naming what is needed, for others."""
+    try:
+        if np.asarray(values).dtype.kind not in 'USc':
+            return np.asarray(values, dtype=float)
+    except (TypeError, ValueError):
+        pass
+    raise ParameterError(f'{name} is no array of numbers; {needed} is needed')
+
+
+def check_whole_numbers(values: Any, name: str) -> Index:
+    """Return an array of whole numbers; raise ParameterError for others."""
+    numbers = check_numbers(values, name, '(N,)')
+    if ((numbers != np.rint(numbers)) | (np.abs(numbers) >= 2.0**63)).any():
+        raise ParameterError(f'{name} must be whole numbers')
+    # Not by way of the others: frames may be stamps, ns, which they round.
+    return np.asarray(values).astype(np.int64)
+
+
+def check_count(count: Any, most: int, name: str) -> int:
+    """Return a whole number from 1 to `most`; raise ParameterError for anything else."""
+    if not isinstance(count, int | np.integer) or not 1 <= count <= most:
+        raise ParameterError(f'{name} is {count!r}; a whole number from 1 to {most} is needed')
+    return int(count)
 
 
 def check_pair(values: Any, name: str, needed: str) -> tuple[float, float]:

@@ -39,7 +39,9 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
     (lambda: fsvp.plan(LENS, BOARD, 0.3), 'room is 0.3; (nearest, furthest) in m is needed'),
     (lambda: fsvp.plan(LENS, BOARD, (0.3, 0.1)), 'room is (0.3, 0.1); two distances above 0, m'),
     (lambda: fsvp.plan(LENS, BOARD, (-1, 0.1)), 'room is (-1, 0.1); two distances above 0'),
-    (lambda: fsvp.plan(LENS, BOARD, ROOM, count=0), 'count is 0; a number above 0 is needed'),
+    (lambda: fsvp.plan(LENS, BOARD, ROOM, count=0), 'count is 0; a whole number from 1 to 100'),
+    (lambda: fsvp.plan(LENS, BOARD, ROOM, count=2.5), 'count is 2.5; a whole number from 1 to'),
+    (lambda: fsvp.plan(LENS, BOARD, ROOM, count=101), 'count is 101; a whole number from 1 to'),
     (lambda: fsvp.plan(LENS, BOARD, ROOM, noise_px=-1), 'noise_px is -1; a number above 0 px is'),
     (lambda: fsvp.render(LENS, BOARD, None), 'pose is of type NoneType; a Pose is needed'),
     (lambda: fsvp.render(LENS, BOARD, poses(4)), 'pose holds 4 poses; one is needed'),
@@ -53,8 +55,8 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
     (lambda: SIDE.remap([[1]]), 'the image is list; an array (H, W) or'),
     (lambda: SIDE.remap(IMAGE.astype(np.int64)), 'the image is int64 (400, 424); an array (H, W'),
     (lambda: SIDE.remap(IMAGE > 0), 'the image is bool (400, 424); an array (H, W)'),
-    (lambda: fsvp.project(LENS, 'abc'), 'points are no numbers; (..., 3) is needed'),
-    (lambda: fsvp.back_project(LENS, [[1, 2], [3]]), 'uv are no numbers; (..., 2) is needed'),
+    (lambda: fsvp.project(LENS, 'abc'), 'points is no array of numbers; (..., 3) is needed'),
+    (lambda: fsvp.back_project(LENS, [[1, 2], [3]]), 'uv is no array of numbers; (..., 2) is'),
     (lambda: fsvp.read_observations(None), 'a NoneType is no path; the name of a file is needed'),
     (lambda: fsvp.read_poses(None), 'a NoneType is no path; the name of a file is needed'),
     (lambda: fsvp.load_rig(None), 'a NoneType is no path; the name of a file is needed'),
@@ -75,6 +77,22 @@ SIDE, IMAGE = fsvp.undistort_maps(LENS), np.zeros((400, 424), np.uint8)
     (lambda: fsvp.calibrate_rig(TABLE, [LENS, LENS]), 'lenses is of type list; a mapping of cam'),
     (lambda: fsvp.observations([1.0], [np.nan], [0], BOARD), 'u and v must be finite; leave out'),
     (lambda: fsvp.observations([1.0], [2.0], [0.5], BOARD), 'landmark must be whole numbers'),
+    (lambda: fsvp.observations([1.0], [2.0], [np.nan], BOARD), 'landmark must be whole numbers'),
+    (lambda: fsvp.observations([1.0], [2.0], [1e30], BOARD), 'landmark must be whole numbers'),
+    (lambda: fsvp.observations('a', [2.0], [0], BOARD), 'u is no array of numbers; (N,) is'),
+    (lambda: fsvp.observations([1.0], ['2'], [0], BOARD), 'v is no array of numbers; (N,) is'),
+    (lambda: fsvp.observations([1.0], [2.0], ['a'], BOARD), 'landmark is no array of num'),
+    (lambda: fsvp.observations([[1.0], [2]], [2.0, 3], [0, 1], BOARD), 'must have one length'),
+    (lambda: fsvp.observations(*np.ones((2, 10)), np.arange(10), BOARD, frame=np.arange(3)),
+     'frame has the shape (3,); one number, or one for each of the 10 points'),
+    (lambda: fsvp.observations(*np.ones((2, 10)), np.arange(10) - 1, BOARD),
+     'landmarks are 0 to 29; there is -1'),
+    (lambda: fsvp.observations([1.0], [2.0], [0], [[0, 0, 0], [1, 0]]), 'board is no array of nu'),
+    (lambda: fsvp.observations([1.0], [2.0], [0], [['a', 'b', 'c']]), 'board is no array of nu'),
+    (lambda: fsvp.observations([1.0], [2.0], [0], [[0, np.nan, 0]]), 'board has places that are'),
+    (lambda: fsvp.sweep(None), 'over is of type NoneType; a mapping of lists is needed'),
+    (lambda: fsvp.sweep({'radius': [1.0]}, localizer=3), 'localizer is of type int; a mapping of'),
+    (lambda: fsvp.simulate_scenario(rate=-3), 'rate is -3.0; allowed is 0.001 to 10000'),
     (lambda: fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD), 'a landmark is twice in a fr'),
 ])
 def test_what_is_wrong_is_named(call: Callable[[], Any], said: str) -> None:
@@ -94,3 +112,18 @@ def test_what_is_near_is_taken(tmp_path: Path) -> None:
     assert len(fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD, frame=[0, 1])) == 2
     assert fsvp.undistort_maps(LENS, size=np.array([40, 30])).maps.u.shape == (30, 40)
     assert len(fsvp.sweep({'radius': np.array([0.5, 1.0])}).table()['radius']) == 2
+    stamps = 10**18 + np.arange(2)
+    assert (fsvp.observations([1.0, 2], [2.0, 3], [0, 0], BOARD, frame=stamps).frame
+            == stamps).all()
+    seen = fsvp.simulate_scenario(radius=np.float32(0.5), seed=np.int64(2), poses=np.array(
+        [[0, 0, 0, 1, 0, 0, 0], [0, 0, 0.1, 1, 0, 0, 0]]))
+    assert seen.pose.position.tolist() == [[0, 0, 0], [0, 0, 0.1]]
+    assert fsvp.sweep({'seed': [1]}, localizer={'sigma_px': np.float64(2)}).table()['seed'] == [1]
+
+
+@pytest.mark.parametrize('lens', ['fish214', LENS])
+def test_points_however_far_have_the_image_of_their_direction(lens: Any) -> None:
+    away = np.array([1.0, 0.2, 1.0])
+    image = fsvp.project(lens, away * [[1e9], [1e155], [1e300]])
+    np.testing.assert_allclose(image.uv[1:], image.uv[[0, 0]], atol=1e-6)
+    assert not fsvp.project(lens, [[np.nan, 1e200, 1]]).valid.any()

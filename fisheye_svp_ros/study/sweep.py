@@ -64,6 +64,7 @@ def plan_sweep(parameters: Mapping[str, Mapping[str, Any]]) -> Plan:
     base, sweep = with_values(Scenario(), camera), sweep_of(Scenario, camera, ('rig_file',))
     if not sweep.lists:
         raise ParameterError('no parameter is swept; add a list such as sweep.radius: [2.0, 0.5]')
+    with_values(TABLES[CAMERA](), camera)  # what the node would refuse
     names = solvers_of(base, sweep)
     tables = {
         name: with_values(SOLVERS[name].settings(), parameters.get(name, {})) for name in names}

@@ -213,6 +213,7 @@ BAD = {
     'sweep.environment: [nowhere]': "environment 'nowhere' is unknown",
     'radius: 2.0': 'no parameter is swept',
     'sweep.seed: [1], radios: 3': 'radios is not a parameter of synthetic_camera',
+    'sweep.seed: [1], rate: -3': 'rate is -3.0; allowed is',
     'sweep.seed: [1], poses: [1.0, 2.0]': 'seven a pose are needed',
     'sweep.seed: [1], poses: 3.0': 'poses is 3.0; a list is needed',
     'sweep.seed: [1], noise_px: much': "noise_px is 'much'; float is needed",
