@@ -10,9 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.detect.finders import DETECTORS
-from fisheye_svp_ros.detect.patterns import parse_pattern
+from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.io.detect_files import Sizes, photographs_beside
 from fisheye_svp_ros.io.readers import read_observations
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 _MAX_LISTED = 12
 _UNCERTAIN = 0.9
 _MIN_LARGER_SHARE = 0.2  # of all boards: a wrong count shows where the next squares are visible
+_MIN_BEYOND_SHARE = 0.05  # of all tags: another board in the background has few
 _TIME = re.compile(r'([\d.]+) *(s|ms|us|ns)')
 _UNITS = {'s': 1.0, 'ms': 1e-3, 'us': 1e-6, 'ns': 1e-9}
 
@@ -133,10 +136,20 @@ def search(paths: Sequence[str], args: argparse.Namespace) -> Detection:
     if larger and larger >= _MIN_LARGER_SHARE * found:
         say(f'{larger} of {found} boards look larger than {args.board}; count its inner corners '
             'again, otherwise photographs may number different corners alike')
+    _note_tags(detection, pattern)
     if 2 * found < len(detection.searched):
         counted = ' (inner corners)' if pattern.kind == 'chessboard' else ''
         say(f'no {args.board} in most photographs; check kind and size{counted} of the board')
     return detection
+
+
+def _note_tags(detection: Detection, pattern: Pattern) -> None:
+    """Say where many tags have numbers that the board, as it was described, does not have."""
+    seen, beyond = np.sum([one.tags for one in detection.searched], axis=0).tolist()
+    if beyond > _MIN_BEYOND_SHARE * seen:
+        words = 'tagCols and tagRows' if pattern.kind == 'aprilgrid' else 'its columns and rows'
+        say(f'{beyond} of {seen} tags have ids beyond the {pattern.columns}x{pattern.rows} board; '
+            f'check {words}')
 
 
 def _note_alone(detection: Detection) -> None:

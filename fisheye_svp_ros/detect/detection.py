@@ -15,12 +15,18 @@ import numpy as np
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.detect.effort import Effort, Look
 from fisheye_svp_ros.detect.extent import goes_on
-from fisheye_svp_ros.detect.finders import FIRST_LOOKS, default_detector, invert_image
+from fisheye_svp_ros.detect.finders import FIRST_LOOKS, count_tags, default_detector, invert_image
 from fisheye_svp_ros.detect.order import Agreement, agree, board_residuals, of_rig, turn_field
 from fisheye_svp_ros.detect.pairing import Pairing, pair_photographs, stamp_of
 from fisheye_svp_ros.detect.patterns import Pattern, Turn, check_of_board
 from fisheye_svp_ros.detect.photographs import Photograph, Pixels, caught_stderr, exif_turned
-from fisheye_svp_ros.detect.points import SATURATED_SHARE, Points, find_points, full_scale_share
+from fisheye_svp_ros.detect.points import (
+    SATURATED_SHARE,
+    Points,
+    eight_bit,
+    find_points,
+    full_scale_share,
+)
 from fisheye_svp_ros.detect.workers import TimedOut, bounded_map
 from fisheye_svp_ros.errors import FisheyeSvpError, ObservationError
 from fisheye_svp_ros.io.files import read_bytes
@@ -43,7 +49,8 @@ class SearchedPhotograph:
     """One photograph after the search; points: None where there is no board, `reason` says why.
 
     notes: what is odd about it; bright: share of the board's pixels at the end of the scale;
-    inverted: what is dark in print is bright.
+    inverted: what is dark in print is bright; tags: how many there are, and how many of them the
+    board does not have.
     """
 
     name: str
@@ -57,6 +64,7 @@ class SearchedPhotograph:
     bright: float = 0.0
     digest: str = ''
     inverted: bool = False
+    tags: tuple[int, int] = (0, 0)
 
 
 class Detection(NamedTuple):
@@ -174,16 +182,17 @@ def examine(task: _Task) -> SearchedPhotograph:
         if any(line.startswith('Corrupt JPEG') for line in said):
             notes = (*notes, _DAMAGE_NOTE)
         points, inverted = _look(pixels, task)
+        tags = count_tags(eight_bit(pixels), pattern)
     except (FisheyeSvpError, cv2.error, MemoryError) as cause:
         text = str(cause).removeprefix(f'{photograph.name}: ')
         return replace(blank, reason=text.splitlines()[0] if text else 'not enough memory')
-    size = (int(pixels.shape[1]), int(pixels.shape[0]))
+    blank = replace(blank, size=(int(pixels.shape[1]), int(pixels.shape[0])), tags=tags)
     if isinstance(points, str):
-        return replace(blank, size=size, reason=points, notes=notes)
+        return replace(blank, reason=points, notes=notes)
     if pattern.kind == 'chessboard' and goes_on(pixels, points, pattern):
         notes = (*notes, LARGER_BOARD)
     digest = hashlib.sha1(pixels.tobytes()).hexdigest()
-    return replace(blank, size=size, points=points, notes=notes, digest=digest, inverted=inverted,
+    return replace(blank, points=points, notes=notes, digest=digest, inverted=inverted,
                    bright=full_scale_share(pixels, points.uv))
 
 

@@ -132,7 +132,8 @@ def charuco(image: Grey, pattern: Pattern) -> Found | None:
 
 def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
     """Kalibr's AprilGrid: tags 36h11 with a border of two cells, by cv2.aruco."""
-    known = _tags(image, pattern, 2)
+    known = {tag: corners for tag, corners in _tags(image, pattern, 2).items()
+             if tag < pattern.tag_count}
     if not known:
         return None
     index = np.concatenate([4 * tag + np.arange(4) for tag in known])
@@ -143,14 +144,18 @@ def aprilgrid(image: Grey, pattern: Pattern) -> Found | None:
 
 def explain_failure(image: Grey, pattern: Pattern) -> str:
     """Return why a board was not found, as far as the image tells."""
-    if pattern.kind == 'aprilgrid' and _tags(image, pattern, 1):
+    if pattern.kind == 'aprilgrid' and any(
+            tag < pattern.tag_count for tag in _tags(image, pattern, 1)):
         return ('no board found: its tags have a border of one cell; print the target of Kalibr, '
                 'whose border is two cells')
     return 'no board found'
 
 
 def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
-    """Return the corners of a pattern's tags by number; border: cells around their code."""
+    """Return the corners of tags by number, of any of the dictionary of a pattern.
+
+    border: cells around their code.
+    """
     dictionary, modern = dictionary_of(pattern), hasattr(_ARUCO, 'ArucoDetector')
     parameters = (_ARUCO.DetectorParameters if modern else _ARUCO.DetectorParameters_create)()
     parameters.markerBorderBits = border
@@ -159,8 +164,15 @@ def _tags(image: Grey, pattern: Pattern, border: int) -> dict[int, Array]:
     else:
         tags, ids, _ = _ARUCO.detectMarkers(image, dictionary, parameters=parameters)
     return {} if ids is None else {
-        int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)
-        if tag < pattern.columns * pattern.rows}
+        int(tag): corners for tag, corners in zip(ids.ravel(), tags, strict=True)}
+
+
+def count_tags(image: Grey, pattern: Pattern) -> tuple[int, int]:
+    """Return how many tags are in an image, and how many of them a pattern does not have."""
+    if not pattern.tag_count:
+        return 0, 0
+    found = _tags(image, pattern, 2 if pattern.kind == 'aprilgrid' else 1)
+    return len(found), sum(tag >= pattern.tag_count for tag in found)
 
 
 # Which patterns a detector is for, and its finder

@@ -62,6 +62,12 @@ class Pattern:
     marker: float = 0.0
     dictionary: str = ''
 
+    @property
+    def tag_count(self) -> int:
+        """How many tags it has."""
+        return {'aprilgrid': self.columns * self.rows,
+                'charuco': self.columns * self.rows // 2}.get(self.kind, 0)
+
     @cached_property
     def turns(self) -> tuple[Turn, ...]:
         """The quarter turns that put every point on a point; the first is none."""

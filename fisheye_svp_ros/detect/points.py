@@ -74,7 +74,7 @@ def find_points(
 def _search(
     pixels: Pixels, pattern: Pattern, detector: str, near: Array | None, finder: Finder
 ) -> Points | str:
-    grey = _eight_bit(pixels)
+    grey = eight_bit(pixels)
     found = _search_near(grey, pattern, finder, near) if near is not None else None
     found = found or finder(grey, pattern)
     if found is None:
@@ -300,7 +300,8 @@ def _order_points(index: Index, corners: Corners, pattern: Pattern, reach: Array
     return Points(index[ok], corners.uv[ok], corners.sigma[ok], blur, reach[ok])
 
 
-def _eight_bit(pixels: Pixels) -> Grey:
+def eight_bit(pixels: Pixels) -> Grey:
+    """Return a grey image in 8 bits."""
     if pixels.dtype == np.uint8:
         return pixels
     top = max(float(np.percentile(pixels[::4, ::4], 99.8)), 1.0)

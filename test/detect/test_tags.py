@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -10,6 +11,7 @@ import pytest
 from helpers.patterns import pattern_photograph
 
 from benchmark.detectors import TARGET
+from fisheye_svp_ros import cli
 from fisheye_svp_ros.detect.patterns import Pattern, parse_pattern
 from fisheye_svp_ros.detect.points import find_points
 from fisheye_svp_ros.simulate.render import Exposure
@@ -73,6 +75,20 @@ def test_what_is_hidden_is_not_reached(aprilgrid: Pattern) -> None:
     away = np.linalg.norm(true - middle, axis=1) > 48
     assert set(np.flatnonzero(away)) - set(found.ids) == set()
     assert np.abs(found.uv - true[found.ids]).max() < 0.2
+
+
+@pytest.mark.parametrize(('columns', 'said'), [
+    (6, ''), (5, r'\d+ of \d+ tags have ids beyond the 5x5 board; check tagCols and tagRows')])
+def test_tags_beyond_the_board_are_told(
+    aprilgrid: Pattern, tmp_path: Path, capsys: pytest.CaptureFixture[str], columns: int,
+    said: str,
+) -> None:
+    for number in (1, 2):
+        cv2.imwrite(str(tmp_path / f'{number}.png'), pattern_photograph(aprilgrid, number)[0])
+    (tmp_path / 'target.yaml').write_text(TARGET.replace('Cols: 6', f'Cols: {columns}'))
+    assert cli.main(['detect', str(tmp_path), '--board', f'aprilgrid:{tmp_path}/target.yaml']) == 0
+    told = capsys.readouterr().err
+    assert re.search(said, told) and ('beyond the' in told) == bool(said)
 
 
 @pytest.mark.slow
