@@ -51,7 +51,7 @@ def observations(
     if frames.shape not in ((), (1,), number.shape):
         raise ParameterError(f'frame has the shape {frames.shape}; one number, or one for each of '
                              f'the {len(number)} points, is needed')
-    frames = np.broadcast_to(frames, number.shape)
+    frames = np.broadcast_to(frames, number.shape).copy()
     if not np.isfinite(image).all():
         raise ParameterError('u and v must be finite; leave out what was not seen')
     if not np.isfinite(places).all():
