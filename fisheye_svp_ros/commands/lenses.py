@@ -15,8 +15,8 @@ from fisheye_svp_ros.io.share import is_there, lens_path, without_camera
 from fisheye_svp_ros.optics.lens import Lens
 
 LARGE_DEVIATION = 0.5  # px, of a lens from what another tool's file says
-_FAR_SHIFT = 0.1  # m, of the viewpoint at the edge of the field: no lens has so much
-_NARROW = 5.0  # deg, of max_incidence_deg: no fisheye sees so little
+_MAX_SHIFT = 0.1  # m, of the viewpoint at the edge of the field: no lens has so much
+_MIN_FIELD_DEG = 5.0  # deg, of max_incidence_deg: no fisheye sees so little
 
 
 def add_lens_argument(parser: argparse.ArgumentParser, purpose: str = '') -> None:
@@ -45,10 +45,10 @@ def note_odd(lens: Lens, path: str | Path, worst: float) -> None:
     edge, limit = np.array([lens.max_incidence]), np.degrees(lens.max_incidence)
     if lens.viewpoint_shift is not None:
         shift = float(lens.viewpoint_shift.value_and_slope(edge, np.tan(edge / 2))[0][0])
-        if abs(shift) > _FAR_SHIFT:
+        if abs(shift) > _MAX_SHIFT:
             say(f'{path}: the viewpoint shift is {shift:.2g} m at {limit:.3g} deg; its '
                 'coefficients are in m')
-    if limit < _NARROW:
+    if limit < _MIN_FIELD_DEG:
         say(f'{path}: max_incidence_deg is {limit:.3g}; it is in degrees')
     if worst > LARGE_DEVIATION:
         say(f'{path}: the nearest lens is {worst:.2g} px off the model of this file; calibrate '
