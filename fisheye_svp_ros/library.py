@@ -260,7 +260,8 @@ def sweep(over: Mapping[str, Sequence[Any]], **nodes: Mapping[str, Any]) -> Swep
     for node, values in parameters.items():
         _check_names(node, values)
     plan = sweeps.plan_sweep(parameters)
-    sweeps.check_solvers(plan, nodes)
+    if idle := sweeps.idle_solvers(plan, nodes):
+        raise ParameterError(f'{idle[0]}; choose that, or leave it out')
     return Swept(sweeps.sweep_rows(plan, range(len(plan.sweep))))
 
 

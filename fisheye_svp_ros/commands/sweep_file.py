@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from fisheye_svp_ros.commands.notes import say
 from fisheye_svp_ros.errors import FisheyeSvpError, ParameterError
 from fisheye_svp_ros.io.parameter_files import parameters_of, read_parameter_file
 from fisheye_svp_ros.io.parameters import SWEEP, rows
-from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, check_solvers, plan_sweep
+from fisheye_svp_ros.study.sweep import CAMERA, TABLES, Plan, idle_solvers, plan_sweep
 
 
 def read_sweep(path: Path) -> Plan:
@@ -24,7 +25,8 @@ def read_sweep(path: Path) -> Plan:
             _check_names(pattern, values)
         plan = plan_sweep({node: parameters_of(f'/{node}', given) for node in TABLES})
         # A pattern such as /** means those that there are; a name means that node.
-        check_solvers(plan, [node for node in TABLES if f'/{node}' in given])
+        for sentence in idle_solvers(plan, [node for node in TABLES if f'/{node}' in given]):
+            say(f'{path}: {sentence}')
         return plan
     except FisheyeSvpError as error:
         text = ' '.join(str(error).split())

@@ -89,14 +89,13 @@ def solvers_of(base: Scenario, sweep: Sweep) -> tuple[str, ...]:
     return _MONO_SOLVERS if mono.pop() else ('stereo_calibrator', 'stereo_depth')
 
 
-def check_solvers(plan: Plan, nodes: Iterable[str]) -> None:
-    """Raise ParameterError for a node that is asked for and has nothing to solve in a sweep."""
-    for node in nodes:
-        if node not in (CAMERA, *plan.solvers):
-            *others, last = STYLES
-            needed = MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
-            raise ParameterError(f'{node} solves nothing in this sweep: it needs style {needed}; '
-                                 f'choose that, or leave {node} out')
+def idle_solvers(plan: Plan, nodes: Iterable[str]) -> list[str]:
+    """Return a sentence for each node that has nothing to solve in a sweep."""
+    *others, last = STYLES
+    needed = {node: MONO if node in _MONO_SOLVERS else f'{", ".join(others)} or {last}'
+              for node in nodes if node not in (CAMERA, *plan.solvers)}
+    return [f'{node} solves nothing in this sweep: it needs style {style}'
+            for node, style in needed.items()]
 
 
 def column_types(plan: Plan) -> dict[str, type]:
