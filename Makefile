@@ -4,9 +4,11 @@ ifndef PYTHON
 PYTHON := $(firstword $(foreach python,python3 python3.14 python3.13 python3.12 python3.11,\
 	$(shell $(python) -c 'import sys; (3, 11) <= sys.version_info < (3, 15) and print("$(python)")' 2>&-)) python3)
 endif
-# ROS 2 out of pip, but not beside one that is sourced.
+# ROS 2 out of pip, but not beside one that is sourced. One of an activated environment does not
+# count: $(VENV) does not see it.
 COMMA := ,
-ROS := $(if $(shell $(PYTHON) -c 'import rclpy.node; print("sourced")' 2>&-),,$(COMMA)ros)
+ROS := $(if $(shell $(PYTHON) -c 'import sys, rclpy.node; \
+	rclpy.__file__.startswith(sys.prefix) or print("sourced")' 2>&-),,$(COMMA)ros)
 VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= out

@@ -135,3 +135,9 @@ def test_make_installs_no_ros_beside_one_that_is_sourced(
     assert ',ros]' in installation('python3')  # it cannot be imported: of another Python
     (sourced / 'rclpy' / 'node.py').write_text('')
     assert ',ros]' not in installation('python3') and 'lint' in installation('python3')
+
+
+def test_make_installs_ros_although_an_activated_environment_has_it(installation: Any) -> None:
+    """The new environment does not see that one: every test of a node was skipped."""
+    pytest.importorskip('rclpy.node')
+    assert ',ros]' in installation('python3')
