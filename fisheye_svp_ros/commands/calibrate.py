@@ -14,7 +14,7 @@ import numpy as np
 from fisheye_svp_ros.commands.calibrate_rig import check_names, fit_rig, print_rig, write_rig
 from fisheye_svp_ros.commands.lenses import load_with_notes
 from fisheye_svp_ros.commands.notes import note_gross_errors, note_huge, say
-from fisheye_svp_ros.commands.outputs import output_path
+from fisheye_svp_ros.commands.outputs import output_file, output_path
 from fisheye_svp_ros.commands.photographs import (
     add_observation_arguments,
     image_sizes,
@@ -22,7 +22,7 @@ from fisheye_svp_ros.commands.photographs import (
     search_options,
 )
 from fisheye_svp_ros.commands.ports import add_port_arguments, port_of
-from fisheye_svp_ros.errors import GeometryError, OutputError, ParameterError
+from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.io.detect_files import (
     Sizes,
     check_size_given,
@@ -143,8 +143,8 @@ def _known_sizes(args: argparse.Namespace, observations: Observations, sizes: Si
 
 def _check_output(args: argparse.Namespace, table: Observations) -> None:
     """Raise FisheyeSvpError where the lens of a camera, or those of several, cannot be written."""
-    if not table.cameras[0] and args.output.is_dir():
-        raise OutputError(f'-o {args.output}: it is a folder; name a file')
+    if not table.cameras[0]:
+        output_file(str(args.output))
     if len(table.cameras) == 1:
         return
     if args.output.suffix in ('.yaml', '.yml'):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from fisheye_svp_ros.commands.notes import say
+from fisheye_svp_ros.commands.notes import counted, say
 from fisheye_svp_ros.errors import FisheyeSvpError
 from fisheye_svp_ros.io.files import write_json, write_text
 from fisheye_svp_ros.io.lens_formats import kalibr, transforms
@@ -78,7 +78,7 @@ def _warnings(
             one = shared == 1
             what = (f'relate{"s" if one else ""} {name} to the others'
                     if len(found.cameras) > 2 else 'is shared' if one else 'are shared')
-            yield (f'only {shared} frame{"" if one else "s"} {what}, and it is assumed that all '
+            yield (f'only {counted(shared, "frame")} {what}, and it is assumed that all '
                    'cameras saw one target; take more photographs of it with two cameras at once')
             if len(found.cameras) == 2:
                 return

@@ -27,6 +27,11 @@ def say(note: str) -> None:
     print(f'fisheye-svp: note: {note}', file=sys.stderr)
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number of things, one of them in the singular."""
+    return f'{count} {noun}' if count == 1 else f'{count} {noun}s'
+
+
 def note_formats() -> None:
     """Say it where tables come in one form only, once a day."""
     from fisheye_svp_ros.io.columns import arrow

@@ -55,15 +55,16 @@ def check_output(args: argparse.Namespace) -> None:
 
 def _files_to_keep(given: str, path: Path, output: Path, name: str) -> Iterator[Path]:
     """Yield the files and folders that an output must not be, for one of the inputs."""
+    if output.is_file() or given in _PHOTOGRAPHS:
+        yield path
+    if given not in _PHOTOGRAPHS:
+        return
     from fisheye_svp_ros.detect.photographs import IMAGES, photograph_folders
 
     if output.is_file():
-        yield path
-        if given in _PHOTOGRAPHS and path.is_dir() and output.suffix.lower() in IMAGES:
-            for folder in photograph_folders(path):
-                yield folder / output.name
-    elif given in _PHOTOGRAPHS:
-        yield path
+        if path.is_dir() and output.suffix.lower() in IMAGES:
+            yield from (folder / output.name for folder in photograph_folders(path))
+    else:
         # `undistort` and overlays write PNG files under the names of the photographs.
         if path.is_dir():
             yield from photograph_folders(path)

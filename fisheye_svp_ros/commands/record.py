@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> None:
 
 def _sweep(name: str, bag: Path) -> None:
     from fisheye_svp_ros.commands.lock_step import record_sweep
-    from fisheye_svp_ros.commands.notes import say
+    from fisheye_svp_ros.commands.notes import counted, say
     from fisheye_svp_ros.commands.ros import prepare_ros
     from fisheye_svp_ros.commands.sweep_file import read_sweep
     from fisheye_svp_ros.errors import BagError
@@ -58,8 +58,7 @@ def _sweep(name: str, bag: Path) -> None:
     with progress('sweeping', len(plan.sweep)) as advance:
         record_sweep(path, plan, bag, logs, advance)
     count = sum(1 for _ in Bag(bag).records(lambda topic, _: topic == '/scenario'))
-    of = len(plan.sweep)
-    say(f'{count} sets of {of} scenario{"s"[:of - 1]} are in {bag}')
+    say(f'{count} sets of {counted(len(plan.sweep), "scenario")} are in {bag}')
 
 
 def _record(args: argparse.Namespace) -> None:

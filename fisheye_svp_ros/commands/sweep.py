@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 
 from fisheye_svp_ros.commands.executors import dask, process_pool
-from fisheye_svp_ros.commands.notes import note_formats, say
+from fisheye_svp_ros.commands.notes import counted, note_formats, say
 from fisheye_svp_ros.commands.outputs import output_folder
 from fisheye_svp_ros.commands.sweep_file import read_sweep
 from fisheye_svp_ros.errors import OutputError, ParameterError
@@ -119,7 +119,7 @@ def _report(path: Path, folder: Path, plan: Plan, mine: str) -> None:
     found = {name: summarise(as_numbers(table[name])) for name in metrics}
     count = len(plan.sweep)
     print_table(
-        f'{path}: {count} scenario{"s"[:count - 1]}',
+        f'{path}: {counted(count, "scenario")}',
         ('metric', 'sets', 'not solved', 'median', 'mean', 'largest'),
         [(name, str(s.solved), str(s.missing), *(f'{v:.6g}' for v in s[2:]))
          for name, s in found.items()],

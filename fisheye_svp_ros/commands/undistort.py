@@ -25,7 +25,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.files import write_bytes, write_json, write_text, write_together
 from fisheye_svp_ros.io.lens_formats.ros import camera_info_text
 from fisheye_svp_ros.io.map_files import save_maps
-from fisheye_svp_ros.io.rig_files import load_pair, rigs_of_lenses
+from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
@@ -154,8 +154,7 @@ def _rig(args: argparse.Namespace, lenses: dict[str, Lens]) -> Pose | None:
         return load_pair(args.rig, list(lenses))
     if args.lens or len(lenses) != 2:
         return None
-    path = lens_path(args.inputs[0])
-    return load_pair(path, list(lenses)) if rigs_of_lenses(path) else None
+    return pair_of_lenses(lens_path(args.inputs[0]), list(lenses))
 
 
 def _note_unrectified(cameras: Sequence[str]) -> None:

@@ -98,12 +98,12 @@ def conclude(
         bool(evaluation.averaged_model.shifts),
         (gain.value, gain.low), file, rays.offset if evaluation.free else None,
         [c.effect for c in causes if c.effect in _INTRINSIC], find_bounds(evaluation.null),
-        evaluation.noise_px, evaluation.falling, evaluation.null.linear.data.frames))
+        evaluation.noise_px, evaluation.falling, evaluation.frames))
     scatter = np.hypot.reduce([part.sd_px for part in components
                                if part.stage == 'frame' and not part.named_share]
                               + [evaluation.noise_px])
     photographs = decide_photographs(PhotographsFacts(
-        evaluation.null.linear.data.frames, frames_of(advice, RETAKE), frames_of(advice, UNLIKE),
+        evaluation.frames, frames_of(advice, RETAKE), frames_of(advice, UNLIKE),
         evaluation.named_quality.heldout_rms_px, 2**0.5 * float(scatter), lens.say))
     target = decide_target(_target_facts(evaluation, causes, components, contradicted))
     return Conclusion({'lens': lens, 'target': target, 'photographs': photographs}, file,
@@ -147,7 +147,7 @@ def _target_facts(
         [cause.effect for cause in mine], _largest_error(evaluation, mine), gain,
         size([part for part in of_target if part.named_share]), size(local),
         float(np.sqrt((far**2).mean())), max((p.p_value for p in local), default=0.0),
-        evaluation.noise_px, contradicted, evaluation.null.linear.data.frames)
+        evaluation.noise_px, contradicted, evaluation.frames)
 
 
 def _largest_error(evaluation: Evaluation, causes: Sequence[Cause]) -> str:

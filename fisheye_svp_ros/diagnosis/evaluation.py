@@ -296,6 +296,11 @@ class Evaluation:
         return FitQuality(
             rms_px(self.null.linear, residuals), self._extended_prediction.rms, chi2)
 
+    @property
+    def frames(self) -> int:
+        """How many frames there are."""
+        return self.null.linear.data.frames
+
     @cached_property
     def gain(self) -> Comparison:
         """Of the best prediction over the simulation."""

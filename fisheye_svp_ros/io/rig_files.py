@@ -10,7 +10,7 @@ from fisheye_svp_ros.io.documents import dump_yaml
 from fisheye_svp_ros.io.files import path_of, read_text, write_text
 from fisheye_svp_ros.io.lens_files import FILES_OF_RIG, MAX_LENS_BYTES, read_lens_file
 from fisheye_svp_ros.io.lens_formats import Foreign, read_foreign
-from fisheye_svp_ros.io.lens_formats.rig import cameras_of, pose_keys
+from fisheye_svp_ros.io.lens_formats.rig import SEPARATOR, cameras_of, pose_keys
 from fisheye_svp_ros.pose import Pose, identity, quaternion_from_rotation
 from fisheye_svp_ros.scene.observations import STEREO
 
@@ -34,9 +34,9 @@ def check_camera_names(cameras: Sequence[str], chain: Sequence[str], where: str)
         raise LensError(f'{where}: camera {taken[0]!r} has the name of a file of the rig, '
                         f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0')
     if len(chain) > 1 and cameras_of(pose_keys(chain)) != tuple(chain):
-        named = ', '.join(name for name in chain if '_in_' in name)
-        raise LensError(f'{where}: camera {named}: with _in_ in its name, rig.yaml does not say '
-                        'which camera is in which; rename it')
+        named = ', '.join(name for name in chain if SEPARATOR in name)
+        raise LensError(f'{where}: camera {named}: with {SEPARATOR} in its name, rig.yaml does not '
+                        'say which camera is in which; rename it')
 
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:
@@ -58,12 +58,8 @@ def load_cameras(path: str | Path) -> tuple[tuple[str, ...], Pose]:
     path: of a rig file, or of a file or folder that holds lenses and rig.
     Raises LensError where there is none.
     """
-    held = _read_rig(path)
-    names = held.cameras or tuple(held.lenses) or STEREO
-    if len(names) != len(held.rigs) + 1:
-        raise LensError(f'{path}: {len(names)} cameras, and {len(held.rigs)} transforms between '
-                        'them; each camera in the next one is needed')
-    return names, cameras_in_first(held.rigs)
+    names, steps = _read_chain(path)
+    return names, cameras_in_first(steps)
 
 
 def load_rig(path: str | Path) -> Pose:
@@ -82,14 +78,20 @@ def load_pair(path: str | Path, cameras: Sequence[str]) -> Pose:
     By name or, of a rig of two that are called otherwise, by order.
     Raises LensError for a rig of more cameras that are called otherwise.
     """
-    names, places = load_cameras(path)
+    names, steps = _read_chain(path)
     if len(names) == 2 and tuple(cameras) != names[::-1]:
-        return load_rig(path)
+        return steps[0]
     if unknown := [name for name in cameras if name not in names]:
         raise LensError(f'{path}: a rig of {", ".join(names)}, without {unknown[0]}; give the '
                         'lenses of two of these, by their names')
+    places = cameras_in_first(steps)
     first, second = (places.take(names.index(name)) for name in cameras)
     return second.inverse().compose(first)
+
+
+def pair_of_lenses(path: str | Path, cameras: Sequence[str]) -> Pose | None:
+    """Return what `load_pair` does, of a file or folder of lenses; None where it holds no rig."""
+    return load_pair(path, cameras) if rigs_of_lenses(path) else None
 
 
 def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
@@ -103,6 +105,15 @@ def rigs_of_lenses(path: str | Path) -> tuple[Pose, ...]:
 def _rig_file(path: str | Path) -> Path:
     given = path_of(path)
     return given / 'rig.yaml' if given.is_dir() else given
+
+
+def _read_chain(path: str | Path) -> tuple[tuple[str, ...], tuple[Pose, ...]]:
+    held = _read_rig(path)
+    names = held.cameras or tuple(held.lenses) or STEREO
+    if len(names) != len(held.rigs) + 1:
+        raise LensError(f'{path}: {len(names)} cameras, and {len(held.rigs)} transforms between '
+                        'them; each camera in the next one is needed')
+    return names, held.rigs
 
 
 def _read_rig(path: str | Path) -> Foreign:

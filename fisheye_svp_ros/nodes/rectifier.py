@@ -18,7 +18,7 @@ from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.io.decoding import read_camera_info
 from fisheye_svp_ros.io.lens_files import cameras_in, load_lens
 from fisheye_svp_ros.io.parameters import parameter
-from fisheye_svp_ros.io.rig_files import load_pair, rigs_of_lenses
+from fisheye_svp_ros.io.rig_files import load_pair, pair_of_lenses
 from fisheye_svp_ros.io.share import lens_path
 from fisheye_svp_ros.nodes import messages
 from fisheye_svp_ros.nodes.base import BaseNode
@@ -154,10 +154,11 @@ class Rectifier(BaseNode):
         if len(names) > 2:
             raise ParameterError(f'lens {settings.lens!r} holds {len(names)} cameras, '
                                  f'{", ".join(names)}; give a file or folder of two')
-        if not path or not rigs_of_lenses(path):
+        rig = pair_of_lenses(path, names) if path else None
+        if rig is None:
             raise ParameterError(f'rig is empty, and lens {settings.lens!r} holds none; name the '
                                  'file of the rig')
-        return load_pair(path, names)
+        return rig
 
     def _rectifications(
         self, settings: RectifierSettings, rig: Pose | None, lenses: tuple[Lens, ...]

@@ -14,8 +14,8 @@ VERDICTS = {
 }
 TARGET = {
     'keep': 'Keep the target',
-    'correct': f'Correct it by {LENS_FILE} (valid for this target only), or ',
-    'measure_again': 'Measure the target, or ',
+    'correct': f'Correct it by {LENS_FILE} (valid for this target only)',
+    'measure_again': 'Measure the target',
 }
 PHOTOGRAPHS = {
     'enough': 'Enough', 'more': 'Take more', 'retake': 'Take some again',
@@ -51,7 +51,7 @@ def target_words(d: Diagnosis) -> str:
     say = d.decision['target'].say
     words = TARGET['measure_again' if say == 'correct' and not d.offers_extended else say]
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
-    return words if say == 'keep' else f'{words}{"flatten or " if bent else ""}replace it'
+    return words if say == 'keep' else f'{words}, or {"flatten or " if bent else ""}replace it'
 
 
 def largest_cause(d: Diagnosis) -> str:

@@ -11,13 +11,13 @@ from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.io.documents import parse_yaml
 from fisheye_svp_ros.io.lens_formats import Foreign, fields
 
-_SEPARATOR = '_in_'
+SEPARATOR = '_in_'
 _POSE_KEY = re.compile(r'^\w+_in_\w+ *:', re.MULTILINE)
 
 
 def recognises(text: str) -> bool:
     """Say whether a text is such a file."""
-    if _SEPARATOR not in text:
+    if SEPARATOR not in text:
         return False
     try:
         document = parse_yaml(text, '', LensError)
@@ -42,7 +42,7 @@ def read(text: str, where: str) -> Foreign:
 
 def pose_keys(cameras: Sequence[str]) -> list[str]:
     """Return the key of each camera in the next one."""
-    return [f'{one}{_SEPARATOR}{other}' for one, other in pairwise(cameras)]
+    return [f'{one}{SEPARATOR}{other}' for one, other in pairwise(cameras)]
 
 
 def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
@@ -51,12 +51,12 @@ def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
     A camera may have `_in_` in its name: the first division with which all keys agree counts.
     """
     first, *others = keys
-    for place in (match.start() for match in re.finditer(f'(?={_SEPARATOR})', first)):
-        cameras = [first[:place], first[place + len(_SEPARATOR):]]
+    for place in (match.start() for match in re.finditer(f'(?={SEPARATOR})', first)):
+        cameras = [first[:place], first[place + len(SEPARATOR):]]
         for key in others:
-            if not key.startswith(cameras[-1] + _SEPARATOR):
+            if not key.startswith(cameras[-1] + SEPARATOR):
                 break
-            cameras.append(key.removeprefix(cameras[-1] + _SEPARATOR))
+            cameras.append(key.removeprefix(cameras[-1] + SEPARATOR))
         else:
             return tuple(cameras)
     return ()
@@ -65,4 +65,4 @@ def cameras_of(keys: Sequence[str]) -> tuple[str, ...]:
 def _steps(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
     """Return the entries that hold a pose."""
     return {str(name): entry for name, entry in document.items()
-            if _SEPARATOR in str(name) and isinstance(entry, dict) and 'position' in entry}
+            if SEPARATOR in str(name) and isinstance(entry, dict) and 'position' in entry}
