@@ -35,8 +35,8 @@ def check_camera_names(cameras: Sequence[str], chain: Sequence[str], where: str)
                         f'{taken[0]}.yaml; rename the camera, for example {taken[0]}0')
     if len(chain) > 1 and cameras_of(pose_keys(chain)) != tuple(chain):
         named = ', '.join(name for name in chain if SEPARATOR in name)
-        raise LensError(f'{where}: camera {named}: with {SEPARATOR} in its name, rig.yaml does not '
-                        'say which camera is in which; rename it')
+        raise LensError(f'{where}: camera {named}: with {SEPARATOR} in its name, rig.yaml does '
+                        'not say which camera is in which; rename it')
 
 
 def load_rigs(path: str | Path) -> tuple[Pose, ...]:
