@@ -79,7 +79,7 @@ def _rendered(folder: Path) -> Iterator[Case]:
     _run(['example', '-o', str(folder / 'example')])
     _run(['detect', str(folder / 'example/photographs'), '--board', 'chessboard:9x6:25mm',
           '-o', str(folder / 'example.csv')])
-    yield from _calibrated(folder, 'example', 'example.csv', '848x800')
+    yield from _calibrated(folder, 'example', 'example.csv', '480x450')
     yield _diagnosis('example', '{inputs}/example.csv', '--lens', '{inputs}/example.yaml',
                      '--poses', '{inputs}/example/truth/poses.csv', '--next', '2')
     yield _diagnosis('example-for', '{inputs}/example.csv', '--quick', '--lens',

@@ -38,7 +38,8 @@ from benchmark.mutation_reach import Reach, load, trace
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path('fisheye_svp_ros')
-ROOMS = ('optics', 'scene', 'solve', 'diagnosis', 'io', 'nodes')
+ROOMS = ('optics', 'scene', 'effects', 'mixed_model', 'solve', 'rectify', 'diagnosis', 'planning',
+         'io', 'nodes')
 # Compiled, or part of what is: tried uncompiled first, which spares a minute where that fails.
 COMPILED = {
     'optics/formulas.py', 'optics/rays.py', *(f'optics/engines/{name}.py' for name in (

@@ -20,10 +20,10 @@ from coverage import CoverageData
 
 # Traced one after the other, so that an interrupted trace goes on where it was.
 GROUPS = {
-    'numbers': ['optics', 'scene', 'io', 'effects', 'simulate', 'solve', 'study', 'test_pose.py',
-                'test_library.py', 'test_registry.py'],
+    'numbers': ['optics', 'scene', 'io', 'effects', 'mixed_model', 'simulate', 'solve', 'rectify',
+                'study', 'test_pose.py', 'test_library.py', 'test_registry.py'],
     'uncompiled': ['optics', 'solve/test_least_squares.py', '-k', 'numba or engine or compiled'],
-    'diagnosis': ['diagnosis'],
+    'diagnosis': ['diagnosis', 'planning'],
     'nodes': ['nodes'],
     'commands': ['commands', 'detect', 'reporting', 'paper'],
 }

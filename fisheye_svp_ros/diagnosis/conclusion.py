@@ -35,8 +35,6 @@ from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.ray_errors import RayError
 
-_INTRINSIC = ('focal_length', 'principal_point', 'aspect')
-
 
 @dataclass(frozen=True)
 class Conclusion:
@@ -97,8 +95,8 @@ def conclude(
         [c.effect for c in causes if c.effect_class.budget_stage() != 'noise'],
         bool(evaluation.averaged_model.shifts),
         (gain.value, gain.low), file, rays.offset if evaluation.free else None,
-        [c.effect for c in causes if c.effect in _INTRINSIC], find_bounds(evaluation.null),
-        evaluation.noise_px, evaluation.falling, evaluation.frames))
+        find_bounds(evaluation.null), evaluation.noise_px, evaluation.falling,
+        evaluation.frames))
     scatter = np.hypot.reduce([part.sd_px for part in components
                                if part.stage == 'frame' and not part.named_share]
                               + [evaluation.noise_px])

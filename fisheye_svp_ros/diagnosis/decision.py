@@ -11,6 +11,7 @@ LensAnswer = Literal['keep', 'use_extended', 'recalibrate', 'undecided']
 TargetAnswer = Literal['keep', 'correct', 'measure_again']
 PhotographsAnswer = Literal['enough', 'more', 'retake']
 
+_INTRINSIC = ('focal_length', 'principal_point', 'aspect')
 _OFF_P = 0.04  # of the offset by chance: below, the lens is another one
 _OFF_PX = 0.2  # of the noise: a difference that matters
 _HINT = 2.4  # standard errors: an effect that is not named, and yet likely there
@@ -103,8 +104,8 @@ class LensFacts(NamedTuple):
     lens_causes, causes: confirmed ones of the lens, and all that move predictions;
     has_likely_shift: whether the extended lens has a viewpoint shift that is likely and not named;
     named_gain: value, low of what all causes gain held out; offset: None where intrinsics were
-    not fitted; refitted: intrinsics that only a change of the lens explains, confirmed as causes;
-    falling: whether no error rises with the causes on the fitted frames; frames: how many.
+    not fitted; falling: whether no error rises with the causes on the fitted frames; frames: how
+    many.
     """
 
     lens_causes: Sequence[str]
@@ -113,11 +114,15 @@ class LensFacts(NamedTuple):
     named_gain: tuple[float, float]
     file: FileFigure
     offset: LensOffset | None
-    refitted: Sequence[str]
     bounds: list[Bound]
     noise_px: float
     falling: bool
     frames: int
+
+    @property
+    def refitted(self) -> list[str]:
+        """Intrinsics that only a change of the lens explains, confirmed as causes."""
+        return [name for name in self.causes if name in _INTRINSIC]
 
 
 def decide_lens(facts: LensFacts) -> Decision:
@@ -136,32 +141,37 @@ def decide_lens(facts: LensFacts) -> Decision:
         return Decision('undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained,
                         None)
     if facts.refitted:
-        names = ', '.join(facts.refitted)
-        return Decision('recalibrate', f'the lens as given is wrong in {names}', gained, file.sure)
+        return Decision(
+            'recalibrate', f'the lens as given is wrong in {", ".join(facts.refitted)}', gained,
+            file.sure)
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(
             'use_extended', 'on the same corrected target it takes the held-out error from '
                             f'{file.given_px:.3g} to {file.extended_px:.3g} px', gained, file.sure)
+    return _doubt(facts, gained) or Decision(
+        'keep', _keep_text(bounds, off), gained, 0.95, bounds)
+
+
+def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
+    """Return why nothing can be said of the lens; None where it can."""
+    file, bounds = facts.file, facts.bounds
     hint = max((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
                key=lambda one: one.edge_px, default=None)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
-        why = (f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
-               f'{file.given_px:.3g} px with the lens as given; only all causes together reduce '
-               'it')
-        return Decision('undecided', why, gained, 1 - file.sure, bounds)
-    if facts.lens_causes:
-        names = ', '.join(facts.lens_causes)
-        return Decision(
-            'undecided', f'it is not certain that {names} in the lens reduces the held-out error '
-                         f'({file.given_px:.3g} → {file.extended_px:.3g} px): its probability is '
-                         f'{100 * file.sure:.0f} %', gained, file.sure, bounds)
-    if hint is not None:
-        sure = erf(hint.z / 2**0.5)
-        return Decision(
-            'undecided', f'likely but not confirmed: {hint.effect}, which may cause up to '
-                         f'{hint.edge_px:.2g} px at the edge', gained, sure, bounds)
-    return Decision('keep', _keep_text(bounds, off), gained, 0.95, bounds)
+        why, sure = (f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
+                     f'{file.given_px:.3g} px with the lens as given; only all causes together '
+                     'reduce it'), 1 - file.sure
+    elif facts.lens_causes:
+        why, sure = (f'it is not certain that {", ".join(facts.lens_causes)} in the lens reduces '
+                     f'the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
+                     f'probability is {100 * file.sure:.0f} %'), file.sure
+    elif hint is not None:
+        why, sure = (f'likely but not confirmed: {hint.effect}, which may cause up to '
+                     f'{hint.edge_px:.2g} px at the edge'), erf(hint.z / 2**0.5)
+    else:
+        return None
+    return Decision('undecided', why, gained, sure, bounds)
 
 
 def _keep_text(bounds: Sequence[Bound], off: LensOffset | None) -> str:

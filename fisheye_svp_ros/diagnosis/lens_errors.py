@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
+from fisheye_svp_ros.diagnosis.gathered_points import ColumnGeometry
 from fisheye_svp_ros.diagnosis.model_errors import (
     ErrorParts,
     ModelErrors,
     parameter_names,
     pose_maps,
 )
-from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF, ColumnGeometry
+from fisheye_svp_ros.diagnosis.random_effects import NAMES, STAGE_OF
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target import Target
 from fisheye_svp_ros.errors import LensError

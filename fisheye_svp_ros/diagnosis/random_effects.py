@@ -15,9 +15,8 @@ from scipy import sparse
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.diagnosis.effect_forms import bump_values, hexagons
-from fisheye_svp_ros.effects.target import Target
+from fisheye_svp_ros.diagnosis.gathered_points import ColumnGeometry, GatheredPoints
 from fisheye_svp_ros.mixed_model import Components, RandomColumns
-from fisheye_svp_ros.scene.boards import Board, find_boards
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 SAG = 'frame_sag'
@@ -36,7 +35,6 @@ _IMAGE_GRIDS = (('image_broad', 3, 0.5), ('image_coarse', 6, 0.5), ('image_fine'
            ('image_finest', 26, 3.0))
 _FRAME_CELLS, _BOARD_CELLS = 4, 4
 _MIN_LANDMARKS = 12
-MILLIMETRE = 1e-3  # unit of offsets on the target
 
 
 class ImageGrid(NamedTuple):
@@ -83,140 +81,6 @@ class RandomEffects(NamedTuple):
         return sum(2 * len(grid.centres) for grid in self.grids)
 
 
-class ColumnGeometry(NamedTuple):
-    """What the columns rest on, for data other than those that the variances are of.
-
-    extents (C, 2, 2), px: least and largest u, v by camera; finest, px: pitch of the finest grid,
-    NaN without one; landmark, board (L,), points (L, 3), m: the target, by ascending numbers;
-    modes (L, 3, K) and alone (L, 3), m: how far its landmarks are off along the axes of their
-    boards, each as a sum of the modes, drawn once for all, and of what it has alone.
-    """
-
-    extents: Array
-    finest: float
-    landmark: Index
-    board: Index
-    points: Array
-    modes: Array
-    alone: Array
-
-    @classmethod
-    def measure(
-        cls, linear: Linearization, finest: float, modes: Array, alone: Array
-    ) -> ColumnGeometry:
-        """Return that of a linearised state; modes, alone: see above."""
-        views = linear.data.views
-        used = views.used
-        landmark, first = np.unique(views.landmark[used], return_index=True)
-        return cls(GatheredPoints.gather(linear).extents, finest, landmark,
-                   views.board[used][first], views.points[used][first], modes, alone)
-
-
-class BoardLandmarks(NamedTuple):
-    """The landmarks of a design: ids (L,), their boards, by place (L,), and where on them (L, 2).
-
-    board_of (L,): among `boards`; at (L, 2): place on the board over its size.
-    """
-
-    ids: Index
-    boards: list[Board]
-    board_of: Index
-    at: Array
-
-    @classmethod
-    def of_geometry(cls, geometry: ColumnGeometry) -> BoardLandmarks:
-        """Return those that a geometry is of."""
-        boards = find_boards(geometry.points, geometry.board)
-        board_of = np.searchsorted([one.id for one in boards], geometry.board)
-        at = np.zeros((len(geometry.points), 2))
-        for i, one in enumerate(boards):
-            mine = board_of == i
-            at[mine] = one.to_board(geometry.points[mine])[:, :2]
-        return cls(geometry.landmark, boards, board_of, at)
-
-
-class GatheredPoints(NamedTuple):
-    """The points of all frames, (F, N) each: N of all cameras; what a design is built from.
-
-    used; uv (F, N, 2), px; weight, 1/px; camera; slot: place among the landmarks, -1 for none;
-    board: place among the boards; local (F, N, 2): place on the board over its size; place
-    (F, N, 2, 3): whitened derivatives by an offset along the board's axes, per mm; extents
-    (C, 2, 2), px: see `ColumnGeometry`; normals (F, boards, 3): of the boards, in the frame of the
-    camera or rig.
-    """
-
-    used: Mask
-    uv: Array
-    weight: Array
-    camera: Index
-    slot: Index
-    board: Index
-    local: Array
-    place: Array
-    extents: Array
-    landmarks: BoardLandmarks
-    normals: Array
-
-    @classmethod
-    def gather(
-        cls, linear: Linearization, geometry: ColumnGeometry | None = None
-    ) -> GatheredPoints:
-        """Gather the points of a linearized state; geometry: None for its own."""
-        data, views = linear.data, linear.data.views
-
-        def rows(values: Array | Index) -> Array:
-            return data.blocks(np.asarray(values, dtype=float)[..., None, :])
-
-        weight = rows(linear.weight[..., None])[..., 0]
-        shown = used = weight > 0
-        camera = np.broadcast_to(data.camera_of[:, None, None], (*views.landmark.shape, 1))
-        camera = rows(camera)[..., 0].astype(np.int64)
-        points, uv = rows(views.points), rows(np.nan_to_num(linear.linear.uv))
-        landmark = rows(views.landmark[..., None])[..., 0].astype(np.int64)
-        number = rows(views.board[..., None])[..., 0].astype(np.int64)
-        if geometry is None:
-            ids, boards = np.unique(landmark[used]), linear.scene.boards
-        else:
-            target = Target((), geometry.landmark, geometry.board, geometry.points)
-            shown = used & (rows(target.landmark_mask(views).astype(float)[..., None])[..., 0] > 0)
-            known = BoardLandmarks.of_geometry(geometry)
-            ids, boards = known.ids, known.boards
-        slot = np.where(shown, np.searchsorted(ids, landmark).clip(max=len(ids) - 1), -1)
-        if geometry is not None:
-            number, points = geometry.board[slot], geometry.points[slot]
-        place = linear.whiten(linear.linear.d_target).reshape(*used.shape, 2, 3) * MILLIMETRE
-        board, local, place = _turn_to_boards(boards, shown, number, points, place)
-        if geometry is None:
-            known = BoardLandmarks(
-                ids, boards, np.zeros(len(ids), dtype=np.int64), np.zeros((len(ids), 2)))
-            known.board_of[slot[used]], known.at[slot[used]] = board[used], local[used]
-        extents = _extents(uv, used, camera) if geometry is None else geometry.extents
-        normals = np.array([one.axes[2] for one in boards]) @ linear.state.pose.rotation
-        return cls(used, uv, weight, camera, slot, board, local, place, extents, known, normals)
-
-
-def _turn_to_boards(
-    boards: list[Board], shown: Mask, number: Index, points: Array, place: Array
-) -> tuple[Index, Array, Array]:
-    """Return the board of each point, by place, where it is on it, derivatives along its axes."""
-    board, local = np.zeros(shown.shape, dtype=np.int64), np.zeros((*shown.shape, 2))
-    for i, one in enumerate(boards):
-        mine = shown & (number == one.id)
-        board[mine], local[mine] = i, one.to_board(points[mine])[:, :2]
-        place[mine] = place[mine] @ one.axes.T
-    return board, local, place
-
-
-def _extents(uv: Array, used: Mask, camera: Index) -> Array:
-    """Return the least and the largest u, v of each camera, (C, 2, 2), px; NaN without points."""
-    extents = np.full((int(camera.max()) + 1, 2, 2), np.nan)
-    for i in range(len(extents)):
-        mine = used & (camera == i)
-        if mine.any():
-            extents[i] = uv[mine].min(axis=0), uv[mine].max(axis=0)
-    return extents
-
-
 def make_random_effects(
     linear: Linearization, finest: bool = False, geometry: ColumnGeometry | None = None
 ) -> RandomEffects:
@@ -234,7 +98,7 @@ def make_random_effects(
     parts = [_move_both_axes(bumps.multiply(weight).tocsr()) for _, bumps in static]
     names = [grid.name for grid in grids]
     if linear.data.poses is None:  # else the camera moves, and gravity beside it
-        parts.append(_sag_columns(points))
+        parts.append(_sag_columns(points, linear.state.pose.rotation))
         names.append(SAG)
     combinations = [_combine_offsets(field) for field in fields]
     of = [np.full(part.shape[1], NAMES.index(name)) for name, part in zip(
@@ -303,16 +167,18 @@ def _bend_columns(points: GatheredPoints) -> Array:
     return np.asarray(columns.reshape(*columns.shape[:3], -1))
 
 
-def _sag_columns(points: GatheredPoints) -> sparse.csr_array:
+def _sag_columns(points: GatheredPoints, rotation: Array) -> sparse.csr_array:
     """Return columns (2 F N, 9 boards) of a bend of each board in proportion to its normal.
 
-    A board that sags by its own weight bends by b (n . g), n its normal and g the direction of
-    gravity, which stands still beside a camera that does.
+    rotation (F, 3, 3): of the camera or rig.  A board that sags by its own weight bends by
+    b (n . g), n its normal and g the direction of gravity, which stands still beside a camera
+    that does.
     """
-    bend, (frames, boards, _) = _bend_columns(points), points.normals.shape
-    parts = bend.reshape(*bend.shape[:3], boards, 3)[..., None]
-    columns = parts * points.normals[:, None, None, :, None]
-    return sparse.csr_array(columns.reshape(frames * bend.shape[1] * 2, -1))
+    bend, boards = _bend_columns(points), points.landmarks.boards
+    normals = np.array([one.axes[2] for one in boards]) @ rotation  # (F, boards, 3)
+    parts = bend.reshape(*bend.shape[:3], len(boards), 3)[..., None]
+    columns = parts * normals[:, None, None, :, None]
+    return sparse.csr_array(columns.reshape(points.used.size * 2, -1))
 
 
 def _image_grids(

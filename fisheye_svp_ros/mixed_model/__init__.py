@@ -59,6 +59,7 @@ from fisheye_svp_ros.mixed_model.solution import (
     Solution,
     leave_groups_out,
     posterior_covariance,
+    posterior_variances,
     solve_equations,
     unit_covariances,
 )
@@ -69,7 +70,7 @@ __all__ = [
     'combine_offsets', 'component_p_values', 'component_traces', 'eliminate', 'estimate_variances',
     'factor_equations', 'find_variances', 'group_basis', 'identifiable_basis', 'initial_variances',
     'integrate_columns', 'is_called_for', 'leave_groups_out', 'make_equations', 'multiply_rows',
-    'no_variances', 'posterior_covariance', 'predict_rows', 'pseudo_inverse',
-    'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each', 'solve_equations',
-    'solve_lower', 'unit_covariances', 'unit_labels',
+    'no_variances', 'posterior_covariance', 'posterior_variances', 'predict_rows',
+    'pseudo_inverse', 'satterthwaite_freedom', 'score_columns', 'score_components', 'score_each',
+    'solve_equations', 'solve_lower', 'unit_covariances', 'unit_labels',
 ]

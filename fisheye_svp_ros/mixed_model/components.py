@@ -28,6 +28,7 @@ from fisheye_svp_ros.mixed_model.solution import (
     Solution,
     deviance_without,
     posterior_covariance,
+    posterior_variances,
     solution_without,
     solve_equations,
 )
@@ -124,7 +125,7 @@ class _FullModel(NamedTuple):
 def _solve_whole(eq: Equations, now: Variances) -> _FullModel:
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     posterior = posterior_covariance(f)
-    return _FullModel(f, solve_equations(f, posterior), posterior)
+    return _FullModel(f, solve_equations(f, posterior.variances), posterior)
 
 
 def _deviance_ratios(whole: _FullModel, kinds: Iterable[int]) -> dict[int, float]:
@@ -153,7 +154,7 @@ def _step_without(eq: Equations, now: Variances, whole: _FullModel, kind: int) -
     if (f.equations.blocks.r_label == kind).any():
         return update_variances(f, solution_without(*whole, kind), others)
     f = factor_equations(eq.select(others.alive), others.lam, others.weight)
-    return update_variances(f, solve_equations(f, posterior_covariance(f)), others)
+    return update_variances(f, solve_equations(f, posterior_variances(f)), others)
 
 
 def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Array:

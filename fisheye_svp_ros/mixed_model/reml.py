@@ -17,7 +17,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.mixed_model.equations import Equations, FactoredEquations, factor_equations
-from fisheye_svp_ros.mixed_model.solution import Solution, posterior_covariance, solve_equations
+from fisheye_svp_ros.mixed_model.solution import Solution, posterior_variances, solve_equations
 
 T_FREEDOM = 3.0  # of the t distribution of units' offsets
 LAMBDA_ABSENT = 1e12  # lambda of a component without variance
@@ -106,7 +106,7 @@ def _iterate(
     for step in range(steps):
         now = replace(now, lam=np.maximum(now.lam, floor))
         f = factor_equations(eq, now.lam, now.weight)
-        solution = solve_equations(f, posterior_covariance(f))
+        solution = solve_equations(f, posterior_variances(f))
         newton = step > 0 and solution.deviance < deviance + 1e-3 * eq.rows
         before, now, deviance = now, update_variances(f, solution, now, newton), solution.deviance
         if (now.alive != before.alive).any():

@@ -28,6 +28,8 @@ from fisheye_svp_ros.mixed_model.equations import (
 )
 from fisheye_svp_ros.mixed_model.model_columns import RandomColumns, combine_offsets
 
+_COLUMNS = 128  # of a triangle at a time: few of its zeros are multiplied
+
 
 class Posterior(NamedTuple):
     """The covariance of all coefficients, over the noise variance.
@@ -43,8 +45,7 @@ class Posterior(NamedTuple):
     @property
     def variances(self) -> tuple[Array, Array]:
         """Variances of the coefficients (E, k), (R,)."""
-        own = np.diagonal(self.block, axis1=-2, axis2=-1)
-        squares = np.einsum('ic,ic->i', self.root, self.root)
+        own, squares = np.diagonal(self.block, axis1=-2, axis2=-1), _row_squares(self.root)
         return own + squares[: own.size].reshape(own.shape), squares[own.size :]
 
 
@@ -64,41 +65,74 @@ def covariance_roots(f: FactoredEquations) -> tuple[Array, Array]:
 def posterior_covariance(f: FactoredEquations) -> Posterior:
     """Return the covariance of all coefficients; the border must be of full rank."""
     inverse_t = np.swapaxes(f.inverse, -1, -2)
-    by_border = solve_upper(f.factor, f.border[:, :-1])
-    by_block = inverse_t @ (f.block_border[..., :-1] - f.coupled @ by_border)
     size, rest, count = f.precision[0].size, len(f.factor), len(f.root)
     root, shared = np.empty((size + rest, rest + count)), np.zeros((count, rest + count))
     root[:size, :rest], root[size:, :rest] = covariance_roots(f)
-    if count:
-        fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T
-        root[:size, rest:] = by_block.reshape(size, count) @ fixed
-        root[size:, rest:] = by_border @ fixed
-        # What fixed columns take up, random ones lose.
-        shared[:, rest:] = -fixed
+    root[:size, rest:], root[size:, rest:], fixed = _roots_of_fixed(f)
+    # What fixed columns take up, random ones lose.
+    shared[:, rest:] = -fixed
     return Posterior(inverse_t @ f.inverse, root, shared)
+
+
+def posterior_variances(f: FactoredEquations) -> tuple[Array, Array]:
+    """Return the variances (E, k), (R,) of all coefficients, over the noise variance.
+
+    As `posterior_covariance` has them, without a root as large as all of it.
+    """
+    (count, width, rest), inverse_t = f.coupled.shape, np.swapaxes(f.inverse, -1, -2)
+    flat = (inverse_t @ f.coupled).reshape(count * width, rest)
+    inverse = linalg.lapack.dtrtri(f.factor, lower=1)[0] if rest else f.factor
+
+    def sum_squares(part: slice) -> Array:
+        """Return the squares of flat inverse', summed over a part of the columns."""
+        return _row_squares(flat[:, : part.stop] @ inverse[part, : part.stop].T)
+
+    parts = [slice(at, min(at + _COLUMNS, rest)) for at in range(0, rest, _COLUMNS)]
+    if flat.size * rest < WORTH_THREADS:
+        sums = list(map(sum_squares, parts))
+    else:
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            sums = list(pool.map(sum_squares, parts[::-1]))  # the largest first
+    by_block, by_rest, _ = _roots_of_fixed(f)
+    e = _row_squares(by_block) + sum(sums, np.zeros(count * width))
+    own = np.einsum('ekj,ekj->ej', f.inverse, f.inverse)
+    return own + e.reshape(count, width), _row_squares(inverse.T) + _row_squares(by_rest)
+
+
+def _row_squares(root: Array) -> Array:
+    return np.asarray(np.einsum('ic,ic->i', root, root))
+
+
+def _roots_of_fixed(f: FactoredEquations) -> tuple[Array, Array, Array]:
+    """Return what shared fixed columns add to roots e (E k, X - 1), r (R, X - 1), and their own.
+
+    The border must be of full rank.
+    """
+    fixed = linalg.lapack.dtrtri(f.root, lower=1)[0].T if len(f.root) else f.root
+    by_border = solve_upper(f.factor, f.border[:, :-1] @ fixed)
+    (count, width, rest), columns = f.coupled.shape, len(fixed)
+    # One large product each, not one for every block.
+    by_block = f.block_border.reshape(count * width, columns + 1)[:, :-1] @ fixed
+    by_block -= f.coupled.reshape(count * width, rest) @ by_border
+    by_block = np.swapaxes(f.inverse, -1, -2) @ by_block.reshape(count, width, columns)
+    return by_block.reshape(count * width, columns), by_border, fixed
 
 
 def unit_covariances(f: FactoredEquations) -> Array:
     """Return the posterior covariances (m, w, w) of units' offsets over the noise variance."""
     eq = f.equations
     size = eq.unit_width * len(eq.units)
-    by_border = solve_lower(f.factor, f.border[:, :-1], trans=1)
+    by_block, by_rest, _ = _roots_of_fixed(f)
     if eq.by_group:
         unit = np.zeros((len(f.factor), size))
         unit[-size:] = np.eye(size)
-        through = solve_lower(f.factor, unit)
-        own, fixed = np.zeros((len(eq.units), eq.unit_width, eq.unit_width)), by_border[-size:]
+        through, fixed = solve_lower(f.factor, unit), by_rest[-size:]
+        own = np.zeros((len(eq.units), eq.unit_width, eq.unit_width))
     else:
         back = np.swapaxes(f.inverse, -1, -2)
-        flat = (back @ f.coupled).reshape(size, -1)
-        through = solve_lower(f.factor, flat.T)
-        own = back @ f.inverse
-        fixed = (back @ (f.block_border[..., :-1] - f.coupled @ by_border)).reshape(size, -1)
-    covariance = own + _unit_products(through, eq)
-    if len(f.root):
-        half = solve_lower(f.root, fixed.T)
-        covariance = covariance + _unit_products(half, eq)
-    return np.asarray(covariance)
+        through = solve_lower(f.factor, (back @ f.coupled).reshape(size, -1).T)
+        own, fixed = back @ f.inverse, by_block
+    return np.asarray(own + _unit_products(through, eq) + _unit_products(fixed.T, eq))
 
 
 def _unit_products(columns: Array, eq: Equations) -> Array:
@@ -124,10 +158,12 @@ class Solution(NamedTuple):
     spread_r: Array
 
 
-def solve_equations(f: FactoredEquations, posterior: Posterior | None = None) -> Solution:
+def solve_equations(
+    f: FactoredEquations, spread: tuple[Array, Array] | None = None
+) -> Solution:
     """Solve for all coefficients; the border must be of full rank.
 
-    posterior: their covariance, for their spread.
+    spread: their variances, where the solution is to have them.
     """
     root, gradient = f.root, f.information[:-1, -1]
     half = solve_lower(root, gradient)
@@ -135,11 +171,10 @@ def solve_equations(f: FactoredEquations, posterior: Posterior | None = None) ->
     freedom = f.freedom
     variance = float(f.information[-1, -1] - half @ half) / max(freedom, 1)
     e, r = f.coefficients(np.append(-values, 1.0))
-    spread = (np.zeros(0), np.zeros(0)) if posterior is None else posterior.variances
     logs = f.log_determinant + log_determinant(root)
     # The noise variance is profiled out.
     deviance = float(freedom * np.log(max(variance, 1e-300)) + logs)
-    return Solution(values, variance, e, r, deviance, *spread)
+    return Solution(values, variance, e, r, deviance, *(spread or (np.zeros(0), np.zeros(0))))
 
 
 def deviance_without(

@@ -22,7 +22,7 @@ SAME = FileFigure(0.1, 0.1, 0.01, -0.2, 0.2, 0.55)
 SMALL = Bound('viewpoint_shift', 0.0004, 'm', 0.7, 0.02, 0.05)
 LIKELY = Bound('viewpoint_shift', 0.0092, 'm', 2.6, 0.32, 0.58)
 SOUND = LensFacts(
-    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [], [SMALL], 0.05, True, 12)
+    [], [], False, (0.0, 0.0), SAME, LensOffset(0.3, 0.8, 0.6, 0.1), [SMALL], 0.05, True, 12)
 
 
 def test_a_sound_lens_is_kept_with_the_bound() -> None:
@@ -81,7 +81,7 @@ def test_an_error_that_rises_on_the_fitted_frames_recommends_nothing() -> None:
 @pytest.mark.parametrize('facts', [
     SOUND._replace(bounds=[LIKELY]),
     SOUND._replace(lens_causes=['sensor_tilt'], causes=['sensor_tilt'], named_gain=(0.1, 0.02)),
-    SOUND._replace(refitted=['focal_length']),
+    SOUND._replace(causes=['focal_length']),
 ])
 def test_no_reason_begins_with_the_name_of_an_effect(facts: LensFacts) -> None:
     """Reasons begin sentences: the first screen had "Sensor_tilt is confirmed"."""

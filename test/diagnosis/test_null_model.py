@@ -22,6 +22,7 @@ from fisheye_svp_ros.mixed_model import (
     leave_groups_out,
     make_equations,
     posterior_covariance,
+    posterior_variances,
     score_components,
     solve_equations,
 )
@@ -129,10 +130,10 @@ def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames,
     now = some_variances(eq)
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     known = posterior_covariance(f)
-    whole = f, solve_equations(f, known), known
+    whole = f, solve_equations(f, known.variances), known
     gone = now.without_component(kind)
     direct_f = factor_equations(eq.select(gone.alive), now.lam, now.weight)
-    direct = solve_equations(direct_f, posterior_covariance(direct_f))
+    direct = solve_equations(direct_f, posterior_variances(direct_f))
     assert deviance_without(*whole, kind) == pytest.approx(direct.deviance - whole[1].deviance)
     if not (f.equations.blocks.r_label == kind).any():
         return
@@ -144,6 +145,22 @@ def test_without_a_component_is_what_the_equations_say_that_never_had_it(frames,
     np.testing.assert_array_equal(step.alive, there)
     np.testing.assert_allclose(step.lam[there], after.lam[there], rtol=1e-6)
     np.testing.assert_allclose(step.weight, after.weight, rtol=1e-6)
+
+
+@pytest.mark.parametrize('worth', [0.0, np.inf])
+@pytest.mark.parametrize('frames', [4, 24])
+def test_variances_are_those_of_the_whole_covariance(frames, worth, monkeypatch):
+    monkeypatch.setattr('fisheye_svp_ros.mixed_model.solution.WORTH_THREADS', worth)
+    linear = linearised(frames=frames, offsets=2e-3)
+    border = np.concatenate(
+        [linear.effect_columns(CATALOGUE['skew']()), linear.residual[..., None]], axis=-1)
+    eq = make_equations(make_random_effects(linear).columns, linear.frame_columns, border)
+    now = some_variances(eq)
+    for alive in (now.alive, np.zeros_like(now.alive)):
+        f = factor_equations(eq.select(alive), now.lam, now.weight)
+        for ours, whole in zip(
+                posterior_variances(f), posterior_covariance(f).variances, strict=True):
+            np.testing.assert_allclose(ours, whole, rtol=1e-9)
 
 
 @pytest.mark.parametrize('frames', [4, 24])
@@ -188,7 +205,7 @@ def test_many_frames_need_no_matrix_of_all_that_they_have_of_their_own():
     now = some_variances(eq)
     f = factor_equations(eq, now.lam, now.weight)
     known = posterior_covariance(f)
-    solution = solve_equations(f, known)
+    solution = solve_equations(f, known.variances)
     tracemalloc.start()
     deviance_without(f, solution, known, kind)
     score_components(eq, now.without_component(kind), [kind])
@@ -215,7 +232,7 @@ def test_what_the_data_determine_is_the_trace_of_the_dense_matrix():
     eq = make_equations(random, linear.frame_columns, border)
     now = some_variances(eq)
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
-    solution = solve_equations(f, posterior_covariance(f))
+    solution = solve_equations(f, posterior_variances(f))
     z, label = dense_columns(linear, random)
     precision = np.where(label >= 0, now.lam[label], 0.0) * np.concatenate([
         np.ones(5 * random.group.shape[-1]), np.repeat(now.weight, 3),
