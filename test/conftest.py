@@ -20,6 +20,7 @@ os.environ.setdefault('OMP_NUM_THREADS', '1')
 # Also where pytest is started in a colcon workspace, and reads no pyproject.toml.
 sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parent)]
 
+from helpers.lasting import LastingWorker  # noqa: E402
 from helpers.nodes import TIMEOUT, Caller, NodeProcess  # noqa: E402
 
 from fisheye_svp_ros.commands.shared_memory import remove_orphans, segments  # noqa: E402
@@ -69,6 +70,12 @@ def same_engine(monkeypatch: pytest.MonkeyPatch) -> None:
 def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Print no line of progress among those of a command, however busy the machine is."""
     monkeypatch.setattr('fisheye_svp_ros.reporting.progress._INTERVAL', math.inf)
+
+
+@pytest.fixture(autouse=True)
+def lasting_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Search the photographs of all tests in the same processes."""
+    monkeypatch.setattr('fisheye_svp_ros.detect.workers._Worker', LastingWorker)
 
 
 @pytest.fixture(params=['numpy', 'numba'])

@@ -49,6 +49,13 @@ class _Worker:
         with suppress(ConnectionError):  # of a process that has died; whoever listens hears so
             self.pipe.send(item)
 
+    def receive_result(self) -> Any:
+        """Return what came of the item, TimedOut where the process has died over it."""
+        try:
+            return self.pipe.recv()
+        except (EOFError, OSError):
+            return TimedOut(False)
+
     def stop(self) -> None:
         self.pipe.close()
         self.process.kill()
@@ -78,12 +85,7 @@ def bounded_map(
                 late = time.monotonic() > worker.deadline
                 if worker.pipe not in ready and not late:
                     continue
-                result: Any = TimedOut(late)
-                if worker.pipe in ready:
-                    try:
-                        result = worker.pipe.recv()
-                    except (EOFError, OSError):
-                        result = TimedOut(False)
+                result = worker.receive_result() if worker.pipe in ready else TimedOut(late)
                 yield worker.number, result
                 following = None if isinstance(result, TimedOut) else next(waiting, None)
                 if following is None:
