@@ -234,7 +234,15 @@ def _inputs(args: argparse.Namespace, free: bool) -> ReportInputs:
 
     return ReportInputs(
         args.observations, tuple(args.lens), args.poses, args.held_out, args.output or Path(),
-        free, search_options(args) if args.board else ())
+        free, search_options(args) if args.board else (), _settings(args), bool(args.count))
+
+
+def _settings(args: argparse.Namespace) -> tuple[str, ...]:
+    """Return the options with which another diagnosis solves the same problem."""
+    named = [('--poses', args.poses), ('--free', args.free), ('--medium', args.medium),
+             ('--port', args.port), *(('--with', name) for name in args.included),
+             *(('--without', name) for name in args.left_out)]
+    return tuple(word for option, value in named if value for word in (option, value))
 
 
 def _write(

@@ -34,6 +34,7 @@ from fisheye_svp_ros.diagnosis.variance_budget import Component
 from fisheye_svp_ros.effects.target_map import board_maps
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.ray_errors import RayError
+from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 
 @dataclass(frozen=True)
@@ -100,10 +101,13 @@ def conclude(
     scatter = np.hypot.reduce([part.sd_px for part in components
                                if part.stage == 'frame' and not part.named_share]
                               + [evaluation.noise_px])
+    target = decide_target(_target_facts(evaluation, causes, components, contradicted))
     photographs = decide_photographs(PhotographsFacts(
         evaluation.frames, frames_of(advice, RETAKE), frames_of(advice, UNLIKE),
-        evaluation.named_quality.heldout_rms_px, 2**0.5 * float(scatter), lens.say))
-    target = decide_target(_target_facts(evaluation, causes, components, contradicted))
+        evaluation.named_quality.heldout_rms_px, 2**0.5 * float(scatter), lens.say,
+        target.say == 'measure_again' and target.confidence is not None,
+        evaluation.selection.problem.plannable,
+        'view' if is_unpaired(evaluation.null.linear.data) else 'frame'))
     return Conclusion({'lens': lens, 'target': target, 'photographs': photographs}, file,
                       rays.errors, candidates)
 

@@ -18,6 +18,7 @@ _HINT = 2.4  # standard errors: an effect that is not named, and yet likely ther
 _MIN_FRAMES = 8  # frames
 _ONE_FRAME = 'one frame does not tell errors of the lens from those of the target'
 _MAX_REJECTED_SHARE = 0.1  # of the frames
+_TARGET_RATIO = 1.5  # times noise and scatter: a held-out error that needs a reason
 
 
 class Figure(NamedTuple):
@@ -156,8 +157,8 @@ def decide_lens(facts: LensFacts) -> Decision:
 def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
     """Return why nothing can be said of the lens; None where it can."""
     file, bounds = facts.file, facts.bounds
-    hint = max((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
-               key=lambda one: one.edge_px, default=None)
+    hints = sorted((one for one in bounds if one.z > _HINT and one.edge_px > facts.noise_px),
+                   key=lambda one: -one.edge_px)
     if facts.causes and file.high < 0 < facts.named_gain[1]:
         why, sure = (f'held-out error {file.extended_px:.3g} px with the extended lens alone, '
                      f'{file.given_px:.3g} px with the lens as given; only all causes together '
@@ -166,9 +167,10 @@ def _doubt(facts: LensFacts, gained: Figure) -> Decision | None:
         why, sure = (f'it is not certain that {", ".join(facts.lens_causes)} in the lens reduces '
                      f'the held-out error ({file.given_px:.3g} → {file.extended_px:.3g} px): its '
                      f'probability is {100 * file.sure:.0f} %'), file.sure
-    elif hint is not None:
-        why, sure = (f'likely but not confirmed: {hint.effect}, which may cause up to '
-                     f'{hint.edge_px:.2g} px at the edge'), erf(hint.z / 2**0.5)
+    elif hints:
+        why, sure = (f'likely but not confirmed: {" or ".join(one.effect for one in hints)}, '
+                     f'which may cause up to {hints[0].edge_px:.2g} px at the edge'), erf(
+                         hints[0].z / 2**0.5)
     else:
         return None
     return Decision('undecided', why, gained, sure, bounds)
@@ -238,7 +240,8 @@ class PhotographsFacts(NamedTuple):
 
     frames: how many there are; bad: names of those that are wrong as a whole; unlike: that the
     others do not predict; heldout_px: by all causes; scatter_px: what noise leaves of it; lens:
-    the answer about the lens.
+    the answer about the lens; is_target_off: whether errors of the target remain in what is held
+    out; plannable: whether `--next` can tell which photographs to take; unit: what is counted.
     """
 
     frames: int
@@ -247,6 +250,9 @@ class PhotographsFacts(NamedTuple):
     heldout_px: float
     scatter_px: float
     lens: str
+    is_target_off: bool = False
+    plannable: bool = True
+    unit: str = 'frame'
 
 
 def decide_photographs(facts: PhotographsFacts) -> Decision:
@@ -257,14 +263,19 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
         return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
                                   'others or are outliers as a whole', figure, None)
     if facts.frames < _MIN_FRAMES:
-        few = 'one frame is' if facts.frames == 1 else f'{facts.frames} frames are'
+        few = f'one {facts.unit} is' if facts.frames == 1 else f'{facts.frames} {facts.unit}s are'
         return Decision('more', f'{few} too few; take {_MIN_FRAMES} or more', figure, None)
     if facts.lens == 'undecided':
-        return Decision('more', 'the lens is undecided; --next 6 lists the views that decide it',
-                        figure, None)
+        how = '--next 6 lists the views that decide it'
+        if not facts.plannable:
+            how = 'cover the image to its edge, at different distances'
+        return Decision('more', f'the lens is undecided; {how}', figure, None)
     if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
         return Decision('more', f'{len(facts.unlike)} of {facts.frames} are not predicted by the '
                                 'others',
                         figure, None)
-    return Decision('enough', f'{facts.frames} frames, held-out error {times:.1f} times what '
-                              'noise and scatter between frames leave', figure, None)
+    rest = ''
+    if facts.is_target_off and times > _TARGET_RATIO:
+        rest = '; the target causes the rest'
+    return Decision('enough', f'{facts.frames} {facts.unit}s, held-out error {times:.1f} times '
+                              f'what noise and scatter between frames leave{rest}', figure, None)

@@ -15,6 +15,7 @@ from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, on_boards
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
+from fisheye_svp_ros.scene.boards import is_flat
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.scene.table_checks import (
     check_cameras,
@@ -181,6 +182,12 @@ class Problem:
     def observations(self) -> Observations:
         """The table as it is diagnosed."""
         return self.inputs.observations
+
+    @property
+    def plannable(self) -> bool:
+        """Whether the next photographs can be planned: of one camera, and one flat board."""
+        first = np.unique(self.observations.landmark, return_index=True)[1]
+        return len(self.observations.cameras) == 1 and is_flat(self.observations.xyz[first])
 
     @property
     def given_effects(self) -> tuple[Effect, ...]:

@@ -27,7 +27,7 @@ from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.mixed_model import group_basis
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
-from fisheye_svp_ros.scene.boards import spacing
+from fisheye_svp_ros.scene.boards import is_flat, spacing
 from fisheye_svp_ros.scene.observations import Observations
 from fisheye_svp_ros.simulate.simulation import blank_views
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, RigViews
@@ -38,7 +38,6 @@ _EDGE, _SPACING = 8.0, 9.0  # px from the edge of the image and between points, 
 _NEIGHBOURS = 4
 _SLANT = np.cos(np.radians(70.0))  # of a board to the ray, beyond which corners are not found
 _EXCHANGES = 4  # rounds
-_MAX_THICKNESS = 0.02  # thickness of a board over its length
 # What a person can set: steps of angles, rad, and distances between near and far
 _STEP, _QUARTER, _TILTS = np.radians(5.0), np.radians(45.0), np.radians([0, 15, 30, 45, 60])
 _DISTANCES = 9
@@ -118,12 +117,12 @@ class FlatBoard:
         landmark, first = np.unique(observations.landmark, return_index=True)
         points = observations.xyz[first]
         middle = points.mean(axis=0)
-        _, extent, axes = np.linalg.svd(points - middle, full_matrices=False)
-        if extent[2] > _MAX_THICKNESS * extent[0]:
+        if not is_flat(points):
             raise GeometryError(
                 f'{observations.source}: the target is not one flat board; the next photographs '
                 'can be planned only for one'
             )
+        axes = np.linalg.svd(points - middle, full_matrices=False)[2]
         normal = axes[2] * np.sign(((middle - pose.position) @ axes[2]).sum() or 1.0)
         across = np.eye(3)[0] - normal[0] * normal
         if np.linalg.norm(across) < 0.5:

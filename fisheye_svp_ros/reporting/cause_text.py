@@ -10,7 +10,7 @@ import numpy as np
 
 from fisheye_svp_ros.diagnosis import Cause, Diagnosis
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.reporting.tables import with_error
+from fisheye_svp_ros.reporting.tables import with_error, without_minus_zero
 
 HUMAN_UNITS = {
     'm': (1e3, 'mm'), 'm^2': (1e6, 'mm²'), 'rad': (180 / math.pi, 'deg'), 's': (1e3, 'ms'),
@@ -19,6 +19,7 @@ HUMAN_UNITS = {
 _UNDETERMINED_RATIO = 1e-6  # of its standard error: a parameter of which the data know nothing
 _ZERO_TOLERANCE = 1e-12  # what rounding leaves of a parameter that does nothing
 _MAX_PARAMETERS = 4  # parameters that are read one by one
+_MAX_DECIMALS = 2  # of a percentage that is nearly 0 or 100
 
 
 def describe_effect(effect: str) -> str:
@@ -50,7 +51,8 @@ def size(diagnosis: Diagnosis, cause: Cause) -> str:
     largest = sorted(shown, key=lambda name: -_significance(shown[name]))[:_MAX_PARAMETERS]
     text = ', '.join(f'{name} = {quantity(shown[name])}' for name in shown if name in largest)
     text += f' and {len(shown) - len(largest)} more' if len(shown) > len(largest) else ''
-    within = bool(shown) and all(_significance(entry) < 1 for entry in shown.values())
+    errors = [entry['stderr'] for entry in shown.values()]
+    within = any(errors) and all(_significance(entry) < 1 for entry in shown.values())
     return f'size within its error: {text}' if within else text
 
 
@@ -95,8 +97,11 @@ def bare_probability(p_value: float) -> str:
 
 
 def percent(share: float) -> str:
-    """Return a share in percent."""
-    return f'{100 * share:.0f} %'
+    """Return a share in percent; neither a little nor nearly all is rounded to nothing or all."""
+    value = 100 * share
+    texts = [f'{value:.{decimals}f}' for decimals in range(_MAX_DECIMALS + 1)]
+    text = next((text for text in texts if float(text) not in (0, 100)), texts[0])
+    return f'{without_minus_zero(text)} %'
 
 
 def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
@@ -107,4 +112,5 @@ def cause_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
         p_value = bare_probability(c.p_value)
         same += '' if c.survives else '; significant only together with another cause'
         share = percent(c.share) if c.share else '-'
-        yield c.effect, size(diagnosis, c), p_value, share, rms, percent(c.gain), same
+        gain = '-' if math.isnan(c.heldout_rms_px) else percent(c.gain)
+        yield c.effect, size(diagnosis, c), p_value, share, rms, gain, same

@@ -13,13 +13,13 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.io.files import write_text
 from fisheye_svp_ros.planning.plan import NextViews
-from fisheye_svp_ros.reporting import cause_text, external_text, shot_list
+from fisheye_svp_ros.reporting import cause_text, external_text, figure_rows, shot_list
 from fisheye_svp_ros.reporting import diagnosis_text as text
 from fisheye_svp_ros.reporting.blocks import data_uri, page
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
 from fisheye_svp_ros.reporting.evidence_plots import draw_evidence, draw_target, draw_uncertainty
 from fisheye_svp_ros.reporting.first_screen import first_screen
-from fisheye_svp_ros.reporting.headline import VERDICTS
+from fisheye_svp_ros.reporting.headline import verdict_words
 from fisheye_svp_ros.reporting.next_steps import (
     ReportInputs,
     command_to_go_on,
@@ -75,16 +75,17 @@ def write_report(
         'diagnosis.html', d=diagnosis, inputs=inputs, percent=cause_text.percent,
         significance=NAMED_P,
         screen=first_screen(diagnosis, inputs.observations, known),
-        command=command_to_go_on(diagnosis, inputs), verdict=VERDICTS[diagnosis.verdict],
+        command=command_to_go_on(diagnosis, inputs), verdict=verdict_words(diagnosis),
         sentences=text.verdict_sentences(diagnosis, known),
         pictures={'target': None, 'evidence': None, 'next': None,
                   **{p.stem: data_uri(p) for p in pictures}},
         shown=_CAPTIONS.items(),
         **_causes(diagnosis), **_budget(diagnosis), **_evidence(diagnosis),
         **_remaining_structures(diagnosis), next=_next_views(wanted),
-        uncertainty=list(text.uncertainty_rows(diagnosis)),
-        known=list(text.known_rows(known)), free=_free(inputs, diagnosis),
+        uncertainty=list(figure_rows.uncertainty_rows(diagnosis)),
+        known=list(text.known_rows(diagnosis, known)), free=_free(inputs, diagnosis),
         external=external_text.sections(diagnosis), carried_header=external_text.CARRIED_HEADER,
+        contents=text.lens_contents(diagnosis), count=text.count_frames(diagnosis),
         extended=follow_up_files(diagnosis, inputs), not_offered=text.refusal_reason(diagnosis),
     ))
     return [report, *pictures]
@@ -183,8 +184,8 @@ def _budget(diagnosis: Diagnosis) -> dict[str, Any]:
             for stage, (share, named) in shares.items()
         ],
         'total_px2': f'{total:.3g}',
-        'budget_rows': list(text.budget_rows(diagnosis)),
-        'intrinsics': list(text.intrinsic_rows(diagnosis)),
+        'budget_rows': list(figure_rows.budget_rows(diagnosis)),
+        'intrinsics': list(figure_rows.intrinsic_rows(diagnosis)),
         'advice': [(text.advice_text(one), cause_text.percent(one.gain) if one.gain > 0 else '')
                    for one in diagnosis.advice],
     }

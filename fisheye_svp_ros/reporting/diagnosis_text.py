@@ -16,14 +16,13 @@ from fisheye_svp_ros.diagnosis import (
 )
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.reporting.cause_text import (
-    bare_probability,
     describe_effect,
     percent,
     probability,
     size,
 )
-from fisheye_svp_ros.reporting.tables import UNITS, with_error
 from fisheye_svp_ros.scene.photograph_names import frame_name
+from fisheye_svp_ros.solve.rig_checks import is_unpaired
 
 LENS_FILE = 'extended_lens.yaml'
 LENS = {
@@ -59,29 +58,6 @@ _MEASURES = {
     'depth_error_m': ('stereo error', 1e3, 'mm'),
     'rig_translation_m': ('translation of the rig', 1e3, 'mm'),
     'rig_rotation_rad': ('rotation of the rig', 180 / math.pi, 'deg'),
-}
-_UNCERTAIN = {
-    'image_px': ('an image point, u or v', 1.0, 'px'),
-    'position_m': ('position from one frame', 1e3, 'mm'),
-    'rotation_rad': ('orientation from one frame', 180 / math.pi, 'deg'),
-}
-COMPONENTS = {
-    'named_lens': 'lens, identified', 'named_target': 'target, identified',
-    'named_frame': 'frames, identified',
-    'image_broad': 'image field, correlated over 1/3 of the width',
-    'image_coarse': 'image field, correlated over 1/6 of the width',
-    'image_fine': 'image field, correlated over 1/14 of the width',
-    'image_finest': 'finer image field',
-    'landmark_in_plane': 'landmarks along their board',
-    'landmark_normal': 'landmarks off their board', 'landmark': 'landmarks',
-    'board_stretch': 'stretch of the board', 'board_in_plane': 'board field along it',
-    'board_normal': 'board field off it',
-    'frame_focal': 'focal length of each frame', 'frame_centre': 'principal point of each frame',
-    'frame_linear': 'linear field of each frame',
-    'frame_quadratic': 'quadratic field of each frame',
-    'frame_bumps': 'image field of each frame', 'frame_bend': 'bend of the board in each frame',
-    'frame_sag': 'bend of the board that follows its tilt',
-    'frame_similar': 'landmarks in similar views', 'noise': 'noise of image points',
 }
 STAGE_WORDS = {
     'lens': 'lens (stays in the image)', 'target': 'target (stays with the board)',
@@ -151,6 +127,27 @@ def frame_ranges(d: Diagnosis, ranges: Sequence[tuple[int, int]]) -> str:
     return join_names([' to '.join(frame_name(table, one) for one in ends) for ends in ranges])
 
 
+def count_frames(d: Diagnosis) -> str:
+    """Return how many frames there are; of cameras that no rig holds together, how many views."""
+    numbers, plural = d.problem.observations.frame, 's' * (d.frames > 1)
+    if is_unpaired(d.model.data):
+        frames = len({*numbers.tolist()})
+        return (f'{d.frames} view{plural} of {frames} frame{"s" * (frames > 1)} (each view with '
+                'its own pose)')
+    pictures = d.problem.observations.photographs and len(d.lenses) == 1
+    return f'{d.frames} {"photograph" if pictures else "frame"}{plural}'
+
+
+def lens_contents(d: Diagnosis) -> str:
+    """Return what the extended lens has that the lens as given has not."""
+    field = d.evaluation.written_field
+    parts = ['intrinsics fitted to these data'] if d.intrinsics else []
+    parts += [c.effect for c in d.causes if c.effect_class.budget_stage() == 'lens']
+    parts += ['a viewpoint shift that is likely, not confirmed'] if d.averaged_model.shifts else []
+    parts += ['an image field'] if field is not None and field.fields else []
+    return f'with {join_names(parts)}' if parts else 'as it was fitted'
+
+
 def _field_sentence(d: Diagnosis) -> str:
     """Return what the image field in the lens file gains, and which frames refute it."""
     field = d.evaluation.written_field
@@ -164,15 +161,20 @@ def _field_sentence(d: Diagnosis) -> str:
 
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
-    if d.verdict == 'adequate':
+    if _shows_no_cause(d):
         but = [what for what, told in (('the intrinsics as given', _is_off(d)),
-                                       ('the rig', _rig_advice(d))) if told]
+                                       ('the rig', _rig_advice(d)),
+                                       ('the target', _is_target_off(d))) if told]
         nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
-        return (f'{nothing} is wrong in these data: in {d.observations} points of {d.frames} '
-                f'frames the residuals are {noise}, without a pattern.')
+        likely = d.verdict == 'adequate' and d.offers_extended
+        wrong = 'confirmed to be wrong' if likely else 'wrong'
+        rest = ' and displaced landmarks' if _is_target_off(d) else ', without a pattern'
+        return (f'{nothing} is {wrong} in these data: in {d.observations} points of '
+                f'{count_frames(d)} the residuals are {noise}{rest}.')
     if not d.causes:
-        return (f'The simulation leaves residuals of {d.figures.base.rms_px:.3g} px rms, and no '
-                'effect of the catalog explains them: '
+        off = 'The intrinsics as given are wrong. Fitted to these data, the'
+        return (f'{off if _is_off(d) else "The"} simulation leaves residuals of '
+                f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; '.join(
         f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
@@ -181,6 +183,16 @@ def _wrong(d: Diagnosis) -> str:
     more = len(d.causes) - _MAX_CAUSES
     rest = f'; the table lists {more} more cause{"s" * (more > 1)}' if more > 0 else ''
     return f'Besides {noise}, these errors are found: {causes}{rest}.'
+
+
+def _shows_no_cause(d: Diagnosis) -> bool:
+    """Say whether the lens, fitted to these data where it may be, leaves noise."""
+    return not d.causes and d.verdict in ('adequate', 'explained')
+
+
+def _is_target_off(d: Diagnosis) -> bool:
+    """Say whether landmarks are displaced, where no cause says how."""
+    return bool(d.remaining) or d.decision['target'].figure.value > 0
 
 
 def _almost(d: Diagnosis) -> str:
@@ -211,14 +223,13 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
                  f'it: with them {best:.3g} px')
     if not moving:
         why, times = 'no extension improved on it', before / max(2**0.5 * d.noise_px, 1e-3)
-        if d.verdict == 'adequate':
-            why = 'that is the noise' if times < _NOISE_RATIO else (
-                f'{times:.1f} times the noise: these frames constrain the lens poorly; --next N '
-                'lists the photographs to take')
+        if _shows_no_cause(d):
+            why = 'that is the noise' if times < _NOISE_RATIO else _poor_prediction(d, times)
         if d.causes:
             why = 'the cause is in the image points, not in the lens'
-        which = 'The lens, fitted to these data,' if _is_off(d) else 'The lens as it is'
-        return f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}.'
+        which = 'The lens, fitted to these data,' if d.intrinsics else 'The lens as it is'
+        text = f'{which} predicts held-out data to {before:.3g} px rms; {why}{local}'
+        return text + (_file_clause(d) if d.offers_extended else '') + '.'
     if named >= before:
         return (f'Held-out data do not confirm it: {named:.3g} px rms instead of {before:.3g}; do '
                 f'not correct for the causes{local}.')
@@ -229,15 +240,29 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
         text += (f'; this removes {value} (95 % interval {low} to {high}) of the error above the '
                  'noise')
     if 'target' in {c.effect_class.budget_stage() for c in moving}:
-        text += (f'; on the same corrected target the extended lens leaves '
-                 f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
+        text += _file_clause(d)
     for (label, base, extended, _), compared in zip(
-        known_rows(known), known.values(), strict=True
+        known_rows(d, known), known.values(), strict=True
     ):
         changed = compared.low > 0 or compared.high < 0
         text += f'; the {label} ' + (f'goes from {base} to' if changed else 'stays at') + (
             f' {extended}')
     return text + '.'
+
+
+def _poor_prediction(d: Diagnosis, times: float) -> str:
+    """Return why held-out data leave several times the noise where no cause shows."""
+    if _is_target_off(d):
+        return f'{times:.1f} times the noise: landmarks are displaced'
+    if d.decision['photographs'].say == 'enough':
+        return f'{times:.1f} times the noise'
+    how = '; --next N lists the photographs to take' if d.problem.plannable else ''
+    return f'{times:.1f} times the noise: these frames constrain the lens poorly{how}'
+
+
+def _file_clause(d: Diagnosis) -> str:
+    return (f'; on the same corrected target the extended lens leaves '
+            f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
 
 
 def _is_off(d: Diagnosis) -> bool:
@@ -300,39 +325,22 @@ def advice_text(advice: Advice) -> str:
     return f'{what} ({", ".join(about)})' if about else what
 
 
-def budget_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str, str, str]]:
-    """Yield the variance budget: part, stage, sd in px, share, p-value."""
-    for part in diagnosis.components:
-        yield (COMPONENTS[part.name], part.stage, f'{part.sd_px:.3f}', percent(part.share),
-               '-' if part.name == 'noise' else bare_probability(part.p_value))
-
-
-def uncertainty_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, ...]]:
-    """Yield what noise, parameters and remaining misfit make uncertain, and all together."""
-    for name, parts in diagnosis.uncertainty.items():
-        label, factor, unit = _UNCERTAIN[name]
-        sizes = (*parts.values(), math.hypot(*parts.values()))
-        yield label, *(f'{factor * value:.3g}' for value in sizes), unit
-
-
-def intrinsic_rows(diagnosis: Diagnosis) -> Iterable[tuple[str, str, str]]:
-    """Yield each free intrinsic and its unit, before and after, with its standard error."""
-    for name, value in diagnosis.intrinsics.items():
-        unit = UNITS.get(name.rpartition('.')[2])
-        yield (
-            f'{name}, {unit}' if unit else name,
-            ' ± '.join(with_error(value.before, value.before_stderr)),
-            ' ± '.join(with_error(value.after, value.after_stderr)),
-        )
-
-
 def _remedy(cause: Cause) -> str:
     return cause.to_separate.replace(';', ',')
 
 
-def known_rows(known: Mapping[str, Comparison]) -> Iterable[tuple[str, str, str, str]]:
-    """Return name, mean error before and after, and by how much it is less."""
-    return (compared_row(name, compared) for name, compared in known.items())
+def known_rows(
+    d: Diagnosis, known: Mapping[str, Comparison]
+) -> Iterable[tuple[str, str, str, str]]:
+    """Yield name, mean error before and after, and by how much it is less.
+
+    Without a cause in the model nothing comes after.
+    """
+    changed = any(cause.effect_class.stage != 'noise' for cause in d.causes)
+    for name, compared in known.items():
+        label, before, *rest = compared_row(name, compared)
+        after, less = rest if changed else ('-', '-')
+        yield label, before, after, less
 
 
 def compared_row(name: str, compared: Comparison) -> tuple[str, str, str, str]:

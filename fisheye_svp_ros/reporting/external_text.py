@@ -19,6 +19,7 @@ from fisheye_svp_ros.solve.hand_eye import HandEye
 
 CARRIED_HEADER = ('found in', 'tried on', 'what', 'rms px without', 'with', 'less by (95 %)')
 _SIGNIFICANT_RATIO, _MAX_PARAMETERS = 3.0, 4
+_MIN_HEIGHT = 1e-9  # m, rms: less is rounding
 _NO_RIG_NOTE = (
     '; their relative pose is not constant, the photographs are not simultaneous, or the two see '
     'different boards, so each view has its own pose and no result depends on the rig')
@@ -65,13 +66,13 @@ def _of_cameras(pair: TwoCameras) -> Section:
     rows = [] if not pair.rig else list(_rig_rows(pair.rig))
     if pair.maps is not None:
         first, second = (f'{1e3 * rms:.3f} mm rms' for rms in pair.maps.rms_m)
-        rows += [
-            (f'height of {pair.maps.landmarks} landmarks, from {pair.cameras[0]} alone and from '
-             f'{pair.cameras[1]} alone', first, second,
-             f'correlation {pair.maps.correlation:.2f}'),
-            ('their positions along the board', '', '',
-             f'correlation {pair.maps.correlation_along:.2f}'),
-        ]
+        whose = (f'of {pair.maps.landmarks} landmarks, from {pair.cameras[0]} alone and from '
+                 f'{pair.cameras[1]} alone')
+        if _has_height(pair):
+            rows.append((f'height {whose}', first, second,
+                         f'correlation {pair.maps.correlation:.2f}'))
+        rows.append((f'positions along the board {whose}', '', '',
+                     f'correlation {pair.maps.correlation_along:.2f}'))
     return Section(
         CAMERAS_TITLE, f'{_agreement(pair)}{_rig(pair)}.',
         [carried_row(one, 'shape of the target') for one in pair.target],
@@ -87,13 +88,24 @@ def _agreement(pair: TwoCameras) -> str:
         f'{one.to} from {one.without_px:.3g} to {one.with_px:.3g} px' for one in pair.target
     ])
     carried = f'the shape estimated from one camera changes the held-out error of {tried}'
-    alike = '' if pair.maps is None else f'; their maps correlate by {pair.maps.correlation:.2f}'
+    alike = '' if pair.maps is None else f'; their maps correlate by {_map_correlation(pair)}'
     if pair.verdict == 'agree':
         return f'{both} agree: {carried}{alike}'
     if pair.verdict == 'undecided':
         return f'{both} are undecided: {carried}, not significant in both{alike}'
     gone = f', so that {join_names(pair.withdrawn)} is withdrawn' if pair.withdrawn else ''
     return f'{both} contradict each other about the target: {carried}{alike}{gone}'
+
+
+def _map_correlation(pair: TwoCameras) -> str:
+    """Return how alike two maps are; where landmarks moved along the board only, along it."""
+    assert pair.maps is not None
+    return (f'{pair.maps.correlation:.2f}' if _has_height(pair) else
+            f'{pair.maps.correlation_along:.2f} along the board')
+
+
+def _has_height(pair: TwoCameras) -> bool:
+    return pair.maps is not None and max(pair.maps.rms_m) > _MIN_HEIGHT
 
 
 def _rig(pair: TwoCameras) -> str:

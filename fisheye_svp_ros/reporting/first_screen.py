@@ -18,8 +18,13 @@ from fisheye_svp_ros.diagnosis import (
     frames_of,
 )
 from fisheye_svp_ros.reporting.blocks import image_uri
-from fisheye_svp_ros.reporting.cause_text import HUMAN_UNITS, size
-from fisheye_svp_ros.reporting.diagnosis_text import frame_ranges, known_rows, lens_words
+from fisheye_svp_ros.reporting.cause_text import HUMAN_UNITS, percent, size
+from fisheye_svp_ros.reporting.diagnosis_text import (
+    count_frames,
+    frame_ranges,
+    known_rows,
+    lens_words,
+)
 from fisheye_svp_ros.reporting.headline import PHOTOGRAPHS, headline, target_words
 from fisheye_svp_ros.scene.photograph_names import photograph_names
 
@@ -64,7 +69,8 @@ def first_screen(
 ) -> Screen:
     """Return the first screen; source: what was diagnosed; known: errors against the truth."""
     paths = _paths(d)
-    about = frames_of(d.advice, RETAKE) or frames_of(d.advice, UNLIKE)
+    kind = {'retake': RETAKE, 'more': UNLIKE}.get(d.decision['photographs'].say, '')
+    about = frames_of(d.advice, kind) if kind else []
     answers: tuple[tuple[str, str, Decision, list[str]], ...] = (
         ('Lens', lens_words(d), d.decision['lens'], []),
         ('Target', target_words(d), d.decision['target'], []),
@@ -78,8 +84,8 @@ def first_screen(
                      max(len(some) - _MAX_NAMES, 0))
               for title, do, decision, some in answers),
         _causes(d), _candidates(d), _bound_text(d.decision['lens']),
-        '; '.join(f'{name} {before} → {after}'
-                  for name, before, after, _ in known_rows(known or {})))
+        '; '.join(f'{name} {before}' + (f' → {after}' if after != '-' else '')
+                  for name, before, after, _ in known_rows(d, known or {})))
 
 
 def _reason(decision: Decision, d: Diagnosis) -> str:
@@ -109,8 +115,6 @@ def terminal_lines(screen: Screen, command: str) -> list[str]:
 
 
 def _facts(d: Diagnosis, source: str) -> str:
-    kind = 'photograph' if d.problem.observations.photographs else 'frame'
-    kind += 's' if d.frames > 1 else ''
     figures = d.figures
     base, named, extended = (
         one.heldout_rms_px for one in (figures.base, figures.named, figures.extended))
@@ -120,7 +124,7 @@ def _facts(d: Diagnosis, source: str) -> str:
         before, after = (next(one['value'] for one in rays[side] if one['range_m'] == asked)
                          for side in ('given', 'extended'))
         near = f'; ray error {before:.2g} → {after:.2g} mrad at {asked:g} m'
-    return (f'{source}: {d.observations} points in {d.frames} {kind}; held-out error '
+    return (f'{source}: {d.observations} points in {count_frames(d)}; held-out error '
             f'{base:.3g} → {named:.3g} px ({extended:.3g} px with local offsets), '
             f'noise {d.noise_px:.2g} px{near}')
 
@@ -144,12 +148,15 @@ def _warning(d: Diagnosis) -> str:
 def _confidence(decision: Decision) -> str:
     if decision.confidence is None or decision.say == 'undecided':
         return ''
-    sure = f'{100 * decision.confidence:.0f} % sure'
-    if decision.confidence > _CERTAIN:
-        sure = f'more than {100 * _CERTAIN:.0f} % sure'
+    sure = f'{_sure_text(decision.confidence)} sure'
     if decision.say == 'use_extended':
-        return f'removes {100 * decision.figure.value:.0f} % of the squared error, {sure}'
+        return f'removes {percent(decision.figure.value)} of the squared error, {sure}'
     return sure
+
+
+def _sure_text(probability: float) -> str:
+    limit = 100 * _CERTAIN
+    return f'more than {limit:.0f} %' if probability > _CERTAIN else f'{100 * probability:.0f} %'
 
 
 def _causes(d: Diagnosis) -> str:
@@ -169,7 +176,7 @@ def _candidates(d: Diagnosis) -> str:
     shifts = d.averaged_model.shifts
     others = [one for one in d.candidates if not shifts or one.effect != 'viewpoint_shift']
     words = [f'{f"{one.camera} " if one.camera else ""}viewpoint_shift (posterior probability '
-             f'{100 * one.weight:.0f} %: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
+             f'{_sure_text(one.weight)}: the extended lens includes e0 = {1e3 * one.e0:.2g} ± '
              f'{1e3 * one.stderr:.2g} mm)' for one in shifts]
     words += [f'{one.effect} ({one.why})' for one in others[:_MAX_NAMES]]
     more = len(others) - _MAX_NAMES
@@ -202,14 +209,18 @@ def _thumbnail(path: str | None) -> str:
     return image_uri(cv2.imencode('.jpg', small)[1].tobytes(), 'jpeg')
 
 
-def next_command(d: Diagnosis, observations: str, options: str, lenses: Sequence[str]) -> str:
+def next_command(
+    d: Diagnosis, observations: str, options: str, lenses: Sequence[str], settings: str = '',
+    planned: bool = False,
+) -> str:
     """Return the command to go on with, as a shell takes it.
 
     observations: with the options that find the board; options: of the extended lenses; lenses:
-    as given.
+    as given; settings: further options of this diagnosis; planned: whether the photographs to
+    take next are listed already.
     """
-    boards = {*d.problem.observations.board.tolist()}
-    if d.decision['lens'].say == 'undecided' and len(d.lenses) == len(boards) == 1:
-        return f'fisheye-svp diagnose {observations} {" ".join(lenses)} --next 6 -o next'
+    if d.decision['lens'].say == 'undecided' and d.problem.plannable and not planned:
+        words = ['fisheye-svp diagnose', observations, *lenses, settings, '--next 6 -o next']
+        return ' '.join(filter(None, words))
     used = options if d.offers_extended else ' '.join(lenses)
     return f'fisheye-svp localize {observations} {used} -o poses'

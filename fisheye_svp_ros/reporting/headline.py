@@ -6,7 +6,7 @@ from fisheye_svp_ros.diagnosis import Cause, Diagnosis
 from fisheye_svp_ros.reporting.cause_text import describe_effect, most_significant, size
 from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, lens_words, only_gross
 
-VERDICTS = {
+_VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
     'explained': 'Explained: the model error is identified',
     'partly_explained': 'Partly explained: some of the residual error is unexplained',
@@ -20,6 +20,7 @@ TARGET = {
 PHOTOGRAPHS = {
     'enough': 'Enough', 'more': 'Take more', 'retake': 'Take some again',
 }
+NO_CONFIRMED_ERROR = 'no model error is confirmed in these data'
 _HEADLINES = {
     'viewpoint_shift': 'The viewpoint of the lens shifts with the angle',
     'radial_profile': 'The image-height curve of the lens is wrong',
@@ -46,12 +47,27 @@ def headline(d: Diagnosis) -> str:
     return f'{largest_cause(d)}{_displaced_landmarks(d)}. {lens_words(d)}.'
 
 
+def verdict_words(d: Diagnosis) -> str:
+    """Return the verdict as a sentence that agrees with the headline."""
+    if d.verdict == 'unexplained' and only_gross(d):
+        return 'Unexplained: outliers; nothing else is wrong'
+    if d.verdict == 'adequate' and d.offers_extended:
+        return f'Adequate: {NO_CONFIRMED_ERROR}'
+    if not d.causes and d.decision['lens'].say == 'recalibrate':
+        rest = '; some of the residual error is unexplained' if d.remaining else ''
+        return f'{_VERDICTS[d.verdict].partition(":")[0]}: the lens as given is off{rest}'
+    return _VERDICTS[d.verdict]
+
+
 def target_words(d: Diagnosis) -> str:
     """Return what to do about the target."""
     say = d.decision['target'].say
-    words = TARGET['measure_again' if say == 'correct' and not d.offers_extended else say]
+    if say == 'keep':
+        return TARGET[say]
+    by_file = d.offers_extended or say != 'correct'
+    words = TARGET[say] if by_file else 'Correct the target: measure it'
     bent = any(cause.effect == 'target_shape' for cause in d.causes)
-    return words if say == 'keep' else f'{words}, or {"flatten or " if bent else ""}replace it'
+    return f'{words}, or {"flatten or " if bent else ""}replace it'
 
 
 def largest_cause(d: Diagnosis) -> str:
@@ -79,7 +95,8 @@ def largest_cause(d: Diagnosis) -> str:
         which = 'Only the target' if d.verdict == 'adequate' else 'The target'
         return f'{which} is imperfect: {d.decision["target"].why}'
     if d.verdict == 'adequate':
-        return 'No model error shows in these data'
+        return (_capital(NO_CONFIRMED_ERROR) if d.offers_extended else
+                'No model error shows in these data')
     return 'No effect of the catalog explains the residual error'
 
 

@@ -14,7 +14,9 @@ from fisheye_svp_ros.reporting.first_screen import next_command
 class ReportInputs(NamedTuple):
     """What was diagnosed, as the user named it; folder: where the report goes.
 
-    search: options of a command that finds the board in the photographs, where these are some.
+    search: options of a command that finds the board in the photographs, where these are some;
+    settings: further options that say how it was diagnosed; planned: whether the photographs to
+    take next are listed.
     """
 
     observations: str
@@ -24,13 +26,16 @@ class ReportInputs(NamedTuple):
     folder: Path
     free_intrinsics: bool
     search: tuple[str, ...] = ()
+    settings: tuple[str, ...] = ()
+    planned: bool = False
 
 
 def command_to_go_on(diagnosis: Diagnosis, inputs: ReportInputs) -> str:
     """Return the command to go on with, as a shell takes it."""
     words = follow_up_files(diagnosis, inputs)
     lenses = [shlex.join(['--lens', lens]) for lens in inputs.lens]
-    return next_command(diagnosis, words['observations'], words['options'], lenses)
+    return next_command(diagnosis, words['observations'], words['options'], lenses,
+                        shlex.join(inputs.settings), inputs.planned)
 
 
 def follow_up_files(diagnosis: Diagnosis, inputs: ReportInputs) -> dict[str, str]:

@@ -71,7 +71,13 @@ def with_error(value: float, standard_error: float) -> tuple[str, str]:
     decimals = max(0, 1 - math.floor(math.log10(standard_error)))
     if decimals > 9:
         return f'{value:.6g}', f'{standard_error:.1e}'
-    return f'{value:.{decimals}f}', f'{standard_error:.{decimals}f}'
+    text = f'{value:.{decimals}f}'
+    return without_minus_zero(text), f'{standard_error:.{decimals}f}'
+
+
+def without_minus_zero(text: str) -> str:
+    """Return a number as text, without the sign of a negative one that is rounded to zero."""
+    return text.removeprefix('-') if float(text) == 0 else text
 
 
 def range_text(range_m: float) -> str:

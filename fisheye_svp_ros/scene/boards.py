@@ -11,6 +11,9 @@ from fisheye_svp_ros.arrays import Array, Index
 _MIN_LANDMARKS_DEGREE_6 = 100  # landmarks: four for each coefficient from degree 2 to 6
 
 
+MAX_THICKNESS = 0.02  # thickness of a board over its length
+
+
 class Board(NamedTuple):
     """A board's id, centre (3,), axes (3, 3; rows a, b, normal), size (m) and flatness.
 
@@ -39,6 +42,12 @@ def spacing(points: Array) -> float:
     """Return the median distance of points (M, 3) to their nearest neighbours."""
     from scipy.spatial import KDTree  # not loaded for the help of a command
     return float(np.median(np.asarray(KDTree(points).query(points, 2)[0])[:, 1]))
+
+
+def is_flat(points: Array) -> bool:
+    """Say whether points (N, 3) are one flat board: its thickness is little beside its length."""
+    extent = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(len(extent) < 3 or extent[2] <= MAX_THICKNESS * extent[0])
 
 
 def find_boards(points: Array, board: Index) -> list[Board]:

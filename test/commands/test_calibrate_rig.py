@@ -178,6 +178,8 @@ def test_a_rig_of_three_is_posed_and_diagnosed_as_one(
     for camera in CAMERAS[:3]:
         e0 = shift['parameters'][f'{camera}.e0']
         assert abs(e0['value'] - 0.004) < 4 * e0['stderr'] < 0.012
+    report = (out / 'report.html').read_text()
+    assert 'with their relative poses in <code>rig.yaml</code>' in report
     capsys.readouterr()
     extended = [f'--lens=cam{i}={out}/cam{i}/extended_lens.yaml' for i in range(3)]
     assert cli.main(['localize', str(tmp_path / 'obs.csv'), *extended, '--rig',

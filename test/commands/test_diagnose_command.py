@@ -33,7 +33,8 @@ from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting import diagnosis_plots, evidence_plots
 from fisheye_svp_ros.reporting.cause_text import cause_rows
 from fisheye_svp_ros.reporting.diagnosis_plots import PlotData, residual_pictures
-from fisheye_svp_ros.reporting.diagnosis_text import advice_text, intrinsic_rows, verdict_sentences
+from fisheye_svp_ros.reporting.diagnosis_text import advice_text, verdict_sentences
+from fisheye_svp_ros.reporting.figure_rows import intrinsic_rows
 from fisheye_svp_ros.reporting.headline import headline
 from fisheye_svp_ros.reporting.point_residuals import point_residuals
 from fisheye_svp_ros.scene.landmarks import Landmarks

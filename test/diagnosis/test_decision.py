@@ -111,7 +111,26 @@ def test_photographs_are_enough_or_not() -> None:
     assert decide_photographs(facts._replace(bad=['1.jpg'])).say == 'enough'
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
+    open_ = facts._replace(lens='undecided', plannable=False)
+    assert '--next' not in decide_photographs(open_).why
     assert decide_photographs(facts._replace(unlike=['1', '2', '3', '4'])).say == 'more'
+
+
+def test_enough_photographs_with_a_large_error_say_where_it_is_from() -> None:
+    """"Enough. Held-out error 15.6 times what noise leaves" asked for a reason."""
+    facts = PhotographsFacts(26, [], [], 0.9, 0.09, 'keep', is_target_off=True)
+    assert decide_photographs(facts).why.endswith('leave; the target causes the rest')
+    assert decide_photographs(facts._replace(heldout_px=0.1)).why.endswith('frames leave')
+    assert decide_photographs(facts._replace(unit='view')).why.startswith('26 views, ')
+    assert decide_photographs(facts._replace(unit='view', frames=1)).why.startswith('one view ')
+
+
+def test_all_that_is_likely_is_named() -> None:
+    """Of three effects that are alike, only one was."""
+    tilt = Bound('sensor_tilt', 0.002, 'rad', 2.7, 0.31, 0.6)
+    found = decide_lens(SOUND._replace(bounds=[LIKELY, SMALL, tilt]))
+    assert found.say == 'undecided'
+    assert 'viewpoint_shift or sensor_tilt, which may cause up to 0.32 px' in found.why
 
 
 def test_one_frame_decides_nothing() -> None:

@@ -2,13 +2,23 @@
 
 import warnings
 from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from benchmark.two_cameras import Hidden, pair
 from fisheye_svp_ros import cli
-from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose, diagnose_against, simplest_form
+from fisheye_svp_ros.diagnosis import (
+    Comparison,
+    DiagnosisOptions,
+    Transfer,
+    TwoCameras,
+    diagnose,
+    diagnose_against,
+    simplest_form,
+)
+from fisheye_svp_ros.diagnosis.checks.two_cameras import TargetMaps
 from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
@@ -16,6 +26,7 @@ from fisheye_svp_ros.io.readers import write_observations
 from fisheye_svp_ros.io.rig_files import load_rig
 from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.external_text import sections
+from fisheye_svp_ros.reporting.first_screen import first_screen
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state
 from fisheye_svp_ros.solve.measured_poses import posable_observations
@@ -175,6 +186,28 @@ def test_cameras_that_were_not_photographed_together(late):
     assert 'each view has its own pose' in sections(found)[0].sentence
     assert 'have no constant relative pose' in verdict_sentences(found)[2].lower()
     assert found.figures.extended.heldout_rms_px < 0.15
+
+
+def test_views_of_cameras_without_a_rig_are_counted_as_views():
+    """A pair of four frames was told to be eight frames."""
+    few, shared = few_shared(pair(replace(SMALL, reversed_frames=0), 1), 4)
+    lenses = pair(replace(SMALL, reversed_frames=0), 1).lenses
+    found = diagnose(few.take(np.isin(few.frame, shared)), lenses,
+                     options=DiagnosisOptions(quick=True))
+    said = 'in 8 views of 4 frames (each view with its own pose)'
+    assert said in first_screen(found, 'table').facts
+    assert found.decision['photographs'].why.startswith('8 views')
+
+
+def test_maps_along_the_board_alone_are_compared_along_it():
+    """Without a height the maps of cameras that agree were told to "correlate by 0.00"."""
+    maps = TargetMaps(88, 0.0, 0.57, (1e-21, 1e-21))
+    carried = (Transfer('left', 'right', 0.3, 0.2, Comparison(0.3, 0.2, 0.1, 0.05, 0.15)),) * 2
+    found = SimpleNamespace(cameras=[TwoCameras(('left', 'right'), carried, maps, {})],
+                            hand_eye=None, against=None)
+    section, = sections(found)
+    assert 'their maps correlate by 0.57 along the board' in section.sentence
+    assert not any(row[0].startswith('height') for row in section.rows)
 
 
 def test_cameras_without_a_common_frame():

@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.diagnoses import with_changes
 from helpers.scenes import lens, observe, scene
 
-from fisheye_svp_ros.diagnosis import Cause, Diagnosis, DiagnosisOptions, diagnose
+from fisheye_svp_ros.diagnosis import (
+    RETAKE,
+    Advice,
+    Cause,
+    Comparison,
+    Diagnosis,
+    DiagnosisOptions,
+    Structure,
+    diagnose,
+)
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
-from fisheye_svp_ros.reporting.cause_text import size
+from fisheye_svp_ros.reporting.cause_text import percent, size
+from fisheye_svp_ros.reporting.diagnosis_report import write_report
+from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import Photo, first_screen, terminal_lines
-from fisheye_svp_ros.reporting.headline import headline, target_words
+from fisheye_svp_ros.reporting.headline import headline, target_words, verdict_words
+from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
+from fisheye_svp_ros.reporting.point_residuals import point_residuals
 
 
 @pytest.fixture(scope='module')
@@ -115,3 +130,121 @@ def test_only_an_extended_lens_that_is_offered_is_warned_of(
     worse = replace(worse, conclusion=replace(
         worse.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)))
     assert ('extended lens on one target' in first_screen(worse, 'table').warning) == warned
+
+
+@pytest.mark.parametrize(('share', 'words'), [
+    (0.5, '50 %'), (0.9963, '99.6 %'), (0.99996, '100 %'), (0.0042, '0.4 %'), (0.0003, '0.03 %'),
+    (-1e-9, '0 %'), (0.0, '0 %'), (-0.004, '-0.4 %'), (1.0, '100 %')])
+def test_a_share_is_not_rounded_to_nothing_or_all(share: float, words: str) -> None:
+    """Reports had "-0 % (-0 % to 0 %)", and gains of "100 % (100 % to 100 %)"."""
+    assert percent(share) == words
+
+
+def test_a_likely_shift_is_not_told_as_no_model_error(found: Diagnosis) -> None:
+    """The headline was "No model error shows in these data. Use extended_lens.yaml."."""
+    likely = replace(_deciding(found, 'lens', say='use_extended'), causes=[], remaining=[])
+    assert likely.verdict == 'adequate'
+    assert headline(likely) == (
+        'No model error is confirmed in these data. Use extended_lens.yaml.')
+    assert verdict_words(likely) == 'Adequate: no model error is confirmed in these data'
+    wrong, gained, _ = verdict_sentences(likely)
+    assert wrong.startswith('Nothing is confirmed to be wrong in these data')
+    assert 'the extended lens leaves' in gained
+
+
+def test_a_lens_that_is_off_is_all_that_is_wrong(found: Diagnosis) -> None:
+    """The verdict was explained, and the sentence below it "no effect explains them: ."."""
+    off = replace(_deciding(found, 'lens', say='recalibrate', why='the lens is off'), causes=[],
+                  remaining=[])
+    wrong, gained, _ = verdict_sentences(off)
+    assert off.verdict == 'explained'
+    assert wrong.startswith('Nothing but the intrinsics as given is wrong in these data')
+    assert 'no extension improved' not in gained
+    assert verdict_words(off) == 'Explained: the lens as given is off'
+    more = replace(off, remaining=[Structure('theta', 1e-9, 0.1)])
+    assert 'intrinsics as given are wrong. Fitted' in verdict_sentences(more)[0]
+    assert verdict_words(more) == (
+        'Partly explained: the lens as given is off; some of the residual error is unexplained')
+
+
+def test_an_imperfect_target_is_told_in_every_sentence(found: Diagnosis) -> None:
+    """"Only the target is imperfect", and below: nothing is wrong, without a pattern."""
+    figure = Figure('local_offsets', 0.38, 'px')
+    again = replace(_deciding(found, 'target', say='measure_again', figure=figure), causes=[],
+                    remaining=[Structure('landmark', 1e-9, 0.9)])
+    assert again.verdict == 'adequate'
+    wrong, *_ = verdict_sentences(again)
+    assert wrong.startswith('Nothing but the target is wrong in these data')
+    assert wrong.endswith(' and displaced landmarks.')
+
+
+def test_outliers_alone_are_no_riddle_in_the_verdict(found: Diagnosis) -> None:
+    gross = [{'frame': 4, 'landmark': 17, 'px': 12.3, 'why': 'far off'}]
+    clean = with_changes(found, causes=[], remaining=[Structure('outliers', 0.0, 0.5)],
+                         gross=gross)
+    assert 'nothing else is wrong' in headline(clean)
+    assert verdict_words(clean) == 'Unexplained: outliers; nothing else is wrong'
+
+
+def test_words_about_the_target_agree_with_its_decision(found: Diagnosis) -> None:
+    """diagnosis.json had `correct`; the terminal said to measure the target."""
+    bent = replace(_tilt(0.0, 0.0), effect='target_shape')
+    kept = replace(_deciding(found, 'target', say='correct'), causes=[bent])
+    assert not kept.offers_extended
+    assert target_words(kept) == 'Correct the target: measure it, or flatten or replace it'
+    offered = _deciding(kept, 'lens', say='use_extended')
+    assert target_words(offered).startswith('Correct it by extended_lens.yaml')
+
+
+def test_without_a_cause_the_truth_is_told_once(found: Diagnosis) -> None:
+    """"1.55 mm → 1.55 mm" beside "Use extended_lens.yaml" read as if the lens gained nothing."""
+    known = {'position_error_m': Comparison(0.002, 0.002, -1e-9, 0.0, 0.0)}
+    assert first_screen(replace(found, causes=[]), 'table', known).truth == 'position error 2 mm'
+    tilted = replace(found, causes=[_tilt(0.005, 0.002)])
+    assert first_screen(tilted, 'table', known).truth == 'position error 2 mm → 2 mm'
+
+
+def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
+    """It left out the poses and the free intrinsics, and planned what was planned already."""
+    inputs = ReportInputs('a b.csv', ('l.yaml',), 'p.csv', None, Path('out'), True,
+                          settings=('--poses', 'p.csv', '--free', 'intrinsics'))
+    lens_open = {'lens': SimpleNamespace(say='undecided')}
+    open_ = SimpleNamespace(decision=lens_open, lenses={'': None}, offers_extended=False,
+                            problem=SimpleNamespace(plannable=True))
+    assert command_to_go_on(open_, inputs) == (
+        "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
+        '-o next')
+    assert command_to_go_on(open_, inputs._replace(planned=True)).startswith(
+        "fisheye-svp localize 'a b.csv' --lens l.yaml")
+
+
+def test_no_plan_is_promised_that_the_target_does_not_allow(found: Diagnosis) -> None:
+    """The command that the report printed ended with "the target is not one flat board"."""
+    assert not found.problem.plannable
+    inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
+    assert '--next' not in command_to_go_on(_deciding(found, 'lens', say='undecided'), inputs)
+
+
+def test_photographs_are_named_only_beside_what_to_do_with_them(found: Diagnosis) -> None:
+    """"Enough: frame 3. 16 frames, ..." did not say what was to be done with frame 3."""
+    bad = replace(found, advice=[Advice('take again', frames=[3], kind=RETAKE)])
+    for say, names in (('enough', []), ('more', []), ('retake', ['frame 3'])):
+        action = first_screen(_deciding(bad, 'photographs', say=say), 'table').actions[2]
+        assert [photo.name for photo in action.photographs] == names
+
+
+def test_a_step_without_an_error_is_not_within_it(found: Diagnosis) -> None:
+    step = replace(_tilt(0.0, 0.0), effect='quantisation', parameters={
+        'step': {'value': 0.25, 'stderr': 0.0, 'unit': 'px'}})
+    assert size(found, step) == 'step = 0.25 px'
+
+
+def test_the_report_of_a_likely_shift_claims_no_causes(found: Diagnosis, tmp_path: Path) -> None:
+    """"The lens with its causes" stood below "Causes: none", and "1 points" among outliers."""
+    gross = [{'frame': 4, 'landmark': 17, 'px': 12.3, 'why': 'far off'}]
+    likely = with_changes(_deciding(found, 'lens', say='use_extended'), causes=[], gross=gross)
+    write_report(likely, point_residuals(found.simulation, found.cause_fit), {},
+                 ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False))
+    page = (tmp_path / 'report.html').read_text()
+    assert 'is the lens as it was fitted; every command' in page
+    assert 'fits and pictures: 1 point<' in page

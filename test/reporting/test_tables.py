@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fisheye_svp_ros.reporting.tables import interval, print_table
+from fisheye_svp_ros.reporting.tables import interval, print_table, with_error
 
 
 @pytest.mark.parametrize('count', [8, 30])
@@ -25,3 +25,9 @@ def test_numbers_are_never_cut(
 def test_an_interval_has_two_digits_of_its_width() -> None:
     assert interval(355.937, 358.911) == '355.94 … 358.91'
     assert interval(-0.00022, 0.0003) == '-0.000220 … 0.000300'
+
+
+def test_what_is_rounded_to_zero_has_no_sign() -> None:
+    """Intrinsics were told as "-0.0000 ± 0.0024"."""
+    assert with_error(-0.00004, 0.0024) == ('0.0000', '0.0024')
+    assert with_error(-0.0004, 0.0024) == ('-0.0004', '0.0024')
