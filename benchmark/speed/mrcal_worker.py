@@ -17,14 +17,17 @@ seen = seen.reshape(2 * views, rows, columns, 3)
 indices = np.array(
     [(view, camera, camera - 1) for view in range(views) for camera in range(2)], dtype=np.int32
 )
+# The names of the poses since mrcal 2.5, and those before.
+CAMERA, FRAMES = ('rt_cam_ref', 'rt_ref_frame') if 'rt_cam_ref' in (
+    mrcal.optimize.__doc__ or '') else ('extrinsics_rt_fromref', 'frames_rt_toref')
 for _ in sys.stdin:
     extrinsics = problem['extrinsics'].copy()
     arguments = {
         'intrinsics': np.array([problem['intrinsics']] * 2),
-        'extrinsics_rt_fromref': extrinsics,
+        CAMERA: extrinsics,
         'points': None, 'observations_point': None,
         'indices_point_camintrinsics_camextrinsics': None,
-        'frames_rt_toref': problem['frames'].copy(),
+        FRAMES: problem['frames'].copy(),
         'observations_board': seen.copy(),
         'indices_frame_camintrinsics_camextrinsics': indices,
         'lensmodel': 'LENSMODEL_STEREOGRAPHIC',

@@ -13,7 +13,7 @@ from benchmark.speed.compiled import compiler, mrcal_revision
 from benchmark.speed.harness import OURS, NotHereError, Row
 
 _PACKAGES = ('numpy', 'scipy', 'numba', 'opencv-python-headless', 'poselib', 'pycolmap', 'gtsam',
-             'ros-jazzy-rclpy')
+             'ros-jazzy-rclpy', 'mrcal')
 # Columns of words; all others hold numbers.
 _WORDS = ('what', 'node', 'version', 'who', 'notes', 'work', 'that grows', 'command', 'on', 'met',
           'engine', 'against')

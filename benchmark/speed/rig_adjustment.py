@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,8 @@ from benchmark.speed.worker import worker
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.pose import Pose, cross_matrix, rotation_from_vector, vector_from_rotation
 
-_PYTHON = '/usr/bin/python3'  # Debian's and Ubuntu's python3-mrcal belongs to it
+# mrcal's wheel, or what belongs to the system's own Python: Debian's and Ubuntu's python3-mrcal.
+_PYTHONS = (sys.executable, '/usr/bin/python3')
 _WORKER = Path(__file__).with_name('mrcal_worker.py')
 
 
@@ -83,11 +85,12 @@ def opencv_rig(scene: StereoScene) -> Pose:
 
 @contextmanager
 def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Yield a function that runs mrcal.optimize once, in the system's own Python.
+    """Yield a function that runs mrcal.optimize once, in a process of its own.
 
     It returns {seconds, rig: rotation vector and place (6,) of the right camera in the left one}.
+    Raises NotHereError where there is no mrcal, and where it ends by itself.
     """
-    _require_mrcal()
+    python = _python_with_mrcal()
     lens = scene.lens
     with tempfile.TemporaryDirectory() as folder:
         problem = Path(folder) / 'problem.npz'
@@ -97,15 +100,17 @@ def mrcal_rig(scene: StereoScene) -> Iterator[Callable[[], dict[str, Any]]]:
             left=scene.left.uv, right=scene.right.uv,
             frames=_rt(scene.pose.inverse()), extrinsics=_rt(scene.rig.inverse())[None],
         )
-        with worker([_PYTHON, '-E', str(_WORKER), str(problem)]) as run:
+        with worker([python, '-E', str(_WORKER), str(problem)]) as run:
             yield run
 
 
-def _require_mrcal() -> None:
-    try:
-        subprocess.run([_PYTHON, '-E', '-c', 'import mrcal'], capture_output=True, check=True)
-    except (OSError, subprocess.CalledProcessError) as reason:
-        raise NotHereError(f'no mrcal for {_PYTHON}; `apt install python3-mrcal`') from reason
+def _python_with_mrcal() -> str:
+    for python in _PYTHONS:
+        with suppress(OSError):
+            if not subprocess.run([python, '-E', '-c', 'import mrcal'], capture_output=True,
+                                  check=False).returncode:
+                return python
+    raise NotHereError('no mrcal; `pip install mrcal` or `apt install python3-mrcal`')
 
 
 def mrcal_pose(answer: dict[str, Any]) -> Pose:

@@ -51,6 +51,7 @@ def _stereographic(views: int, repeats: int) -> Row:
 
         def mrcal() -> Side:
             run = stack.enter_context(mrcal_rig(scene))
+            run()  # if it ends by itself, its row is left out
             return Side(
                 'mrcal', run, 1.0, lambda answer: off(mrcal_pose(answer)),
                 lambda answer: float(answer['seconds']),

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
+
+from benchmark.speed.harness import NotHereError
 
 
 @contextmanager
 def worker(
     command: Sequence[str], environment: Mapping[str, str] | None = None
 ) -> Iterator[Callable[[], dict[str, Any]]]:
-    """Yield a function that has the process work once and returns its answer, with its times."""
+    """Yield a function that has the process work once and returns its answer, with its times.
+
+    It raises NotHereError where the process ends without an answer.
+    """
     with subprocess.Popen(
         command, env=environment, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
@@ -21,9 +26,14 @@ def worker(
         asked, answered = process.stdin, process.stdout
 
         def run() -> dict[str, Any]:
-            print('go', file=asked, flush=True)
-            answer: dict[str, Any] = json.loads(answered.readline())
+            with suppress(BrokenPipeError):
+                print('go', file=asked, flush=True)
+            line = answered.readline()
+            if not line:
+                raise NotHereError(f'its process ended with {process.wait()}')
+            answer: dict[str, Any] = json.loads(line)
             return answer
 
         yield run
-        asked.close()
+        with suppress(BrokenPipeError):
+            asked.close()

@@ -89,6 +89,13 @@ def test_the_hand_written_kernel_is_right(lens):
     )
 
 
+def test_a_worker_that_dies_leaves_its_row_out():
+    """The benchmark ended with an error of JSON when mrcal did."""
+    with worker([sys.executable, '-c', 'exit(3)']) as ask:
+        sides, left_out = available({'dead': lambda: Side('dead', ask())})
+    assert not sides and left_out == {'dead': 'its process ended with 3'}
+
+
 def test_a_worker_answers_each_time_it_is_asked():
     answer = 'import sys\nfor line in sys.stdin: print(\'{"wall": 2.5}\', flush=True)'
     with worker([sys.executable, '-c', answer]) as ask:
