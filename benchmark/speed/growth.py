@@ -18,7 +18,7 @@ from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.io.landmark_files import environment
 from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
-from fisheye_svp_ros.scene.observations import Observations
+from fisheye_svp_ros.scene.observations import Observations, make_observations
 from fisheye_svp_ros.scene.rigs import paper_pose
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
@@ -70,7 +70,11 @@ def growths() -> list[Growth]:
         Growth('localizations, ShiftVP', 'views', (100, 1000, 10_000), _views),
         Growth('stereo calibration', 'views', (10, 40, 160), _stereo),
         Growth('null model and tests, 30 frames', 'effects', (5, 10, 20), _evidence),
-        Growth('diagnosis', 'frames', (20, 80, 320), _diagnosis),
+        Growth('diagnosis, 33 landmarks', 'frames', (20, 40, 80, 160, 320), _diagnosis),
+        Growth('diagnosis, 10 frames of a board', 'landmarks', (32, 64, 128, 256, 512),
+               lambda count: _of_board(count, 1)),
+        Growth('diagnosis, 10 frames of a board, 32 landmarks', 'cameras', (1, 2, 4, 8, 16),
+               lambda count: _of_board(32, count)),
     ]
 
 
@@ -107,6 +111,25 @@ def _evidence(count: int) -> Callable[[], Any]:
 def _diagnosis(count: int) -> Callable[[], Any]:
     seen, lens = _seen(count), shift_lens().svp()
     return lambda: diagnose(seen, lens)
+
+
+def _of_board(landmarks: int, cameras: int) -> Callable[[], Any]:
+    """Prepare a diagnosis of cameras side by side that all see a flat board, 0.4 m wide."""
+    rng, lens = np.random.default_rng(1), shift_lens()
+    rows = 1 << (landmarks.bit_length() - 1) // 2
+    y, x = np.mgrid[:rows, : landmarks // rows]
+    board = 0.4 / rows * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=-1)
+    board -= board.mean(axis=0)
+    frame, camera, point = np.indices((10, cameras, landmarks)).reshape(3, -1)
+    poses = Pose(rotation_from_vector(rng.uniform(-0.5, 0.5, (10, 3))),
+                 rng.uniform([-0.2, -0.2, 0.3], [0.2, 0.2, 0.7], (10, 3)))
+    seen = poses.take(frame).transform(board[point][:, None])[:, 0] - camera[:, None] * [
+        0.02, 0.0, 0.0]
+    names = tuple(f'camera{i}' for i in range(cameras))
+    uv = project(lens, seen).uv + rng.normal(0, 0.2, (len(seen), 2))
+    table = make_observations(frame, point, uv, board[point], camera=camera, cameras=names)
+    lenses = dict.fromkeys(names, lens.svp())
+    return lambda: diagnose(table, lenses)
 
 
 def _seen(frames: int) -> Observations:

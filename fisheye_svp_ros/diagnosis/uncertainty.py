@@ -207,8 +207,8 @@ def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list
     averaged_kinds: kinds of effects that are added to none.
     """
     tests, found = EffectTests(null), dict[frozenset[int], OtherModel]()
-    waiting = {frozenset[int](): OtherModel(0.0, null.included_columns, frozenset())}
-    waiting |= dict(_exchange_effects(null))
+    chosen = OtherModel(0.0, null.included_columns, frozenset())
+    waiting = {frozenset[int](): chosen, **dict(_exchange_effects(null))}
     while waiting and len(found) < _MAX_MODELS:
         forms, model = max(waiting.items(), key=lambda item: item[1].criterion)
         found[forms] = waiting.pop(forms)
@@ -220,7 +220,8 @@ def likely_models(null: NullModel, averaged_kinds: Collection[str] = ()) -> list
             if (larger := forms | {one.form}) not in found:
                 columns = np.concatenate([model.included, null.form_columns(one.form)])
                 waiting[larger] = OtherModel(model.criterion + gain, columns, model.kinds | kinds)
-    return [*found.values()]
+    # The chosen one is among them, however many are likelier.
+    return [*{frozenset[int](): chosen, **found}.values()]
 
 
 def _exchange_effects(null: NullModel) -> Iterator[tuple[frozenset[int], OtherModel]]:

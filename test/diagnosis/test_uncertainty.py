@@ -15,6 +15,7 @@ from fisheye_svp_ros.diagnosis import (
     NullModel,
     diagnose,
 )
+from fisheye_svp_ros.diagnosis.uncertainty import likely_models
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
@@ -172,3 +173,12 @@ def dense_square(null, sigma):
             place += field.values.shape[1]
     mean = way @ mean
     return 1e-6 * (sigma**2 * way @ inverse @ way.T + np.outer(mean, mean))
+
+
+def test_the_chosen_model_is_there_however_many_are_likelier(monkeypatch):
+    """Four cameras and a board had forty likelier models, all with effects no lens file takes."""
+    monkeypatch.setattr('fisheye_svp_ros.diagnosis.uncertainty._MAX_MODELS', 0)
+    data = group_by_frame(photographs(AIR, None, 4))
+    null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
+    chosen, = likely_models(null)
+    np.testing.assert_array_equal(chosen.included, null.included_columns)
