@@ -69,7 +69,7 @@ class LensOffset(NamedTuple):
     mrad: rms of the rays at 1 m, of the fit with causes or of that without, whichever is nearer;
     ratio: of the distance over what the stated errors and those of the fit let expect, by their
     covariance; p_value: of so much by chance; px: mrad in the image; stated: whether the lens
-    file states errors.
+    file states errors; camera: whose lens, of several.
     """
 
     mrad: float
@@ -77,6 +77,7 @@ class LensOffset(NamedTuple):
     p_value: float
     px: float
     stated: bool = True
+    camera: str = ''
 
     def matters(self, noise_px: float) -> bool:
         """Say whether the lens is another one; of a lens without errors only what costs counts."""
@@ -135,7 +136,8 @@ def decide_lens(facts: LensFacts) -> Decision:
                                      'model, so nothing is recommended', gained, 0.0, bounds)
     if (off := facts.offset) is not None and off.matters(facts.noise_px):
         return Decision(
-            'recalibrate', f'the lens as given is off by {off.mrad:.2g} mrad ({off.px:.2g} px), '
+            'recalibrate', f'the lens{off.camera and f" of {off.camera}"} as given is off by at '
+                           f'least {off.mrad:.2g} mrad ({off.px:.2g} px) at 1 m, '
                            f'{off.ratio:.1f} times the combined standard error',
             Figure('ray_error', off.mrad, 'mrad'), 1 - off.p_value)
     if facts.frames < 2 and not facts.causes:
@@ -222,16 +224,19 @@ def decide_target(facts: TargetFacts) -> Decision:
         if low > 0 and facts.local_px <= facts.named_px:
             return Decision('correct', f'{facts.size}; the correction removes {100 * gain:.0f} % '
                                        'of the squared held-out error', figure, sure)
+        if not facts.local_px:
+            return Decision('measure_again', f'{facts.size}; the correction does not lower the '
+                                             'held-out error significantly', figure, None)
         return Decision('measure_again', f'{facts.size}; in addition, {local}', figure, sure)
     figure = Figure('local_offsets', facts.local_px, 'px')
+    if facts.frames < 2:
+        return Decision('keep', f'its errors are unknown: {_ONE_FRAME}', figure, None)
     if facts.local_px > facts.noise_px:
         return Decision('measure_again', f'{local}, more than the noise of '
                         f'{facts.noise_px:.2g} px', figure, 1 - facts.local_p)
     if facts.local_px > 0:
         return Decision('keep', f'{local}, less than the noise', figure,
                         1 - facts.local_p)
-    if facts.frames < 2:
-        return Decision('keep', f'its errors are unknown: {_ONE_FRAME}', figure, None)
     return Decision('keep', 'its errors are below the noise', figure, 0.95)
 
 

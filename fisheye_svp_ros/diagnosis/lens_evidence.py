@@ -78,6 +78,7 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
     now, given = _shared_values(evaluation)
     of_lens = np.append(lens_columns(linear), np.ones(len(shifts.columns), dtype=bool))
     at = null.columns_and_residual(shifts.columns)
+    refit_rig = _rig_response(null, at[:-1])
     residual = np.zeros((2, *linear.residual.shape))
     for frame, information in enumerate(null.information_without_frames(at)):
         _, change, combination = refit_shared(null, information, (), ())
@@ -86,6 +87,7 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         combination[:-1] -= added
         new = np.append(now + change - given, np.zeros(len(shifts.columns)))
         off = np.where(of_lens, new * null.scale[at[:-1]] + added, 0.0)
+        off[:len(refit_rig)] -= refit_rig @ off
         extended = null.leave_one_out.rows[frame][:, at] @ combination
         other = null.fixed.border[frame][:, at[:-1]] @ off
         poses = linear.frame_columns[frame] * ratio[frame][:, None]
@@ -95,6 +97,21 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
             residual[i, frame] = left - poses @ (inverse @ left)
     before, after = (sum_squares(linear, one / ratio) for one in residual)
     return before, after
+
+
+def _rig_response(null: NullModel, at: Index) -> Array:
+    """Return by how much (6 (C - 1), m) the rig moves for each of some columns (m,).
+
+    As the poses of the frames, those of the cameras on the rig are fitted with either lens:
+    otherwise a center that the rig would absorb counts as an error of the lens as given.
+    """
+    count = 6 * (null.linear.data.cameras - 1)
+    products = np.zeros((count, len(at)))
+    for frame, poses in enumerate(null.linear.frame_columns):
+        columns = null.fixed.border[frame][:, at]
+        left = columns - poses @ (np.linalg.pinv(poses, rcond=1e-9) @ columns)
+        products += left[:, :count].T @ left
+    return pseudo_inverse(products[:, :count])[0] @ products
 
 
 def _shared_values(evaluation: Evaluation) -> tuple[Array, Array]:
@@ -195,9 +212,9 @@ def find_lens_rays(
             errors[name]['given'].append(wider.errors(more)[-1])
             errors[name]['extended'].append(wider.errors()[-1])
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
-        offsets.append(
-            _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px))
-    return LensRays(errors, min(offsets, key=lambda one: one.p_value, default=None))
+        one = _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px)
+        offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
+    return LensRays(errors, min(offsets, key=lambda one: (one.p_value, -one.ratio), default=None))
 
 
 def _written_rays(

@@ -177,7 +177,7 @@ def _wrong(d: Diagnosis) -> str:
                 f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; '.join(
-        f'{describe_effect(c.effect)} ({_name(c)}: {size(d, c)}; {probability(c.p_value)})'
+        f'{describe_effect(c.effect)} ({_name(d, c)}: {size(d, c)}; {probability(c.p_value)})'
         for c in d.causes[:_MAX_CAUSES]
     )
     more = len(d.causes) - _MAX_CAUSES
@@ -192,7 +192,7 @@ def _shows_no_cause(d: Diagnosis) -> bool:
 
 def _is_target_off(d: Diagnosis) -> bool:
     """Say whether landmarks are displaced, where no cause says how."""
-    return bool(d.remaining) or d.decision['target'].figure.value > 0
+    return d.frames > 1 and (bool(d.remaining) or d.decision['target'].figure.value > 0)
 
 
 def _almost(d: Diagnosis) -> str:
@@ -206,9 +206,15 @@ def _almost(d: Diagnosis) -> str:
     return ''
 
 
-def _name(cause: Cause) -> str:
+def _name(d: Diagnosis, cause: Cause) -> str:
     others = join_names(cause.indistinguishable_from, 'or')
-    return f'{cause.effect}, confounded with {others}' if others else cause.effect
+    assumed = ', assumed by --with' if is_assumed(d, cause) else ''
+    return f'{cause.effect}{assumed}' + (f', confounded with {others}' if others else '')
+
+
+def is_assumed(d: Diagnosis, cause: Cause) -> bool:
+    """Say whether a cause was not tested, since the user said that it is there."""
+    return cause.effect in d.problem.options.included
 
 
 def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
@@ -252,7 +258,7 @@ def _gain_sentence(d: Diagnosis, known: Mapping[str, Comparison]) -> str:
 
 def _poor_prediction(d: Diagnosis, times: float) -> str:
     """Return why held-out data leave several times the noise where no cause shows."""
-    if _is_target_off(d):
+    if d.decision['target'].say == 'measure_again':
         return f'{times:.1f} times the noise: landmarks are displaced'
     if d.decision['photographs'].say == 'enough':
         return f'{times:.1f} times the noise'

@@ -116,8 +116,10 @@ def _rig(pair: TwoCameras) -> str:
     if pair.verdict in ('nothing', 'contradict'):
         return ''
     said = []
-    for label, before, after, less in _rig_rows(pair.rig):
-        said.append(f'{label} {before} before, {after} after (reduced by {less})')
+    rows = zip(_rig_rows(pair.rig), pair.rig.values(), strict=True)
+    for (label, before, after, less), change in rows:
+        how = f'reduced by {less}' if change.low > 0 else 'not significantly reduced'
+        said.append(f'{label} {before} before, {after} after ({how})')
     return '; estimated view by view, the rig scatters: ' + join_names(said)
 
 
@@ -176,7 +178,9 @@ def _difference_text(against: TwoDatasets) -> str:
         far = sorted((one for one in sizes if one[0] > _SIGNIFICANT_RATIO), reverse=True)
         each = [f'{name} by {apart:.1f} standard errors' for apart, name in far[:_MAX_PARAMETERS]]
         said += f'; {meaning.format(join_names(each))}' if each else ''
-    return said or '; its parameters agree within their errors'
+    if said or against.verdict == 'contradict':
+        return said
+    return '; its parameters agree within their errors'
 
 
 def _follows(against: TwoDatasets) -> str:

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from fisheye_svp_ros.diagnosis import Cause, Diagnosis
+from fisheye_svp_ros.diagnosis import NAMED_P, Cause, Diagnosis
 from fisheye_svp_ros.reporting.cause_text import describe_effect, most_significant, size
-from fisheye_svp_ros.reporting.diagnosis_text import LENS_FILE, lens_words, only_gross
+from fisheye_svp_ros.reporting.diagnosis_text import (
+    LENS_FILE,
+    is_assumed,
+    lens_words,
+    only_gross,
+)
 
 _VERDICTS = {
     'adequate': 'Adequate: the simulation of the lens describes these data',
@@ -82,7 +87,7 @@ def largest_cause(d: Diagnosis) -> str:
                       == {'lens', 'target'}), None)
         second = _sentence(d, other) if other else ''
         return _sentence(d, first) + (f', and {second[0].lower()}{second[1:]}' if second else '')
-    if d.frames < 2 and d.candidates:
+    if d.frames < 2 and (d.candidates or d.decision['target'].figure.value > 0):
         return 'Errors show in one frame, which does not tell their cause'
     if d.decision['lens'].say == 'recalibrate':
         return _capital(d.decision['lens'].why)
@@ -110,7 +115,12 @@ def _displaced_landmarks(d: Diagnosis) -> str:
 
 
 def _sentence(d: Diagnosis, cause: Cause) -> str:
-    """Return a cause as a sentence, its size in it."""
+    """Return a cause as a sentence, its size in it, and whether nothing but the user claims it."""
+    assumed = is_assumed(d, cause) and cause.p_value > NAMED_P
+    return _statement(d, cause) + (' (assumed, not significant)' if assumed else '')
+
+
+def _statement(d: Diagnosis, cause: Cause) -> str:
     if cause.effect == 'target_shape':
         worst = max(d.board_maps((cause.effect,)), key=lambda one: one.peak_to_valley)
         which = f'Board {worst.board}' if len(_boards(d)) > 1 else 'The board'

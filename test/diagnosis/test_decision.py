@@ -37,7 +37,11 @@ def test_a_lens_off_by_three_of_its_errors_is_to_be_calibrated_again(causes: lis
     off = SOUND._replace(offset=LensOffset(1.2, 3.0, 0.001, 1.5), causes=causes, file=BETTER)
     found = decide_lens(off)
     assert found.say == 'recalibrate'
-    assert '3.0 times the combined standard error' in found.why
+    assert found.why == ('the lens as given is off by at least 1.2 mrad (1.5 px) at 1 m, 3.0 '
+                         'times the combined standard error')
+    assert off.offset is not None
+    left = decide_lens(off._replace(offset=off.offset._replace(camera='left')))
+    assert left.why.startswith('the lens of left as given is off')
     assert found.confidence is not None and found.confidence > 0.99
 
 
@@ -104,6 +108,13 @@ def test_the_target_is_judged_apart() -> None:
     assert decide_target(alone._replace(local_px=0.0, local_m=0.0)).say == 'keep'
 
 
+def test_a_correction_that_gains_nothing_is_not_blamed_on_offsets_of_nothing() -> None:
+    """"In addition, local offsets cause 0 px (0 % sure)" stood beside a board that was assumed."""
+    found = decide_target(TARGET._replace(gain=(-0.2, -0.5, 0.0), local_px=0.0, local_m=0.0))
+    assert found.why.endswith('the correction does not lower the held-out error significantly')
+    assert found.confidence is None
+
+
 def test_photographs_are_enough_or_not() -> None:
     facts = PhotographsFacts(26, [], [], 0.1, 0.09, 'keep')
     assert decide_photographs(facts).say == 'enough'
@@ -140,3 +151,5 @@ def test_one_frame_decides_nothing() -> None:
     target = decide_target(
         TARGET._replace(causes=[], size='', local_px=0.0, local_m=0.0, frames=1))
     assert target.confidence is None and 'errors are unknown' in target.why
+    displaced = decide_target(TARGET._replace(causes=[], size='', frames=1))
+    assert displaced.say == 'keep' and displaced.why == target.why

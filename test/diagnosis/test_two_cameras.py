@@ -199,6 +199,16 @@ def test_views_of_cameras_without_a_rig_are_counted_as_views():
     assert found.decision['photographs'].why.startswith('8 views')
 
 
+def test_a_center_that_the_rig_absorbs_is_no_gain_of_the_extended_lens():
+    """The rig stayed as the extended lenses have it, and a sound lens "lost" 98 % to them."""
+    seen = pair(replace(SMALL, reversed_frames=0), 1)
+    right = seen.lenses['right']
+    lenses = seen.lenses | {'right': replace(right, cx=right.cx + 2.0)}
+    found = diagnose(seen.table, lenses, free_intrinsics=True,
+                     options=DiagnosisOptions(quick=True))
+    assert found.file.given_px < 0.25
+
+
 def test_maps_along_the_board_alone_are_compared_along_it():
     """Without a height the maps of cameras that agree were told to "correlate by 0.00"."""
     maps = TargetMaps(88, 0.0, 0.57, (1e-21, 1e-21))
