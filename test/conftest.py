@@ -48,6 +48,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Keep what needs the compiled engine in one process, so that it is compiled once.
 
+    What takes long comes first: at the end others would have nothing to do beside it.
     Processes that talk are at the mercy of the machine: such a test that fails runs once more.
     """
     again = config.pluginmanager.hasplugin('rerunfailures')
@@ -57,6 +58,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.xdist_group('engines'))
         if again and 'ros_domain' in fixtures:
             item.add_marker(pytest.mark.flaky(reruns=1))
+    items.sort(key=lambda item: item.get_closest_marker('slow') is None)
 
 
 @pytest.fixture(autouse=True)
@@ -76,6 +78,16 @@ def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
 def lasting_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search the photographs of all tests in the same processes."""
     monkeypatch.setattr('fisheye_svp_ros.detect.workers._Worker', LastingWorker)
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose pictures, but do not draw them: half the time of a command that writes a report."""
+    from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    monkeypatch.setattr(ConstrainedLayoutEngine, 'execute', lambda *_: None)
+    monkeypatch.setattr(Figure, 'savefig', lambda _, file, **__: file.write(b'\x89PNG'))
 
 
 @pytest.fixture(params=['numpy', 'numba'])

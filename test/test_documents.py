@@ -44,6 +44,7 @@ def test_links_have_targets(page: Path) -> None:
             assert anchor in anchors(path.resolve()), link
 
 
+@pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     for module in ('sphinx', 'myst_parser', 'furo'):
         pytest.importorskip(module, reason='needs the extra `docs`')

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from fisheye_svp_ros.arrays import Array, Index
 
@@ -74,6 +73,8 @@ def pair_photographs(
 
 def _pair_by_stamp(cameras: Index, t: Array, sync: float) -> tuple[tuple[str, ...], float]:
     """Return the keys of moments, and how far, s, the stamps of one are apart at most."""
+    from scipy import optimize  # not while a process that searches photographs starts
+
     moment, apart = np.arange(len(t)), 0.0  # by the photograph that stands for it
     leaders = moment[:0]
     for camera in sorted(set(cameras.tolist())):
@@ -82,7 +83,7 @@ def _pair_by_stamp(cameras: Index, t: Array, sync: float) -> tuple[tuple[str, ..
             away = np.abs(t[own, None] - t[theirs])
             # Squares keep the order where many are within reach of one another.
             cost = np.where(away > sync, _FORBIDDEN, away / sync) ** 2
-            rows, columns = linear_sum_assignment(cost)
+            rows, columns = optimize.linear_sum_assignment(cost)
             close = away[rows, columns] <= sync
             moment[own[rows[close]]] = theirs[columns[close]]
             apart = max(apart, float(away[rows, columns][close].max(initial=0.0)))

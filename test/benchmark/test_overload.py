@@ -5,11 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
 from helpers.nodes import ROOT, need_ros
 
 need_ros()
 
 
+@pytest.mark.slow
 def test_at_any_rate_every_set_taken_has_one_result_or_is_counted(ros_domain: int) -> None:
     command = [sys.executable, '-m', 'benchmark.overload', '--seconds', '0.4']
     told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)

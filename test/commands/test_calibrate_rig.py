@@ -28,6 +28,8 @@ from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.pose import Pose
 from fisheye_svp_ros.scene.observations import Observations
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 
 def write_fitted(table: Observations, lenses: dict[str, Lens], folder: Path) -> None:
     found = fit_rig(table, lenses)

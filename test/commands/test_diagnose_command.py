@@ -200,6 +200,7 @@ class TestFiles:
         assert not [path for path in output.iterdir() if path.name.startswith('.')]
 
 
+@pytest.mark.usefixtures('undrawn')
 class TestTerminal:
     def test_known_poses(self, scene, capsys):
         assert run('shift.csv', scene, '--poses', scene / 'poses.csv') == 0

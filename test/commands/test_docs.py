@@ -29,7 +29,7 @@ _ALL = {
 }
 # A block that another one begins with runs there.
 BLOCKS = [
-    pytest.param(block, id=name) for name, block in _ALL.items()
+    pytest.param(block, id=name, marks=pytest.mark.slow) for name, block in _ALL.items()
     if not any(other != block and other.startswith(block) for other in _ALL.values())
 ]
 

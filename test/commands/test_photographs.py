@@ -29,6 +29,8 @@ from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.scene.observations import make_observations
 from fisheye_svp_ros.scene.rigs import rig
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 PHOTOS = SHARED / 'photos'
 
 

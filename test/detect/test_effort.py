@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.photographs import BOARD, photograph, poses, write
+from helpers.photographs import BOARD, LENS, photograph, poses, write
 
 from fisheye_svp_ros.detect import detection, points
 from fisheye_svp_ros.detect.detection import Detection, detect
@@ -16,8 +16,12 @@ from fisheye_svp_ros.detect.patterns import parse_pattern
 from fisheye_svp_ros.detect.photographs import find_photographs
 from fisheye_svp_ros.errors import ObservationError
 
-IMAGES = [photograph(poses(4, 7).take(i)) for i in range(4)]
-EMPTY = np.full_like(IMAGES[0], 90)
+EMPTY = np.full((LENS.height, LENS.width), 90, np.uint8)
+
+
+@pytest.fixture(scope='module')
+def images() -> list[np.ndarray]:
+    return [photograph(poses(4, 7).take(i)) for i in range(4)]
 
 
 @pytest.fixture
@@ -49,7 +53,8 @@ def test_a_board_that_is_not_there_is_looked_for_a_few_times(
 
 
 def test_once_a_board_is_found_all_are_searched_thoroughly(
-    tmp_path: Path, looks: list[Look], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, looks: list[Look], images: list[np.ndarray],
+    monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And those before it once more, with the result of a thorough search."""
     def blind(image: np.ndarray, pattern: object) -> None:
@@ -58,10 +63,10 @@ def test_once_a_board_is_found_all_are_searched_thoroughly(
 
     real = detection.FIRST_LOOKS['saddle']
     monkeypatch.setitem(detection.FIRST_LOOKS, 'saddle', blind)
-    hidden = [image.copy() for image in IMAGES]
+    hidden = [image.copy() for image in images]
     for image in hidden:
         image[0, 0] = 7
-    write(tmp_path, [EMPTY] * 4 + hidden[:2] + [EMPTY] * 2 + IMAGES[2:])
+    write(tmp_path, [EMPTY] * 4 + hidden[:2] + [EMPTY] * 2 + images[2:])
     seen = found(tmp_path)
     assert [one.points is not None for one in seen.searched] == [False] * 4 + [True] * 2 + [
         False] * 2 + [True] * 2
@@ -71,13 +76,15 @@ def test_once_a_board_is_found_all_are_searched_thoroughly(
         assert np.array_equal(one.points.uv, alone.uv)
 
 
-def test_inverted_boards_are_found_at_a_first_look(tmp_path: Path, looks: list[Look]) -> None:
-    write(tmp_path, [255 - image for image in IMAGES])
+def test_inverted_boards_are_found_at_a_first_look(
+    tmp_path: Path, looks: list[Look], images: list[np.ndarray]
+) -> None:
+    write(tmp_path, [255 - image for image in images])
     inverted = found(tmp_path)
     if inverted.searched[0].points is None:
         pytest.skip('this OpenCV does not find the first inverted board')
     assert looks == [Look.SAMPLE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE, Look.INVERTED_IMAGE]
-    for one, image in zip(inverted.searched, IMAGES, strict=True):
+    for one, image in zip(inverted.searched, images, strict=True):
         alone = points.find_points(255 - image, parse_pattern(BOARD), 'saddle')
         assert np.abs(one.points.uv - alone.uv).max() < 0.1 * alone.sigma.max()
 
@@ -91,8 +98,10 @@ def test_what_cannot_be_read_again_is_searched_at_once() -> None:
     assert Effort(False).look(9, True) is Look.THOROUGH
 
 
-def test_a_first_look_is_at_the_scale_at_which_large_images_are_searched_first() -> None:
-    large = cv2.resize(IMAGES[0], None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+def test_a_first_look_is_at_the_scale_at_which_large_images_are_searched_first(
+    images: list[np.ndarray]
+) -> None:
+    large = cv2.resize(images[0], None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
     pattern = parse_pattern(BOARD)
     first = points.find_points(large, pattern, 'saddle', finder=detection.FIRST_LOOKS['saddle'])
     whole = points.find_points(large, pattern, 'saddle')

@@ -76,7 +76,7 @@ def test_clean_data_is_adequate():
 def test_rounding_is_no_cause(terms):
     """Points simulated without noise are exact but for what their numbers round to."""
     rng = np.random.default_rng(11)
-    pose, views = scene(rng)
+    pose, views = scene(rng, frames=12)
     found = diagnose(observe(lens(), terms, pose, views, 0.0, rng), lens())
     assert [cause.effect for cause in found.causes] == ['skew'][: len(terms)]
     assert not found.remaining and found.noise_px < 2e-6
@@ -364,7 +364,7 @@ def test_boards_are_known_by_the_landmarks_where_a_table_does_not_tell_of_them()
 @pytest.mark.parametrize('cameras', [('left', 'right'), ('right', 'left')])
 def test_true_poses_of_a_rig_are_those_of_its_right_camera(cameras):
     rng = np.random.default_rng(31)
-    pose, views = scene(rng, 2)
+    pose, views = scene(rng, 2, 12)
     table = replace(observe(lens(), (), pose, views, SIGMA, rng), cameras=cameras)
     right = np.flatnonzero(views.camera == cameras.index('right'))
     poses = {int(views.frame[i]): pose.take(i) for i in right}
@@ -495,7 +495,7 @@ def rig_table(seed, right_terms=(), frames=16):
 
 def test_each_camera_of_a_rig_has_causes_of_its_own():
     skew = CATALOGUE['skew']()
-    table, lenses = rig_table(26, [(skew, np.array([0.002]))])
+    table, lenses = rig_table(26, [(skew, np.array([0.002]))], 10)
     found = diagnose(table, lenses, free_intrinsics=True)
     models = [found.model.state.model.camera(camera) for camera in (0, 1)]
     assert [model.lens.name for model in models] == ['fish214', 'right']

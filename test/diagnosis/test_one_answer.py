@@ -21,7 +21,7 @@ from fisheye_svp_ros.study.lens_trust import calibrate_without_outliers
 SHARED = ROOT.parent / 'shared'
 FAULTS, DATA = SHARED / 'faults', SHARED / 'data'
 # One process makes each diagnosis once.
-pytestmark = pytest.mark.xdist_group('one_answer')
+pytestmark = [pytest.mark.xdist_group('one_answer'), pytest.mark.usefixtures('undrawn')]
 SETS = {
     'after_residuals': (FAULTS / 'after_residuals', 'observations.csv', False),
     'sound_lens': (FAULTS / 'sound_lens', 'train.csv', True),

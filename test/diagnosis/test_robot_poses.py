@@ -13,6 +13,8 @@ from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.pose import Pose, identity, rotation_from_vector
 from fisheye_svp_ros.solve.hand_eye import Transforms
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 QUICK = DiagnosisOptions(quick=True)
 # Poses that a hand-eye calibration made those of the camera, all but.
 NEAR = Transforms(Pose(rotation_from_vector(np.full(3, 1e-3)), np.full(3, 4e-4)), identity(),

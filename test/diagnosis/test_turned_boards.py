@@ -21,6 +21,8 @@ from fisheye_svp_ros.reporting.first_screen import first_screen, terminal_lines
 from fisheye_svp_ros.scene.board_turns import board_turns
 from fisheye_svp_ros.scene.observations import Observations, make_observations, views_of
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 HIDDEN = (3, 8, 9, 14)
 
 

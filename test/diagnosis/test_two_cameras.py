@@ -2,12 +2,14 @@
 
 import warnings
 from dataclasses import fields, replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from benchmark.two_cameras import Hidden, pair
+from benchmark import two_cameras
+from benchmark.two_cameras import Hidden
 from fisheye_svp_ros import cli
 from fisheye_svp_ros.diagnosis import (
     Comparison,
@@ -35,6 +37,9 @@ from fisheye_svp_ros.solve.rig_checks import rig_is_inconsistent
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame
 from fisheye_svp_ros.study.known_errors import known_errors
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
+pair = cache(two_cameras.pair)
 SMALL = Hidden(bend=1e-3, frames=14, columns=6, rows=5, reversed_frames=1)
 
 

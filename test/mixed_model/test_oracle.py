@@ -22,9 +22,13 @@ from fisheye_svp_ros.mixed_model import (
 GROUPS, ROWS = 15, 12
 SIGMA, INTERCEPT, SLOPE = 0.5, 0.8, 0.3  # standard deviations of noise and random effects
 
-oracle = pytest.importorskip(
-    'statsmodels.regression.mixed_linear_model',
-    reason="statsmodels is not installed (pip install 'fisheye-svp-ros[test]')")
+
+@pytest.fixture(scope='module')
+def oracle():
+    """Return the module, which takes a second to import: where these tests run alone."""
+    return pytest.importorskip(
+        'statsmodels.regression.mixed_linear_model',
+        reason="statsmodels is not installed (pip install 'fisheye-svp-ros[test]')")
 
 
 def growth_curves(seed):
@@ -68,7 +72,7 @@ def fixed_covariance(model, result):
 
 
 @pytest.fixture(scope='module', params=[1, 2, 3])
-def case(request):
+def case(request, oracle):
     """Return the data, our variances and solution, and the oracle's model and result."""
     y, fixed, random = growth_curves(request.param)
     columns, eq, border = equations_of(y, fixed, random)
@@ -100,7 +104,7 @@ def test_estimates_predictions_and_their_errors_agree(case):
     np.testing.assert_allclose(own, expected, atol=2e-3 * np.abs(expected).max())
 
 
-def test_the_deviance_is_twice_the_log_likelihood(case):
+def test_the_deviance_is_twice_the_log_likelihood(case, oracle):
     """Up to a constant: differences between variances, the noise profiled out in both."""
     _, eq, now, _, model, _ = case
     ours, theirs = [], []

@@ -199,6 +199,7 @@ def test_two_runs_are_drawn_into_one_picture(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b'\x89PNG')
 
 
+@pytest.mark.slow
 def test_from_a_recording_with_a_hidden_effect_to_a_better_localizer(
     scene: Path, tmp_path: Path, ros_domain: int, caller: Caller
 ) -> None:

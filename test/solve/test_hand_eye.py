@@ -23,6 +23,8 @@ from fisheye_svp_ros.solve.hand_eye import (
 from fisheye_svp_ros.solve.lens_calibration import calibrate, calibrate_hand_eye
 from fisheye_svp_ros.solve.rig_state import RigState, group_by_frame
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 
 def fit(seed: int, **settings) -> tuple[RigState, HandEye]:
     table, camera, poses = robot(seed, **settings)
