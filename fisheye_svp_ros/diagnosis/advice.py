@@ -175,7 +175,7 @@ def _measure_landmarks(evaluation: Evaluation, gain: float) -> list[Advice]:
     order = np.argsort(-far)[:_MAX_LISTED]
     chosen = [int(evaluation.offsets.landmark[i]) for i in order
               if far[i] > _OUTSTANDING_RATIO * typical]
-    what = 'measure these landmarks: they are displaced more than the others'
+    what = 'measure the landmarks of the target, first those that are displaced most'
     return [Advice(what, landmarks=chosen, gain=gain)] if chosen else []
 
 

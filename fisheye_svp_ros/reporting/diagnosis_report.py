@@ -152,19 +152,23 @@ def _causes(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def _evidence(diagnosis: Diagnosis) -> dict[str, Any]:
+    withdrawn = {one.effect: one.why for one in diagnosis.candidates}
     return {
-        'steps': [_step(step) for step in diagnosis.trace],
+        'steps': [_step(step, withdrawn) for step in diagnosis.trace],
         'tested': len(CATALOGUE) - len(diagnosis.untestable),
     }
 
 
-def _step(step: TraceStep) -> dict[str, Any]:
+def _step(step: TraceStep, withdrawn: Mapping[str, str]) -> dict[str, Any]:
+    """Return a row of the evidence; withdrawn: why accepted effects were not confirmed."""
+    why = withdrawn.get(step.name) if step.accepted and not step.is_removal else None
     tried = step.statistic > 0
     held_out = ''
     if math.isfinite(step.held_out):
         held_out = f'{step.held_out:.1f} ± {step.held_out_stderr:.1f}'
     return {
-        'effect': step.effect, 'accepted': step.accepted, 'why': step.why,
+        'effect': step.effect, 'accepted': step.accepted and not why,
+        'why': f'{step.why}; not confirmed: {why}' if why else step.why,
         'rank': step.rank if tried else '',
         'explains': f'{step.statistic:.1f}' if tried else '',
         'p': cause_text.bare_probability(step.corrected) if tried else '',

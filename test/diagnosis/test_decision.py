@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
+from fisheye_svp_ros.diagnosis.advice import _measure_landmarks
 from fisheye_svp_ros.diagnosis.decision import (
     Bound,
     FileFigure,
@@ -153,3 +157,13 @@ def test_one_frame_decides_nothing() -> None:
     assert target.confidence is None and 'errors are unknown' in target.why
     displaced = decide_target(TARGET._replace(causes=[], size='', frames=1))
     assert displaced.say == 'keep' and displaced.why == target.why
+
+
+def test_the_gain_of_all_offsets_is_not_that_of_one_landmark() -> None:
+    """"Measure these landmarks (landmark 45)" was to remove 95 % of the held-out variance."""
+    offset = np.full((20, 3), 1e-3)
+    offset[7] = 4e-3
+    offsets = SimpleNamespace(offset=offset, landmark=np.arange(20))
+    one, = _measure_landmarks(SimpleNamespace(offsets=offsets), 0.95)  # type: ignore[arg-type]
+    assert one.landmarks == [7]
+    assert one.what == 'measure the landmarks of the target, first those that are displaced most'

@@ -20,8 +20,10 @@ from fisheye_svp_ros.diagnosis import (
     Diagnosis,
     DiagnosisOptions,
     Structure,
+    TraceStep,
     diagnose,
 )
+from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
@@ -272,3 +274,18 @@ def test_one_frame_does_not_blame_the_target(found: Diagnosis) -> None:
                decision=_deciding(found, 'target', figure=figure).decision)
     assert largest_cause(one) == (
         'Errors show in one frame, which does not tell their cause')
+
+
+def test_evidence_tells_what_was_not_confirmed_in_the_end(
+    found: Diagnosis, tmp_path: Path
+) -> None:
+    """The table ended with "predicts better"; the first screen, "held-out frames refute it"."""
+    refuted = UnconfirmedCause('sensor_tilt', {}, 1e-9, 'held-out frames refute it')
+    step = TraceStep('sensor_tilt', 99.0, 2, 1e-9, 1e-9, 93.0, 27.0, True, 'predicts better')
+    table = with_changes(
+        found, causes=[], trace=[step],
+        conclusion=replace(found.conclusion, candidates=[refuted]))
+    write_report(table, point_residuals(found.simulation, found.cause_fit), {},
+                 ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False))
+    page = (tmp_path / 'report.html').read_text()
+    assert '<td>predicts better; not confirmed: held-out frames refute it</td>' in page
