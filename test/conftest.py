@@ -46,7 +46,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep what needs the compiled engine in one process, so that it is compiled once.
+    """Keep in one process what needs the compiled engine, or one sweep to compare with: made once.
 
     What takes long comes first: at the end others would have nothing to do beside it.
     Processes that talk are at the mercy of the machine: such a test that fails runs once more.
@@ -56,6 +56,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         fixtures = set(getattr(item, 'fixturenames', ()))
         if {'engine', 'compiled'} & fixtures:
             item.add_marker(pytest.mark.xdist_group('engines'))
+        elif 'undisturbed' in fixtures:
+            item.add_marker(pytest.mark.xdist_group('undisturbed'))
         if again and 'ros_domain' in fixtures:
             item.add_marker(pytest.mark.flaky(reruns=1))
     items.sort(key=lambda item: item.get_closest_marker('slow') is None)
@@ -74,10 +76,12 @@ def no_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('fisheye_svp_ros.reporting.progress._INTERVAL', math.inf)
 
 
-@pytest.fixture(autouse=True)
-def lasting_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture(scope='session', autouse=True)
+def lasting_workers() -> Iterator[None]:
     """Search the photographs of all tests in the same processes."""
-    monkeypatch.setattr('fisheye_svp_ros.detect.workers._Worker', LastingWorker)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr('fisheye_svp_ros.detect.workers._Worker', LastingWorker)
+        yield
 
 
 @pytest.fixture

@@ -102,6 +102,7 @@ def document(folder):
     return json.loads((folder / 'diagnosis.json').read_text(), parse_constant=refuse)
 
 
+@pytest.mark.xdist_group('output')  # made once
 class TestFiles:
     def test_diagnosis_has_the_agreed_keys(self, output):
         found = document(output)
@@ -322,6 +323,7 @@ class TestTerminal:
         assert said in err
 
 
+@pytest.mark.xdist_group('words')
 class TestWords:
     @pytest.fixture(scope='class')
     @classmethod
