@@ -265,8 +265,10 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
     times = facts.heldout_px / max(facts.scatter_px, 1e-9)
     figure = Figure('held_out_over_noise', times, '1')
     if facts.bad and len(facts.bad) >= _MAX_REJECTED_SHARE * facts.frames:
-        return Decision('retake', f'{len(facts.bad)} of {facts.frames} scatter more than the '
-                                  'others or are outliers as a whole', figure, None)
+        what = ('scatter more than the others or are outliers' if len(facts.bad) > 1 else
+                'scatters more than the others or is an outlier')
+        return Decision('retake', f'{len(facts.bad)} of {facts.frames} {what} as a whole',
+                        figure, None)
     if facts.frames < _MIN_FRAMES:
         few = f'one {facts.unit} is' if facts.frames == 1 else f'{facts.frames} {facts.unit}s are'
         return Decision('more', f'{few} too few; take {_MIN_FRAMES} or more', figure, None)
@@ -276,9 +278,9 @@ def decide_photographs(facts: PhotographsFacts) -> Decision:
             how = 'cover the image to its edge, at different distances'
         return Decision('more', f'the lens is undecided; {how}', figure, None)
     if len(facts.unlike) >= _MAX_REJECTED_SHARE * facts.frames:
-        return Decision('more', f'{len(facts.unlike)} of {facts.frames} are not predicted by the '
-                                'others',
-                        figure, None)
+        are = 'are' if len(facts.unlike) > 1 else 'is'
+        return Decision('more', f'{len(facts.unlike)} of {facts.frames} {are} not predicted by '
+                                'the others', figure, None)
     rest = ''
     if facts.is_target_off and times > _TARGET_RATIO:
         rest = '; the target causes the rest'

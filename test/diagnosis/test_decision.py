@@ -124,6 +124,10 @@ def test_photographs_are_enough_or_not() -> None:
     assert decide_photographs(facts).say == 'enough'
     assert decide_photographs(facts._replace(bad=['1.jpg', '2.jpg', '3.jpg'])).say == 'retake'
     assert decide_photographs(facts._replace(bad=['1.jpg'])).say == 'enough'
+    few = facts._replace(frames=9)
+    assert decide_photographs(few._replace(bad=['1.jpg'])).why == (
+        '1 of 9 scatters more than the others or is an outlier as a whole')
+    assert '1 of 9 is not predicted' in decide_photographs(few._replace(unlike=['1.jpg'])).why
     assert decide_photographs(facts._replace(frames=5)).say == 'more'
     assert decide_photographs(facts._replace(lens='undecided')).say == 'more'
     open_ = facts._replace(lens='undecided', plannable=False)

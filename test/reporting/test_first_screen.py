@@ -122,6 +122,8 @@ def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
     """"Not significantly smaller (96 % sure)" read as if that were sure."""
     lens = _deciding(found, 'lens', say='undecided', confidence=0.96)
     assert first_screen(lens, 'table').actions[0].sure == ''
+    unlikely = _deciding(found, 'lens', say='recalibrate', confidence=0.2)
+    assert first_screen(unlikely, 'table').actions[0].sure == ''
 
 
 @pytest.mark.parametrize(('say', 'warned'), [('keep', False), ('recalibrate', True)])
