@@ -28,11 +28,16 @@ Ends = tuple[int, int]  # the first and the last frame of a block
 
 
 def contiguous_blocks(data: RigViews) -> tuple[Index, list[Ends]]:
-    """Return the block (F,) of each frame, and the first and the last frame of each block."""
-    block = np.arange(data.frames) * BLOCKS // data.frames
-    numbers = np.unique(data.views.frame)
-    parts = [numbers[block == i] for i in range(BLOCKS)]
-    return block, [(int(part[0]), int(part[-1])) for part in parts if len(part)]
+    """Return the block (F,) of each frame, and the first and the last frame of each block.
+
+    Views of one frame that no rig holds together are in one block.
+    """
+    first = np.unique(data.frame_of, return_index=True)[1]
+    numbers, place = np.unique(data.views.frame[first], return_inverse=True)
+    of_number = np.arange(len(numbers)) * BLOCKS // len(numbers)
+    parts = [numbers[of_number == i] for i in range(BLOCKS)]
+    return of_number[place.reshape(-1)], [
+        (int(part[0]), int(part[-1])) for part in parts if len(part)]
 
 
 def split_frames(
@@ -75,6 +80,8 @@ def refuting_blocks(null: NullModel, fitted: FittedModel) -> dict[str, tuple[End
     models = [own, *(np.setdiff1d(own, columns) for _, columns, _ in lasting)]
     found: dict[str, tuple[Ends, ...]] = {}
     block, ends = contiguous_blocks(linear.data)
+    if len(ends) < BLOCKS:
+        return {}
     for i, edge in enumerate(ends):
         out = block == i
         information = split_frames(fitted, null.variances, out)[0].information
