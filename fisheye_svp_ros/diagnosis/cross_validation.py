@@ -110,10 +110,17 @@ def compare_errors(base: Array, extended: Array) -> Comparison:
     """Compare the mean errors (F,) of frames, NaN where there is none."""
     known = np.isfinite(base) & np.isfinite(extended)
     both = np.stack([base[known], extended[known]])
-    before, after = both[:, _resample_frames(both.shape[1])].mean(axis=-1)
-    low, high = np.quantile(1 - after / before, (0.025, 0.975))
-    first, second = both.mean(axis=1).tolist()
-    return Comparison(first, second, 1 - second / first, float(low), float(high))
+    low, high = np.quantile(
+        _reduction(*both[:, _resample_frames(both.shape[1])].mean(axis=-1)), (0.025, 0.975))
+    first, second = both.mean(axis=1)
+    return Comparison(float(first), float(second), float(_reduction(first, second)), float(low),
+                      float(high))
+
+
+def _reduction(before: Array, after: Array) -> Array:
+    """Return by which shares errors are less; where there was none before, nothing."""
+    some = before > 0
+    return np.where(some, 1 - after / np.where(some, before, 1.0), 0.0)
 
 
 def _resample_frames(frames: int) -> Index:

@@ -22,7 +22,12 @@ from fisheye_svp_ros.diagnosis.conclusion import Conclusion
 from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.cross_validation import Comparison
 from fisheye_svp_ros.diagnosis.decision import Decision, FileFigure
-from fisheye_svp_ros.diagnosis.evaluation import Evaluation, FitQuality, Intrinsic
+from fisheye_svp_ros.diagnosis.evaluation import (
+    MAX_RMS_RATIO,
+    Evaluation,
+    FitQuality,
+    Intrinsic,
+)
 from fisheye_svp_ros.diagnosis.fitted_model import PredictedOffsets
 from fisheye_svp_ros.diagnosis.model_errors import ModelErrors
 from fisheye_svp_ros.diagnosis.problem import Problem
@@ -116,7 +121,18 @@ class Diagnosis:
     @property
     def offers_extended(self) -> bool:
         """Whether the extended lens is expected to be better than the lens as given."""
-        return self.decision['lens'].say in ('use_extended', 'recalibrate')
+        return (self.decision['lens'].say == 'use_extended'
+                or (self.is_lens_off and not self.is_extended_refuted))
+
+    @property
+    def is_lens_off(self) -> bool:
+        """Whether the lens as given is another one than the data show."""
+        return self.decision['lens'].say == 'recalibrate'
+
+    @property
+    def is_extended_refuted(self) -> bool:
+        """Whether the extended lens predicts held-out frames worse than the lens as given."""
+        return self.file.extended_px > MAX_RMS_RATIO * self.file.given_px
 
     @property
     def candidates(self) -> list[UnconfirmedCause]:

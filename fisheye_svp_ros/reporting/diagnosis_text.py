@@ -70,13 +70,16 @@ _NOISE_RATIO = 1.5  # times the noise, from which an error is more than that
 
 def lens_words(d: Diagnosis) -> str:
     """Return what to do about the lens, or the lenses of several cameras."""
-    return (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
+    words = (_OF_RIG if len(d.lenses) > 1 else LENS)[d.decision['lens'].say]
+    return words if d.offers_extended or not d.is_lens_off else words.partition(', or ')[0]
 
 
 def refusal_reason(d: Diagnosis) -> str:
     """Return why the extended lens is not to be used, '' where it is."""
     if d.offers_extended:
         return ''
+    if d.is_lens_off:
+        return 'It predicts held-out frames worse than the lens as given: calibrate again'
     return f'It is not known to be better than the lens as given: {d.decision["lens"].why}'
 
 
@@ -162,7 +165,7 @@ def _field_sentence(d: Diagnosis) -> str:
 def _wrong(d: Diagnosis) -> str:
     noise = f'noise of {d.noise_px:.3g} px a coordinate'
     if _shows_no_cause(d):
-        but = [what for what, told in (('the intrinsics as given', _is_off(d)),
+        but = [what for what, told in (('the intrinsics as given', d.is_lens_off),
                                        ('the rig', _rig_advice(d)),
                                        ('the target', _is_target_off(d))) if told]
         nothing = f'Nothing but {join_names(but)}' if but else 'Nothing'
@@ -173,7 +176,7 @@ def _wrong(d: Diagnosis) -> str:
                 f'{count_frames(d)} the residuals are {noise}{rest}.')
     if not d.causes:
         off = 'The intrinsics as given are wrong. Fitted to these data, the'
-        return (f'{off if _is_off(d) else "The"} simulation leaves residuals of '
+        return (f'{off if d.is_lens_off else "The"} simulation leaves residuals of '
                 f'{d.figures.base.rms_px:.3g} px rms, and no effect of the catalog explains them: '
                 f'{remains(d, 7)}{_almost(d)}.')
     causes = '; '.join(
@@ -269,11 +272,6 @@ def _poor_prediction(d: Diagnosis, times: float) -> str:
 def _file_clause(d: Diagnosis) -> str:
     return (f'; on the same corrected target the extended lens leaves '
             f'{d.file.extended_px:.3g} px, the lens as given {d.file.given_px:.3g} px')
-
-
-def _is_off(d: Diagnosis) -> bool:
-    """Say whether the lens as given is another one than the data show."""
-    return d.decision['lens'].say == 'recalibrate'
 
 
 def _rig_advice(d: Diagnosis) -> list[str]:

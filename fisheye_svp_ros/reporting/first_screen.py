@@ -224,5 +224,16 @@ def next_command(
     if d.decision['lens'].say == 'undecided' and d.problem.plannable and not planned:
         words = ['fisheye-svp diagnose', observations, *lenses, settings, '--next 6 -o next']
         return ' '.join(filter(None, words))
+    if d.is_lens_off and not d.offers_extended:
+        return f'fisheye-svp calibrate {observations} {_image_sizes(d)} -o recalibrated' + (
+            '' if len(d.lenses) > 1 else '.yaml')
     used = options if d.offers_extended else ' '.join(lenses)
     return f'fisheye-svp localize {observations} {used} -o poses'
+
+
+def _image_sizes(d: Diagnosis) -> str:
+    """Return the option of `calibrate` that tells the image size of each camera."""
+    sizes = {camera: f'{lens.width}x{lens.height}' for camera, lens in d.lenses.items()}
+    if len({*sizes.values()}) == 1:
+        return f'--image-size {next(iter(sizes.values()))}'
+    return '--image-size ' + ','.join(f'{camera}={size}' for camera, size in sizes.items())

@@ -27,7 +27,7 @@ from fisheye_svp_ros.diagnosis.confirmation import UnconfirmedCause
 from fisheye_svp_ros.diagnosis.decision import Bound, Figure
 from fisheye_svp_ros.reporting.cause_text import percent, size
 from fisheye_svp_ros.reporting.diagnosis_report import write_report
-from fisheye_svp_ros.reporting.diagnosis_text import verdict_sentences
+from fisheye_svp_ros.reporting.diagnosis_text import refusal_reason, verdict_sentences
 from fisheye_svp_ros.reporting.first_screen import Photo, first_screen, terminal_lines
 from fisheye_svp_ros.reporting.headline import headline, largest_cause, target_words, verdict_words
 from fisheye_svp_ros.reporting.next_steps import ReportInputs, command_to_go_on
@@ -126,7 +126,7 @@ def test_an_undecided_lens_is_not_called_sure(found: Diagnosis) -> None:
     assert first_screen(unlikely, 'table').actions[0].sure == ''
 
 
-@pytest.mark.parametrize(('say', 'warned'), [('keep', False), ('recalibrate', True)])
+@pytest.mark.parametrize(('say', 'warned'), [('keep', False), ('use_extended', True)])
 def test_only_an_extended_lens_that_is_offered_is_warned_of(
     found: Diagnosis, say: str, warned: bool
 ) -> None:
@@ -215,7 +215,7 @@ def test_the_command_to_go_on_solves_the_same_problem(found: Diagnosis) -> None:
                           settings=('--poses', 'p.csv', '--free', 'intrinsics'))
     lens_open = {'lens': SimpleNamespace(say='undecided')}
     open_ = SimpleNamespace(decision=lens_open, lenses={'': None}, offers_extended=False,
-                            problem=SimpleNamespace(plannable=True))
+                            problem=SimpleNamespace(plannable=True), is_lens_off=False)
     assert command_to_go_on(open_, inputs) == (
         "fisheye-svp diagnose 'a b.csv' --lens l.yaml --poses p.csv --free intrinsics --next 6 "
         '-o next')
@@ -291,3 +291,19 @@ def test_evidence_tells_what_was_not_confirmed_in_the_end(
                  ReportInputs('obs.csv', ('l.yaml',), None, None, tmp_path, False))
     page = (tmp_path / 'report.html').read_text()
     assert '<td>predicts better; not confirmed: held-out frames refute it</td>' in page
+
+
+def test_an_extended_lens_that_held_out_frames_refute_is_not_offered(found: Diagnosis) -> None:
+    """Beside "use the extended lenses" a warning said that their held-out error is larger."""
+    off = _deciding(found, 'lens', say='recalibrate')
+    better = replace(off, conclusion=replace(
+        off.conclusion, file=found.file._replace(given_px=0.2, extended_px=0.1)))
+    assert headline(better).endswith('calibrate again, or use extended_lens.yaml.')
+    worse = replace(off, conclusion=replace(
+        off.conclusion, file=found.file._replace(given_px=0.1, extended_px=0.2)))
+    assert headline(worse).endswith('Do not use the lens as given; calibrate again.')
+    assert not first_screen(worse, 'table').warning and 'held-out frames' in refusal_reason(worse)
+    inputs = ReportInputs('a.csv', ('l.yaml',), None, None, Path('out'), True)
+    size = f'{found.lens.width}x{found.lens.height}'
+    assert command_to_go_on(worse, inputs) == (
+        f'fisheye-svp calibrate a.csv --image-size {size} -o recalibrated.yaml')
