@@ -19,7 +19,7 @@ BROWSER = next(filter(None, map(shutil.which, ('chromium', 'chromium-browser', '
                None)
 PHOTOGRAPHS = ROOT.parent / 'shared' / 'data' / 'photos' / 'chessboard'
 # One process makes both reports once.
-pytestmark = pytest.mark.xdist_group('browser')
+pytestmark = [pytest.mark.xdist_group('browser'), pytest.mark.slow]
 SIZES = ((1280, 800), (390, 844))
 _MEASURE = """<script>
 const bottom = name => [...document.querySelectorAll(name)].map(
