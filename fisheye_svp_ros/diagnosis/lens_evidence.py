@@ -41,6 +41,8 @@ _NORMAL_95 = 1.96
 _EDGE = 0.9  # of the points by incidence angle: beyond is the edge
 _FLOOR = 0.1  # of the noise: what an angle may differ by without a reason
 _LINEARITY = 0.05  # of a change: beyond it, its columns are no measure
+_DIRECTIONS = 64  # more than a lens has parameters
+_NEGLIGIBLE = 1e-8  # of a variance
 _ROUNDING = 1e-10  # of the variance of an angle: below it, a covariance has no root
 _NEAR_RANGE = 1  # of ray_errors.RANGES: 1 m
 
@@ -280,13 +282,30 @@ def _distances(off: Array, samples: Array, floor: float) -> tuple[float, Array]:
     Source: Mahalanobis, On the generalized distance in statistics (1936).
     """
     flat = samples.reshape(-1, samples.shape[-1])
-    covariance: Array = flat @ flat.T / flat.shape[1]
-    rounding = _ROUNDING * float(np.trace(covariance)) / len(flat)  # of data without noise
-    covariance[np.diag_indices_from(covariance)] += floor**2 * len(flat) / 3 + rounding
+    variance = float((flat**2).sum()) / flat.size
+    least = floor**2 * len(flat) / 3 + _ROUNDING * variance  # rounding of data without noise
+    within, rest = _reduce_rank(flat, off.ravel(), least)
+    covariance: Array = within[:, 1:] @ within[:, 1:].T / flat.shape[1]
+    covariance[np.diag_indices_from(covariance)] += least
     root = np.asarray(np.linalg.cholesky(covariance))
-    whitened = solve_lower(root, np.column_stack([off.ravel(), flat]))
-    distances = np.sqrt((whitened**2).sum(axis=0))
+    distances = np.sqrt((solve_lower(root, within)**2).sum(axis=0))
+    distances[0] = np.hypot(distances[0], rest / np.sqrt(least))
     return float(distances[0]), distances[1:]
+
+
+def _reduce_rank(samples: Array, off: Array, least: float) -> tuple[Array, float]:
+    """Return angles and samples (K, 1 + S) in a basis, and how far the angles are off it.
+
+    Errors of a few parameters span a few directions: some samples tell which.  All directions
+    where what the others have beyond those, squared, is not far below `least`, a variance.
+    """
+    basis = np.linalg.qr(samples[:, :_DIRECTIONS])[0]
+    both = np.column_stack([off, samples])
+    within = basis.T @ both
+    beyond = ((both - basis @ within)**2).sum(axis=0)
+    if (beyond[1:] > _NEGLIGIBLE * least).any():
+        return both, 0.0
+    return within, float(np.sqrt(beyond[0]))
 
 
 def _rms(angles: Array) -> float:
