@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from coverage import CoverageData
+from coverage.exceptions import DataError
 
 # Traced one after the other, so that an interrupted trace goes on where it was.
 GROUPS = {
@@ -125,7 +126,10 @@ def load(tree: Path, folder: Path) -> Reach:
         if file.suffix in {'.log', '.ini'}:
             continue
         data = CoverageData(str(file))
-        data.read()
+        try:
+            data.read()
+        except DataError:  # of a process that was killed
+            continue
         for path in data.measured_files():
             by_line = tests.setdefault(str(Path(path).relative_to(tree)), defaultdict(set))
             for line, contexts in data.contexts_by_lineno(path).items():

@@ -85,6 +85,17 @@ class LensOffset(NamedTuple):
         return self.p_value < _OFF_P and self.px > least * noise_px
 
 
+def least_likely_offset(offsets: Sequence[LensOffset]) -> LensOffset | None:
+    """Return the offset that chance makes least, of the lenses of all cameras.
+
+    The smallest of n p-values comes by chance n times as often (Bonferroni).
+    """
+    if not offsets:
+        return None
+    least = min(offsets, key=lambda one: (one.p_value, -one.ratio))
+    return least._replace(p_value=min(1.0, len(offsets) * least.p_value))
+
+
 class FileFigure(NamedTuple):
     """Held-out rms, px, with the lens as given and the extended lens, the same target in both.
 

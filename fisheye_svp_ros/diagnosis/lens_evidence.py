@@ -16,7 +16,12 @@ from fisheye_svp_ros.diagnosis.cross_validation import (
     refit_shared,
     sum_squares,
 )
-from fisheye_svp_ros.diagnosis.decision import Bound, FileFigure, LensOffset
+from fisheye_svp_ros.diagnosis.decision import (
+    Bound,
+    FileFigure,
+    LensOffset,
+    least_likely_offset,
+)
 from fisheye_svp_ros.diagnosis.evaluation import Evaluation
 from fisheye_svp_ros.diagnosis.image_fields import WrittenField
 from fisheye_svp_ros.diagnosis.lens_covariance import LensCovariance
@@ -182,7 +187,7 @@ def _edge_cost(null: NullModel, moves: Array) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class LensRays:
-    """Ray errors of each camera's lens as given and as extended, by range; the furthest offset."""
+    """Ray errors of each lens as given and as extended, by range; the least likely offset."""
 
     errors: dict[str, dict[str, list[RayError]]]
     offset: LensOffset | None
@@ -216,7 +221,7 @@ def find_lens_rays(
         fitted = _difference(model, points_on_rays(before[name], uv[there]))
         one = _offset(model, (off, off - fitted), given, uv[there], evaluation.noise_px)
         offsets.append(one._replace(camera=name if len(lenses) > 1 else ''))
-    return LensRays(errors, min(offsets, key=lambda one: (one.p_value, -one.ratio), default=None))
+    return LensRays(errors, least_likely_offset(offsets))
 
 
 def _written_rays(

@@ -18,6 +18,7 @@ from fisheye_svp_ros.diagnosis.decision import (
     decide_lens,
     decide_photographs,
     decide_target,
+    least_likely_offset,
 )
 
 BETTER = FileFigure(0.123, 0.081, 0.75, 0.6, 0.84, 1.0)
@@ -171,3 +172,14 @@ def test_the_gain_of_all_offsets_is_not_that_of_one_landmark() -> None:
     one, = _measure_landmarks(SimpleNamespace(offsets=offsets), 0.95)  # type: ignore[arg-type]
     assert one.landmarks == [7]
     assert one.what == 'measure the landmarks of the target, first those that are displaced most'
+
+
+def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
+    """Of two sound lenses one is below the limit of one nearly twice as often."""
+    off = LensOffset(1.2, 2.5, 0.03, 1.5, camera='left')
+    sound = LensOffset(0.2, 0.9, 0.6, 0.2, camera='right')
+    alone, both = least_likely_offset([off]), least_likely_offset([sound, off])
+    assert alone is not None and alone.matters(0.05) and least_likely_offset([]) is None
+    assert both == off._replace(p_value=0.06) and not both.matters(0.05)
+    certain = least_likely_offset([sound, sound])
+    assert certain is not None and certain.p_value == 1.0
