@@ -56,7 +56,6 @@ def _draw_errors(axis: Any, rows: Sequence[DemoRow]) -> None:
                      label='published range')
         axis.set_xscale('log')
         axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.xaxis.set_major_formatter('{x:g}')
         axis.xaxis.set_minor_formatter('')
     else:
         axis.hlines(place, ours, low, color=FAINT, linewidth=1.5)

@@ -195,7 +195,6 @@ def draw_crossings(path: Path, crossings: Sequence[Crossings]) -> None:
             axis.set(title=titles[quantity], xlabel='noise of u and of v / px', yscale='log')
             axis.legend(fontsize=7.5)
         axes[0].set_ylabel('SVP error is under the noise beyond / m')
-        axes[0].yaxis.set_major_formatter('{x:g}')
 
 
 def _fixed_grid(figure: Figure, rows: int, columns: int) -> Array:

@@ -148,7 +148,6 @@ def draw(path: Path, budget: Budget, points: Sequence[Point], asked: BudgetReque
             axis.set_title(f'{_LABELS[point.quantity]}: limit {factor * point.limit:.3g} {unit}, '
                            f'{kept}', fontsize=9.5)
             axis.set(xscale='log', xlabel='range / m', ylabel='spread / degree')
-            axis.xaxis.set_major_formatter('{x:g}')
             axis.grid(visible=False)
         _explain(axes.flat[len(points)], asked.model)
 

@@ -118,7 +118,7 @@ def draw_histogram(path: Path, shown: PlotData) -> None:
     """Residuals of both coordinates over the noise, beside the normal distribution."""
     bins = np.linspace(-6, 6, 73)
     middle = (bins[:-1] + bins[1:]) / 2
-    with picture(path, _WIDTH, 3.0) as figure:
+    with picture(path, _WIDTH, 3.0, tight=True) as figure:
         axes = figure.subplots(1, 2, sharex=True, sharey=True)
         for axis, (side, colour) in zip(axes, _SIDES, strict=True):
             z = getattr(shown.points, side).ravel() / shown.noise
@@ -136,7 +136,7 @@ def _grid(
     path: Path, shown: PlotData, rows: list[tuple[str, Array, dict[str, Array]]], label: str,
     log: bool,
 ) -> None:
-    with picture(path, _WIDTH, 4.4) as figure:
+    with picture(path, _WIDTH, 4.4, tight=True) as figure:
         axes = figure.subplots(2, 2, sharex=True, sharey='row')
         for row, (name, x, values) in zip(axes, rows, strict=True):
             highest = 2.2 * shown.noise
@@ -149,7 +149,6 @@ def _grid(
             axis.set_xlabel(label)
             if log:
                 axis.set_xscale('log')
-                axis.xaxis.set_major_formatter('{x:g}')
         _legend(figure, axes[0, 1])
 
 
@@ -197,7 +196,7 @@ def draw_groups(
     low, high = (
         np.sqrt(special.chdtri(2 * count, 1 - p) / count) * shown.noise for p in (0.025, 0.975)
     )
-    with picture(path, _WIDTH, 3.6 if ticks else 2.8) as figure:
+    with picture(path, _WIDTH, 3.6 if ticks else 2.8, tight=True) as figure:
         axis = figure.subplots()
         axis.fill_between(place[order], low[order], high[order], color=NOISE, alpha=0.4, lw=0,
                           step='mid', label='95 % if there is only noise')

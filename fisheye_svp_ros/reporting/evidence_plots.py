@@ -27,7 +27,7 @@ def draw_evidence(path: Path, diagnosis: Diagnosis) -> None:
     """What each step of the search explains, and how well held-out data are predicted after it."""
     steps = [step for step in diagnosis.trace if step.statistic > 0]
     count = max(len(steps), len(diagnosis.causes) + 2)
-    with picture(path, 9.2, 1.6 + 0.3 * count) as figure:
+    with picture(path, 9.2, 1.6 + 0.3 * count, tight=True) as figure:
         left, right = figure.subplots(1, 2)
         left.barh(
             [step.effect[:40] for step in steps], [step.statistic for step in steps],

@@ -198,7 +198,6 @@ def draw_residuals(clouds: Sequence[Points], lenses: Sequence[str], path: Path) 
         if 0 < 10 * nearest <= farthest:
             axes[1].set_xscale('log')
             axes[1].xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes[1].xaxis.set_major_formatter('{x:g}')
             axes[1].xaxis.set_minor_formatter('')
         axes[0].set(xlabel='incidence angle, deg')
         axes[1].set(xlabel='range, m')

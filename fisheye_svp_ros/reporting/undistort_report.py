@@ -123,7 +123,6 @@ def draw_remaining(path: Path, side: Rectification, left: Remaining, what: str) 
         top = np.fmax.reduce(left.table[:, 2])
         curve.set(xscale='log', xlabel='range, m', ylabel=f'{what}, px', ylim=(0, 1.1 * top),
                   title=tolerated_text(left))
-        curve.xaxis.set_major_formatter('{x:g}')
         curve.legend()
         seen = np.isfinite(left.map_px)
         shown = image.scatter(*left.map_uv[seen].T, c=left.map_px[seen], s=14, marker='s',

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 
 from fisheye_svp_ros.effects.target_map import BoardMap
 from fisheye_svp_ros.reporting import evidence_plots
+from fisheye_svp_ros.reporting.plots import drawing
 
 
 @pytest.fixture
@@ -23,9 +25,10 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     kept: list[Figure] = []
 
     @contextmanager
-    def picture(_: Path, width: float, height: float) -> Iterator[Figure]:
-        kept.append(Figure(figsize=(width, height), layout='constrained'))
-        yield kept[-1]
+    def picture(_: Path, width: float, height: float, tight: bool = False) -> Iterator[Figure]:
+        with drawing(BytesIO(), width, height, tight=tight) as figure:
+            kept.append(figure)
+            yield figure
 
     monkeypatch.setattr(evidence_plots, 'picture', picture)
     return kept
