@@ -55,7 +55,7 @@ from fisheye_svp_ros.solve.rig_state import (
     rms_px,
 )
 
-MAX_RMS_RATIO = 1.005  # a rise by less is none: noise that grows with the angle has weights
+MAX_RMS_RATIO = 1.01  # a rise by less is none: noise that grows with the angle has weights
 
 
 @dataclass(frozen=True)
