@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from fisheye_svp_ros.diagnosis.advice import _measure_landmarks
+from fisheye_svp_ros.diagnosis.causes import Cause
+from fisheye_svp_ros.diagnosis.conclusion import _largest_error
 from fisheye_svp_ros.diagnosis.decision import (
     Bound,
     FileFigure,
@@ -183,3 +186,20 @@ def test_the_worst_of_several_lenses_may_be_so_by_chance() -> None:
     assert both == off._replace(p_value=0.06) and not both.matters(0.05)
     certain = least_likely_offset([sound, sound])
     assert certain is not None and certain.p_value == 1.0
+
+
+@pytest.mark.parametrize(('effect', 'values', 'words'), [
+    ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3, '9.z': 1e-3}, '2 landmarks are displaced'),
+    ('landmark_survey', {'7.x': 1e-3, '7.y': 2e-3}, '1 landmark is displaced'),
+    ('landmark_scale', {'relative': -0.0047}, 'the scale of the board is off by 0.47 %'),
+    ('landmark_scale', {'x_over_y': 0.002}, 'the board is stretched by 0.2 %'),
+    ('board_pose', {'1.x': 1e-3}, 'the relative poses of its boards are wrong'),
+])
+def test_the_largest_error_of_the_target_is_said(
+    effect: str, values: dict[str, float], words: str
+) -> None:
+    cause = Cause(effect, effect, {name: {'value': value} for name, value in values.items()},
+                  1e-9, 0.2, True, 0.1, 0.3, [], '')
+    smaller = replace(cause, effect='board_pose' if effect != 'board_pose' else 'landmark_survey',
+                      share=0.1)
+    assert _largest_error(None, [smaller, cause]) == words  # type: ignore[arg-type]

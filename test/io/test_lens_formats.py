@@ -192,6 +192,17 @@ def test_opencv_xml_and_basalt(tmp_path: Path) -> None:
     assert foreign.rigs[0].position == pytest.approx([-0.2, 0, 0])
 
 
+def test_a_double_sphere_is_read_up_to_where_its_curve_turns_back(tmp_path: Path) -> None:
+    path = tmp_path / 'wide.json'
+    path.write_text(BASALT.replace('158.0', '80.0'))
+    lens = load_lens(f'{path}#cam0')
+    theta = np.linspace(0.5, 3.0, 10_000)
+    z = np.cos(theta) - 0.2
+    height = np.sin(theta) / (0.59 * np.hypot(np.sin(theta), z) + 0.41 * z)
+    turns = theta[np.argmax(np.diff(height) < 0)]
+    assert lens.max_incidence == pytest.approx(turns, abs=0.02)
+
+
 def test_boofcv() -> None:
     path = SHARED / 'photos' / 'chessboard' / 'fisheye.yaml'
     if not path.exists():
@@ -506,6 +517,15 @@ def test_rigs(tmp_path: Path, write: Callable[[Path, str], Path], suffix: str) -
     rig = load_rig(write(tmp_path, suffix))
     assert np.abs(rig.position - RIG.position).max() < 1e-12
     assert np.abs(rig.rotation - RIG.rotation).max() < 1e-12
+
+
+@pytest.mark.parametrize('end', ['<parent link="left_optical_frame"/>',
+                                 '<child link="right_optical_frame"/>'])
+def test_a_joint_without_an_end_leads_nowhere(tmp_path: Path, end: str) -> None:
+    path = tmp_path / 'robot.urdf'
+    path.write_text(of_urdf(tmp_path, '.xml').read_text().replace(
+        '</robot>', '<joint name="loose" type="fixed">' + end + '</joint></robot>'))
+    assert np.abs(load_rig(path).position - RIG.position).max() < 1e-12
 
 
 def test_both_lenses_of_a_rig_of_opencv(tmp_path: Path) -> None:

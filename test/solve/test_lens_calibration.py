@@ -145,6 +145,15 @@ def test_covariances_hold():
     assert np.mean(pose_nees) == pytest.approx(6, abs=4 * np.sqrt(12 / SAMPLES))
 
 
+def test_no_view_fits_better_when_it_is_posed_afresh():
+    """The lens that is begun with takes one of these views for the other pose of a plane."""
+    table = make_table(
+        make_lens('equidistant', 110), plane, 8, 13, sigma=0.5, distance=(0.8, 2.5))
+    found = calibrate(table, 'equidistant', SIZE)
+    afresh = localize(ForwardModel(found.adjusted.lens), found.views)
+    np.testing.assert_allclose(found.adjusted.cost, afresh.cost, rtol=1e-6)
+
+
 @pytest.mark.parametrize('order', ['scrambled', 'begun elsewhere'])
 def test_a_view_of_another_order_is_fitted_around(order):
     true = make_lens('equidistant', 80.0)
