@@ -464,6 +464,10 @@ _SAME_LENS = {
     'ROS': 'image_width: 640\nimage_height: 480\ncamera_matrix: {{data: [300, 0, 320, 0, 310, '
            '240, 0, 0, 1]}}\ndistortion_model: rational_polynomial\ndistortion_coefficients: '
            '{{data: [{}]}}\n',
+    'echo of a topic': 'header: {{frame_id: front}}\nheight: 480\nwidth: 640\n'
+                       'distortion_model: rational_polynomial\nd: [{}]\nk: [300, 0, 320, 0, 310, '
+                       '240, 0, 0, 1]\nbinning_x: 0\nbinning_y: 0\nroi: {{x_offset: 0, y_offset: '
+                       '0, height: 0, width: 0, do_rectify: false}}\n',
 }
 
 
@@ -478,3 +482,14 @@ def test_the_rational_model_is_read_alike_from_every_tool(form: str, tmp_path: P
     matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
     right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(_OPENCV8))[0]
     assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < worst
+
+
+@pytest.mark.parametrize('count', [0, 4, 5])
+def test_perspective_models_of_mrcal_are_those_of_opencv(count: int, tmp_path: Path) -> None:
+    values = (-0.2, 0.05, 0.001, -0.001, -0.01)[:count]
+    lens, worst = loaded(tmp_path, str({
+        'lensmodel': f'LENSMODEL_OPENCV{count}' if count else 'LENSMODEL_PINHOLE',
+        'imagersize': [640, 480], 'intrinsics': [300, 310, 320, 240, *values]}))
+    matrix = np.array([[300, 0, 320], [0, 310, 240], [0, 0, 1.0]])
+    right = cv2.projectPoints(SEEN, np.zeros(3), np.zeros(3), matrix, np.array(values))[0]
+    assert np.abs(project(lens, SEEN).uv - right[:, 0]).max() < 1.05 * worst + 1e-6 < 1.5

@@ -98,6 +98,16 @@ def test_items_too_far_apart_or_of_other_sets_are_not_given() -> None:
         (10, 't10'), (20, None), (30, 't30')]
 
 
+@pytest.mark.parametrize(('own', 'free'), [(10, 40), (40, 10)])
+def test_of_two_items_around_a_set_neither_may_be_of_another(own: int, free: int) -> None:
+    sets = mono(reach=100)
+    for stamp in sorted((own, free)):
+        sets.add('t', stamp, f't{stamp}', 0.0)
+    for stamp in (own, 20):
+        sets.add('l', stamp, f'l{stamp}', 0.0)
+    assert dict(told(sets.pop_complete(2.0, 1.0)))[20] == {'l': 'l20'}
+
+
 def test_items_of_a_recording_that_starts_over_are_not_mixed() -> None:
     sets = mono(reach=100)
     for stamp in (0, 10, 20, 5):

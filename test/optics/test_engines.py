@@ -260,6 +260,17 @@ def test_points_near_the_lens_and_singular_systems_go_to_the_reference(compiled,
             localize(model, views, pose)
 
 
+def test_residuals_of_unweighted_points_near_the_lens_are_those_of_the_reference(compiled, engine):
+    """A fit keeps clear of them, so that only the residuals meet them."""
+    views, pose = views_and_poses(2)
+    near = views.points.copy()
+    near[1, 5] = pose.position[1] + [0.02, 0.0, 3e-3]
+    views = views._replace(points=near)
+    views.uv[1, 5], views.weight[1, 5] = 400.0, 0.0
+    expected, found = on_each(lambda: localize(ForwardModel(FISH214), views, pose))
+    np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-8)
+
+
 def test_a_curve_without_a_formula_goes_to_the_reference(compiled):
     shift = SumOfShifts((FISH214.viewpoint_shift, Gennery(0.001)))
     lens = replace(FISH214, viewpoint_shift=shift)
