@@ -97,13 +97,16 @@ def _predict_with_files(evaluation: Evaluation) -> tuple[HeldOut, HeldOut]:
         off[:len(refit_rig)] -= refit_rig @ off
         extended = null.leave_one_out.rows[frame][:, at] @ combination
         other = null.fixed.border[frame][:, at[:-1]] @ off
-        poses = linear.frame_columns[frame] * ratio[frame][:, None]
-        inverse = np.linalg.pinv(poses, rcond=1e-9)
-        for i, whitened in enumerate((extended + other, extended)):
-            left = whitened * ratio[frame]
-            residual[i, frame] = left - poses @ (inverse @ left)
+        residual[:, frame] = _refit_pose(
+            np.stack([extended + other, extended]), linear.frame_columns[frame], ratio[frame])
     before, after = (sum_squares(linear, one / ratio) for one in residual)
     return before, after
+
+
+def _refit_pose(whitened: Array, columns: Array, ratio: Array) -> Array:
+    """Return residuals (..., M) of even noise without what a pose with columns (M, 6) takes up."""
+    residual, poses = whitened * ratio, columns * ratio[:, None]
+    return np.asarray(residual - residual @ np.linalg.pinv(poses, rcond=1e-9).T @ poses.T)
 
 
 def _rig_response(null: NullModel, at: Index) -> Array:

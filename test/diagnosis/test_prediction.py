@@ -6,6 +6,7 @@ from helpers.scenes import lens, observe, scene
 
 from fisheye_svp_ros.diagnosis import NullModel
 from fisheye_svp_ros.diagnosis.cross_validation import fit_without_causes
+from fisheye_svp_ros.diagnosis.lens_evidence import _refit_pose
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
 from fisheye_svp_ros.solve.initial_rig import initial_state
@@ -28,3 +29,13 @@ def test_without_a_cause_the_rest_is_fitted_anew_however_large_it_is(size):
     best = adjust(data, initial_state(data, lens()), FREE)
     rms = [rms_px(Linearization(data, one, ())) for one in (adjust_poses(data, without), best)]
     assert rms[0] == pytest.approx(rms[1], rel=1e-3)
+
+
+def test_a_pose_takes_up_nothing_else_where_the_noise_is_uneven():
+    rng = np.random.default_rng(0)
+    columns, ratio = rng.normal(size=(20, 6)), rng.uniform(0.5, 2.0, 20)
+    whitened = rng.normal(size=(2, 20))
+    left = _refit_pose(whitened, columns, ratio)
+    np.testing.assert_allclose(left @ (columns * ratio[:, None]), 0.0, atol=1e-12)
+    moved = _refit_pose(whitened + columns @ rng.normal(size=6), columns, ratio)
+    np.testing.assert_allclose(moved, left, atol=1e-12)

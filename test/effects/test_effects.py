@@ -274,3 +274,9 @@ def test_a_dome_turns_rays_as_its_glass_does(distance):
     moved = (exact.uv - air.uv)[seen]
     assert seen.sum() > 50 and np.abs(moved).max() > 0.3
     assert (found.uv - air.uv)[seen] == pytest.approx(moved, abs=0.03 * np.abs(moved).max())
+
+
+def test_displaced_landmarks_are_named_unless_they_are_all():
+    survey = CATALOGUE['landmark_survey']
+    assert survey((7, 9)).key == 'landmark_survey(landmarks=7 9)'
+    assert survey((7, 9), everywhere=True).key == 'landmark_survey(landmarks=all)'

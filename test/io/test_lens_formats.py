@@ -254,6 +254,8 @@ def test_boofcv() -> None:
      + ", 'imagersize': [2, 2]}", 'has 11 values; LENSMODEL_CAHVORE_linearity=0 needs 12'),
     ("{'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': [1], 'imagersize': [2, 2]}",
      'intrinsics has 1 values; LENSMODEL_OPENCV8 needs 12'),
+    ("{'lensmodel': 'LENSMODEL_STEREOGRAPHIC', 'intrinsics': [1, 1, 1, 1], 'imagersize': [2]}",
+     'size, fx, fy, cx or cy are incomplete'),
     ("{'lensmodel': 'LENSMODEL_CAHVORE", 'not a whole .cameramodel'),
     ('camera_matrix: {data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}\ndistortion_model: scara\n'
      'image_width: 4\nimage_height: 4\ndistortion_coefficients: {data: [0.1]}\n',

@@ -8,7 +8,9 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock, call
 
 import numpy as np
 import pytest
@@ -179,6 +181,17 @@ def test_a_rig_is_judged_as_one(graph: Callable[..., Graph], scene: Path) -> Non
     found = numbers(results[0])
     assert 'viewpoint_shift' in found['causes'].split()
     assert float(found['points']) > 40 * FRAMES
+
+
+def test_a_verdict_is_logged_where_it_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(model_critic, 'figures', lambda _: {})
+    monkeypatch.setattr(model_critic, '_lines', lambda found: [found.decision['lens'].say])
+    critic = Mock(_announced=None)
+    for say in ('keep', 'keep', 'recalibrate', 'keep'):
+        found = SimpleNamespace(decision={'lens': SimpleNamespace(say=say)})
+        ModelCritic._finish(critic, Mock(**{'future.result.return_value': found}))
+    assert critic.get_logger().info.call_args_list == [
+        call('keep'), call('recalibrate'), call('keep')]
 
 
 def test_work_in_the_background_raises_where_it_is_asked_for() -> None:
