@@ -22,6 +22,8 @@ HOSTILE = {
     'aliases': (BOMB, 'line 2: there is an alias'),
     'merged': ('a: &a {b: 1}\nc: {<<: *a}\n', 'line 2: there is an alias'),
     'twice': ('a: 1\nb: 2\na: 3\n', "line 3: there is the key 'a' a second time"),
+    'twice within lists': ('a:\n- {b: 2}\n- - b: 2\n    b: 3\n  - c\nd: 1\n',
+                           "line 4: there is the key 'b' a second time"),
     'twice below': ('a:\n  b: 2\n  "b": 3\n', "line 3: there is the key 'b' a second time"),
     'digits': ('a: ' + '9' * 5000, 'too many digits'),
     'deep lists': ('a: ' + '[' * 100_000, _DEEP),

@@ -183,6 +183,16 @@ def test_a_rig_is_judged_as_one(graph: Callable[..., Graph], scene: Path) -> Non
     assert float(found['points']) > 40 * FRAMES
 
 
+def test_a_lens_that_cannot_be_written_is_answered_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(model_critic, 'refusal_reason', lambda _: '')
+    (tmp_path / 'file').write_text('')
+    critic = Mock(**{'_verdict.lens': LENS, 'settings.output': tmp_path / 'file' / 'lens.yaml'})
+    answer = ModelCritic._write_extended_lens(critic, None, SimpleNamespace())
+    assert not answer.success and str(tmp_path / 'file') in answer.message
+
+
 def test_a_verdict_is_logged_where_it_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(model_critic, 'figures', lambda _: {})
     monkeypatch.setattr(model_critic, '_lines', lambda found: [found.decision['lens'].say])

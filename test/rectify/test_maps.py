@@ -64,6 +64,8 @@ def test_a_whole_turn_and_what_lies_past_the_poles() -> None:
     mask = Rectification(SVP, camera).maps.mask
     assert not mask[:31].any() and not mask[-31:].any()  # beyond 90 degrees up and down
     assert mask[120, 180] and not mask[120, 0]  # ahead, and behind
+    u, v = np.meshgrid(np.arange(360.0), np.r_[:29.5, 210.5:240])
+    assert np.abs(camera.directions(u, v) - [0, 0, -1]).max() == 0
 
 
 @pytest.mark.parametrize(('projection', 'along_baseline', 'degrees'), [
