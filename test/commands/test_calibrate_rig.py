@@ -148,6 +148,7 @@ def test_a_rig_file_holds_cameras_of_any_name(tmp_path: Path, cameras: tuple[str
     (('cam0', 'rig'), "obs.csv: camera 'rig' has the name of a file of the rig, rig.yaml; rename "
      'the camera, for example rig0'),
     (('camchain', 'left'), "camera 'camchain' has the name of a file of the rig, camchain.yaml"),
+    (('rig', 'camchain'), "camera 'rig' has the name of a file of the rig, rig.yaml"),
     (('front', 'car_in_back'), 'obs.csv: camera car_in_back: with _in_ in its name'),
     (('car_in_back', 'car_in_front'), 'obs.csv: camera car_in_back, car_in_front: with _in_ in '
      'its name, rig.yaml does not say which camera is in which; rename it'),

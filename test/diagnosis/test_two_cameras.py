@@ -63,6 +63,8 @@ def test_reversed_views_are_put_in_the_order_of_the_other_camera():
     found = diagnose(seen.table, seen.lenses, options=DiagnosisOptions(quick=True))
     assert [one['frame'] for one in found.to_dict()['turned']] == seen.reversed_frames
     assert all(one.corrected and one.degrees == 180 for one in found.record.turned)
+    assert [one.photograph for one in found.record.turned] == [
+        f'frame {frame}' for frame in seen.reversed_frames]
     assert not torn_frames(found) and found.figures.extended.rms_px < 0.11
     assert 'numbered from another end of the board' in verdict_sentences(found)[2]
 

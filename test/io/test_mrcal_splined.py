@@ -76,6 +76,8 @@ def test_a_splined_model_as_mrcal_writes_it(tmp_path: Path) -> None:
     found = project(lens, np.array([[0.0, 0.0, 1.0], [0.3, 0.1, 1.0], [-0.4, 0.3, 1.2],
                                     [0.1, -0.35, 1.0], [-0.2, -0.2, 0.7]])).uv
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    corner = 2 * np.arctan(np.hypot(512.5 / 900, 380.5 / 910) / 2)
+    assert np.radians(36) < lens.max_incidence < corner  # within a step of the nodes
 
 
 @pytest.mark.parametrize(('old', 'new', 'said'), [

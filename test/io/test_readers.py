@@ -338,6 +338,7 @@ class TestOrpc:
         (DSC_TWO, '', 'target.tp: a board number'),
         (DSC_TWO, TP_TWO.replace('0\n1 0', '5\n1 0', 1), 'board 0, corner 1 is not on the target'),
         (DSC_TWO, TP_TWO.replace('1 0', '1.1 0', 1), 'holds no rotation'),
+        (DSC_TWO, '0\n1 0 0 0\n0 1 0 0\n0 0 -1 0\n', 'board 0 holds no rotation'),
         (DSC_TWO, TP_TWO + TP_TWO, 'a board is listed twice'),
         (DSC + DSC, None, 'board 0 is listed twice'),
         (DSC + DSC.splitlines()[-1], None, 'this corner is listed twice'),

@@ -157,3 +157,14 @@ def test_units_that_are_exact_leave_all_as_it_is(case):
     alive = replace(now, lam=lam, weight=np.ones(ROWS // 2))
     found = factor_equations(eq.select(alive.alive), lam, alive.weight)
     np.testing.assert_allclose(found.information, f.information, rtol=1e-9)
+
+
+@pytest.mark.parametrize('kind', [0, 1])
+def test_a_component_that_begins_at_next_to_nothing_grows(kind):
+    _, eq, _ = equations_of(*growth_curves(1))
+    usual, _ = estimate_variances(eq, initial_variances(eq))
+    lam = usual.lam.copy()
+    lam[kind] = initial_variances(eq, 1e-5).lam[kind]
+    found, _ = estimate_variances(eq, replace(usual, lam=lam))
+    assert found.alive.all()
+    np.testing.assert_allclose(found.tau, usual.tau, rtol=0.05)

@@ -138,7 +138,9 @@ def test_what_no_ray_reaches_is_flagged():
     image = camera.project(lens, seen * [[100.0], [1.0], [1.0]])
     assert image.valid.tolist() == [False, False, True]
     assert np.isnan(image.uv[:2]).all()
-    assert camera.unique_range(lens) >= lens.port.reach
+    assert camera.unique_range(lens) >= lens.port.reach == 0.03
+    dome = DomeGlass(0.06, 1.333, 0.003, 0.0, 0.004, thickness=0.005)
+    assert dome.reach == pytest.approx(0.07)
     edge = np.array([lens.cx + 0.999 * lens.fx * AIR.max_incidence, lens.cy])
     assert not camera.back_project(replace(lens, port=FlatGlass(0.03, 1.3, 0.0, -0.2)), edge).valid
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from fisheye_svp_ros.optics.lens import Lens, field_of_view
 from fisheye_svp_ros.scene.observations import group_views
 from fisheye_svp_ros.simulate.simulation import simulate
 from fisheye_svp_ros.solve.bundle_adjustment import adjust_lens
-from fisheye_svp_ros.solve.lens_calibration import calibrate
+from fisheye_svp_ros.solve.lens_calibration import _check_focal, calibrate
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import localize_measured, posable_views, rms_px
 
@@ -292,6 +293,13 @@ class TestBadInput:
         table = make_table(lens, plane, 1, 13, tilt=0.0, widest=0.0)
         with pytest.raises(GeometryError, match=r'fx is known only to \d+ %.*add views'):
             calibrate(table, 'kannala_brandt', SIZE)
+
+    def test_the_error_of_the_focal_length_is_said_in_percent(self):
+        adjusted = SimpleNamespace(
+            names=('cx', 'fx'), covariance=np.diag([0.01, (0.75 * 400) ** 2]),
+            lens=SimpleNamespace(fx=400.0), residual=np.full((1, 5, 2), 0.3))
+        with pytest.raises(GeometryError, match=r'known only to 75 %, rms 0\.424 px'):
+            _check_focal(adjusted, 'table.csv')
 
     def test_frames_that_cannot_be_posed_are_named(self, table):
         on_a_line = (table.frame == 1) & (table.landmark // 9 != 3)
