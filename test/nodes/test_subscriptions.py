@@ -54,6 +54,18 @@ def test_no_message_is_kept_and_memory_is_bounded() -> None:
     assert len(once._passed) == 1000 and len(once._heard) <= 1000
 
 
+def test_the_latest_messages_are_remembered() -> None:
+    heard: list[bytes] = []
+    once = DuplicateFilter(heard.append, history=True)
+    one, other = once.callback(), once.callback()
+    sent = [b'%d' % number for number in range(1500)]
+    for data in sent:
+        one(data)
+    for data in sent[-900:]:
+        other(data)
+    assert heard == sent
+
+
 def test_one_subscription_may_be_a_whole_queue_behind_another() -> None:
     heard: list[bytes] = []
     once = DuplicateFilter(heard.append, history=True)

@@ -11,6 +11,7 @@ import pytest
 from helpers.photographs import LENS as SHIFTED
 
 from fisheye_svp_ros.errors import ParameterError
+from fisheye_svp_ros.optics.camera import project
 from fisheye_svp_ros.optics.curves import Gennery, KannalaBrandt, Stereographic
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import FlatGlass
@@ -122,6 +123,16 @@ def test_the_mask_is_what_the_lens_and_the_photograph_reach() -> None:
     white = np.full((SVP.height, SVP.width), 255, np.uint8)
     image = Rectification(narrow, camera).remap(white, cv2.INTER_LANCZOS4)
     np.testing.assert_array_equal(image > 0, maps.mask)
+
+
+def test_the_mask_ends_at_the_centers_of_the_outer_pixels() -> None:
+    side = Rectification(SVP, rectified_camera('fisheye', (600, 600), np.radians(185.0)))
+    directions = side.camera.directions(*np.meshgrid(np.arange(600.0), np.arange(600.0)))
+    uv = project(SVP, directions).uv
+    inside = ((uv >= 0) & (uv <= [SVP.width - 1, SVP.height - 1])).all(axis=-1)
+    np.testing.assert_array_equal(side.maps.mask, inside)
+    for near in (uv + 1.0, [SVP.width, SVP.height] - uv):  # there are pixels beside each edge
+        assert ((near >= 0) & (near < 1)).any(axis=(0, 1)).all()
 
 
 def test_photographs_of_another_size_are_refused() -> None:
