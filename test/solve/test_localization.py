@@ -16,7 +16,7 @@ from fisheye_svp_ros.pose import Pose, axis_angle_between, rotation_from_vector
 from fisheye_svp_ros.scene.landmarks import RADII, SPREADS
 from fisheye_svp_ros.scene.observations import views_of
 from fisheye_svp_ros.scene.rigs import paper_pose
-from fisheye_svp_ros.solve.localization import localize
+from fisheye_svp_ros.solve.localization import localize, normal_equations
 
 pytestmark = pytest.mark.usefixtures('engine')
 
@@ -289,3 +289,17 @@ def test_a_rolling_shutter_in_a_lens_follows_from_neighbouring_poses():
     chi2 = np.nansum((found.residual / 0.1) ** 2) / (2 * (seen.weight > 0).sum() - 6 * 30)
     assert chi2 == pytest.approx(1.0, abs=0.1)
     assert localize(model, seen.take([7])).converged.all()
+
+
+def test_points_without_weight_cost_nothing():
+    rng = np.random.default_rng(0)
+    views = views_of(rng.normal(size=(4, 3)), rng.normal(size=(1, 4, 2)))
+    views.weight[0] = 1.0, 0.0, 2.0, 0.0
+    uv, columns = rng.normal(size=(1, 4, 2)), rng.normal(size=(1, 4, 2, 6))
+    uv[0, 3] = np.nan
+    cost, (hessian, gradient) = normal_equations(uv, columns, views)
+    rows = ((uv - views.uv)[0, [0, 2]] * [[1.0], [2.0]]).ravel()
+    weighted = (columns[0, [0, 2]] * np.array([1.0, 2.0])[:, None, None]).reshape(4, 6)
+    assert cost == pytest.approx(rows @ rows)
+    np.testing.assert_allclose(hessian[0], weighted.T @ weighted)
+    np.testing.assert_allclose(gradient[0], weighted.T @ rows)
