@@ -1,6 +1,7 @@
 """Uncertainty: noise, parameters, and the misfit that remains."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fisheye_svp_ros.diagnosis import (
     NullModel,
     diagnose,
 )
-from fisheye_svp_ros.diagnosis.uncertainty import likely_models
+from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_weights
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, adjust_poses
@@ -182,3 +183,8 @@ def test_the_chosen_model_is_there_however_many_are_likelier(monkeypatch):
     null = NullModel.estimate(data, adjust(data, initial_state(data, AIR), ()), ())
     chosen, = likely_models(null)
     np.testing.assert_array_equal(chosen.included, null.included_columns)
+
+
+def test_a_model_three_times_as_likely_has_three_quarters():
+    models = [SimpleNamespace(criterion=value) for value in (7.0, 7.0 + 2 * np.log(3.0))]
+    np.testing.assert_allclose(model_weights(models), [0.25, 0.75])

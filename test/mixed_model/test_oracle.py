@@ -168,3 +168,7 @@ def test_a_component_that_begins_at_next_to_nothing_grows(kind):
     found, _ = estimate_variances(eq, replace(usual, lam=lam))
     assert found.alive.all()
     np.testing.assert_allclose(found.tau, usual.tau, rtol=0.05)
+
+
+def test_nothing_has_no_rank():
+    assert pseudo_inverse(np.zeros((0, 0)))[1] == 0

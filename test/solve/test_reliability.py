@@ -21,7 +21,7 @@ from fisheye_svp_ros.solve.initial_pose import (
 )
 from fisheye_svp_ros.solve.localization import localize
 from fisheye_svp_ros.solve.measured_poses import localize_measured
-from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine
+from fisheye_svp_ros.solve.reliability import doubt_of_pairs, examine, misfit_fails
 from fisheye_svp_ros.study.solutions import localize_sets
 
 
@@ -229,3 +229,8 @@ class TestStereoDepth:
         else:
             sigma /= 3
         assert 'check ' in self.doubt(models, left, uv, sigma)
+
+
+def test_a_misfit_is_too_large_even_where_no_freedom_is_left():
+    cost, freedom = np.array([100.0, 0.0, 100.0, 100.0]), np.array([0, 0, 10, 100])
+    assert misfit_fails(cost, freedom).tolist() == [True, False, True, False]
