@@ -13,6 +13,7 @@ from fisheye_svp_ros.mixed_model.equations import (
     Equations,
     FactoredEquations,
     factor_equations,
+    map_in_threads,
     solve_lower,
 )
 from fisheye_svp_ros.mixed_model.reml import (
@@ -140,13 +141,21 @@ def _follow_variances(
 
     They only ever take up a part of it, so that only undecided ones are asked for.
     """
-    found = dict(ratios)
-    for kind, ratio in ratios.items():
-        if _UNDECIDED_RATIOS[0] < ratio < _UNDECIDED_RATIOS[1]:
-            after = _step_without(eq, now, whole, kind)
-            f = factor_equations(eq.select(after.alive), after.lam, after.weight)
-            found[kind] = solve_equations(f).deviance - whole.solution.deviance
-    return found
+
+    def follow(kind: int) -> float:
+        after = _step_without(eq, now, whole, kind)
+        f = factor_equations(eq.select(after.alive), after.lam, after.weight)
+        return solve_equations(f).deviance - whole.solution.deviance
+
+    low, high = _UNDECIDED_RATIOS
+    undecided = [kind for kind, ratio in ratios.items() if low < ratio < high]
+    followed = map_in_threads(follow, undecided, len(undecided) * _products(whole.factored))
+    return ratios | dict(zip(undecided, followed, strict=True))
+
+
+def _products(f: FactoredEquations) -> float:
+    """Return how many products of numbers another factorization takes."""
+    return float(f.coupled.size * len(f.factor))
 
 
 def _step_without(eq: Equations, now: Variances, whole: _FullModel, kind: int) -> Variances:
@@ -169,15 +178,19 @@ def score_components(eq: Equations, now: Variances, kinds: Iterable[int]) -> Arr
         return p_values
     f = factor_equations(eq.select(now.alive), now.lam, now.weight)
     solution = solve_equations(f)
-    for kind in kinds:
+
+    def score(kind: int) -> float:
         columns = _component_columns(eq, now.alive, int(kind))
         if columns is None:
-            continue
+            return np.nan
         size = float((_score(columns, solution) ** 2).sum()) / solution.variance
         remaining = _remaining_information(f, columns, True)
         mean, spread = remaining.trace, 2 * remaining.sum_of_squares
-        if mean > 1e-9 and spread > 0:
-            p_values[kind] = special.gammaincc(mean**2 / spread, size * mean / spread)
+        if mean <= 1e-9 or spread <= 0:
+            return np.nan
+        return float(special.gammaincc(mean**2 / spread, size * mean / spread))
+
+    p_values[kinds] = map_in_threads(score, kinds, _products(f))
     return p_values
 
 

@@ -11,10 +11,12 @@ Biometrics 31 (1975); Searle, Casella, McCulloch, Variance Components (1992), ch
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from scipy import linalg
@@ -32,7 +34,23 @@ FIXED, ABSENT = -1, -2  # labels: without a prior; not there
 _RIDGE = 1e-10  # of normalised fixed columns of a group: some may be zero
 _ABSENT_PRECISION = 1e12
 _ROUNDING_RIDGE = 1e-5  # of a column's own information, where rounding makes the whole indefinite
-WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start
+_WORTH_THREADS = 5e7  # products of numbers: fewer take less time than threads to start
+
+_T = TypeVar('_T')
+_R = TypeVar('_R')
+
+
+def map_in_threads(
+    function: Callable[[_T], _R], items: Iterable[_T], products: float
+) -> list[_R]:
+    """Return what a function makes of items, on all cores where that is worth it.
+
+    products: of numbers, in all; NumPy lets go of the interpreter for them.
+    """
+    if products < _WORTH_THREADS:
+        return list(map(function, items))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(function, items))
 
 
 def solve_lower(root: Array, right: Array, trans: Literal[0, 1] = 0) -> Array:
@@ -316,12 +334,9 @@ def factor_equations(eq: Equations, lam: Array, weight: Array) -> FactoredEquati
         flat = coupled[part].reshape(e[part].size, len(b.rr))
         return flat.T @ flat, flat.T @ block_border[part].reshape(len(flat), len(b.xx))
 
-    if e.size * len(b.rr) ** 2 < WORTH_THREADS:
-        gone = [eliminate_blocks(slice(None))]
-    else:  # most of the time goes here, and NumPy lets go of the interpreter
-        with ThreadPoolExecutor(2) as pool:
-            cut = len(e) // 2
-            gone = list(pool.map(eliminate_blocks, (slice(cut), slice(cut, None))))
+    cut = len(e) // 2  # most of the time goes here
+    gone = map_in_threads(
+        eliminate_blocks, (slice(cut), slice(cut, None)), e.size * len(b.rr) ** 2)
     rr, rx = (whole - sum(parts) for whole, parts in
               zip((b.rr, b.rx), zip(*gone, strict=True), strict=True))
     flat_border = block_border.reshape(e.size, len(b.xx))

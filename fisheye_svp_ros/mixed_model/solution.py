@@ -10,8 +10,6 @@ Source: Cook and Weisberg, Residuals and Influence in Regression (1982), for blo
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -19,10 +17,10 @@ from scipy import linalg
 
 from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.mixed_model.equations import (
-    WORTH_THREADS,
     Equations,
     FactoredEquations,
     log_determinant,
+    map_in_threads,
     solve_lower,
     solve_upper,
 )
@@ -88,11 +86,7 @@ def posterior_variances(f: FactoredEquations) -> tuple[Array, Array]:
         return _row_squares(flat[:, : part.stop] @ inverse[part, : part.stop].T)
 
     parts = [slice(at, min(at + _COLUMNS, rest)) for at in range(0, rest, _COLUMNS)]
-    if flat.size * rest < WORTH_THREADS:
-        sums = list(map(sum_squares, parts))
-    else:
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            sums = list(pool.map(sum_squares, parts[::-1]))  # the largest first
+    sums = map_in_threads(sum_squares, parts[::-1], flat.size * rest)  # the largest first
     by_block, by_rest, _ = _roots_of_fixed(f)
     e = _row_squares(by_block) + sum(sums, np.zeros(count * width))
     own = np.einsum('ekj,ekj->ej', f.inverse, f.inverse)
@@ -280,12 +274,7 @@ def leave_groups_out(
         remaining = _leave_out(f, roots, random, group, group_fixed[group], border[group], rows)
         np.matmul(remaining.T, rows, out=found.information[group])
 
-    every = range(len(border))
-    if border.size * len(f.factor) < WORTH_THREADS:
-        list(map(leave_out, every))
-    else:  # NumPy's linear algebra, unlike SciPy's, lets go of the interpreter
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            list(pool.map(leave_out, every))
+    map_in_threads(leave_out, range(len(border)), border.size * len(f.factor))
     return found
 
 
