@@ -135,7 +135,7 @@ def verdict(tests: list[str], compiled: bool, tree: Path, budget: float, seconds
     """Say what the tests, the quickest first, make of the fault in a copy of the tree.
 
     'survived', 'survived N s of tests' where that is not all that reach it, 'nothing reaches it',
-    'hung', or the test that found it.
+    'hung' where tests take several times as long as before, or the test that found it.
     """
     if not tests:
         return 'nothing reaches it'
@@ -227,31 +227,38 @@ def _key(mutant: Mutant) -> str:
     return ' '.join(map(str, mutant))
 
 
+def _fate(verdict: str) -> str:
+    """Return whether the fault is found, alive or cut off: then it may only have been slow."""
+    if verdict == 'hung':
+        return 'cut off'
+    return 'alive' if verdict.startswith(('survived', 'nothing')) else 'found'
+
+
 def _kind(operator: str) -> str:
     return next((text for name, text in KINDS.items() if name in operator), 'another fault')
 
 
 def report(mutants: list[Mutant], verdicts: dict[str, str], command: str) -> str:
     """Return the page: a table by room, and the survivors by their fault."""
-    rooms: dict[str, Counter[bool]] = {room: Counter() for room in ROOMS}
+    rooms: dict[str, Counter[str]] = {room: Counter() for room in ROOMS}
     alive: dict[str, list[Mutant]] = {}
     for mutant in mutants:
-        said = verdicts[_key(mutant)]
-        lives = said.startswith(('survived', 'nothing'))
-        rooms[mutant.room][lives] += 1
-        if lives:
+        fate = _fate(verdicts[_key(mutant)])
+        rooms[mutant.room][fate] += 1
+        if fate == 'alive':
             alive.setdefault(_kind(mutant.operator), []).append(mutant)
     total: Any = sum(rooms.values(), Counter())
     lines = [
         '# Which faults the tests find', '',
         f'`{command}` puts one small fault at a time into the package and runs the tests that '
-        'reach it.', '',
-        '| room | mutants | found | share |', '|---|---|---|---|',
+        'reach it; tests that take several times as long as before are cut off, and do not count.',
+        '', '| room | mutants | found | share | cut off |', '|---|---|---|---|---|',
     ]
     for room, count in [*rooms.items(), ('all', total)]:
-        tried = count.total()
+        tried = count['found'] + count['alive']
         if tried:
-            lines.append(f'| {room} | {tried} | {count[False]} | {count[False] / tried:.0%} |')
+            lines.append(f'| {room} | {tried} | {count["found"]} | {count["found"] / tried:.0%} | '
+                         f'{count["cut off"]} |')
     lines += ['', '| not found | faults | file and line |', '|---|---|---|']
     for kind, ones in sorted(alive.items()):
         places = ', '.join(f'`{m.path.removeprefix("fisheye_svp_ros/")}` {m.line}'
