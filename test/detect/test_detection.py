@@ -726,12 +726,11 @@ def test_a_process_that_dies_between_two_calls_is_replaced() -> None:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='of glibc alone')
-def test_workers_keep_their_memory() -> None:
-    """What is given back has to be cleared anew, page by page, which took as long as the fit.
-
-    At one of several times: a system short of memory may take pages away meanwhile.
-    """
-    assert min(count for _, count in bounded_map(page_faults, [10] * 5, 60.0)) < 1000
+def test_workers_keep_their_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is given back has to be cleared anew, page by page, which took as long as the fit."""
+    for name in ('MALLOC_MMAP_THRESHOLD_', 'MALLOC_TRIM_THRESHOLD_'):
+        monkeypatch.delenv(name, raising=False)  # Dask sets one in a process that starts workers
+    assert dict(bounded_map(page_faults, [10], 60.0))[0] < 1000
 
 
 def half_hidden() -> np.ndarray:
