@@ -133,7 +133,7 @@ class LensFacts(NamedTuple):
     frames: int
 
     @property
-    def refitted(self) -> list[str]:
+    def wrong_intrinsics(self) -> list[str]:
         """Intrinsics that only a change of the lens explains, confirmed as causes."""
         return [name for name in self.causes if name in _INTRINSIC]
 
@@ -154,10 +154,10 @@ def decide_lens(facts: LensFacts) -> Decision:
     if facts.frames < 2 and not facts.causes:
         return Decision('undecided', f'{_ONE_FRAME}; take {_MIN_FRAMES} frames or more', gained,
                         None)
-    if facts.refitted:
+    if facts.wrong_intrinsics:
         return Decision(
-            'recalibrate', f'the lens as given is wrong in {", ".join(facts.refitted)}', gained,
-            file.sure)
+            'recalibrate', f'the lens as given is wrong in {", ".join(facts.wrong_intrinsics)}',
+            gained, file.sure)
     borne_out = facts.named_gain[0] > 0 if facts.causes else facts.has_likely_shift
     if borne_out and file.low > 0:
         return Decision(

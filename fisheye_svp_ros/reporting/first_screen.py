@@ -30,7 +30,7 @@ from fisheye_svp_ros.scene.photograph_names import photograph_names
 
 _MAX_NAMES = 4  # photographs, and candidates, by name
 _CERTAIN = 0.99  # more cannot be said of a bootstrap
-_LIKELY = 0.5  # what is less is no reason for what a decision says
+_MIN_CONFIDENCE = 0.5  # what is less is no reason for what a decision says
 _THUMBNAIL = 96  # px, the longer side
 
 
@@ -148,7 +148,7 @@ def _warning(d: Diagnosis) -> str:
 
 def _confidence(decision: Decision) -> str:
     if (decision.confidence is None or decision.say == 'undecided'
-            or decision.confidence < _LIKELY):
+            or decision.confidence < _MIN_CONFIDENCE):
         return ''
     sure = f'{_sure_text(decision.confidence)} sure'
     if decision.say == 'use_extended':

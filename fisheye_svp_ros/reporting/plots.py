@@ -60,8 +60,8 @@ def drawing(
     tight: the axes may have any aspect, so that each text is asked for its size once, not twice.
     """
     # Without a rectangle one pass is enough.
-    layout: Any = {'pad': _PAD, 'rect': None}
-    layout = TightLayoutEngine(**layout) if tight else ConstrainedLayoutEngine()
+    once = TightLayoutEngine(pad=_PAD, rect=None)  # type: ignore[arg-type]
+    layout = once if tight else ConstrainedLayoutEngine()
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width, height), dpi=150, layout=layout)
         FigureCanvasAgg(figure)
