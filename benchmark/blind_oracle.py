@@ -14,7 +14,7 @@ from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.diagnosis import SIGNIFICANCE
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.rig_state import Linearization, RigState, group_by_frame
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 
-from fisheye_svp_ros.effects.dome_port import DomePortEffect
+from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.optics.ports import MEDIA, DomeGlass, FlatGlass, Port

@@ -20,9 +20,8 @@ from fisheye_svp_ros.diagnosis.model_errors import ModelErrors, shared_names
 from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.selection import Selection
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.effects.flat_port import FlatPortEffect
 from fisheye_svp_ros.effects.of_cameras import OfCameras
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import pseudo_inverse
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.rig_state import Linearization, with_effect

@@ -18,7 +18,7 @@ from fisheye_svp_ros.arrays import Array, Index, Mask
 from fisheye_svp_ros.effects.base import Effect, Scene, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.of_cameras import OfCameras, by_camera, combine_cameras
-from fisheye_svp_ros.effects.session_step import SessionStepEffect
+from fisheye_svp_ros.effects.recording_effects import SessionStepEffect
 from fisheye_svp_ros.solve.rig_state import Linearization
 
 _LONGEST_PAUSES = 4

@@ -36,8 +36,8 @@ from fisheye_svp_ros.diagnosis.stepwise import (
 )
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
-from fisheye_svp_ros.effects.noise_vs_angle import NoiseVsAngleEffect
+from fisheye_svp_ros.effects.detection_effects import NoiseVsAngleEffect
+from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.mixed_model import Variances, pseudo_inverse
 from fisheye_svp_ros.solve.bundle_adjustment import adjust, shorten_step

@@ -22,7 +22,7 @@ from fisheye_svp_ros.diagnosis.effect_tests import (
 from fisheye_svp_ros.diagnosis.gathered_points import MILLIMETRE
 from fisheye_svp_ros.diagnosis.random_effects import OF_LANDMARKS
 from fisheye_svp_ros.effects.base import Effect
-from fisheye_svp_ros.effects.landmark_survey import MIN_VIEWS, LandmarkSurveyEffect
+from fisheye_svp_ros.effects.target_effects import MIN_VIEWS, LandmarkSurveyEffect
 from fisheye_svp_ros.mixed_model import (
     LAMBDA_ABSENT,
     factor_equations,

@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
+from math import prod
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -136,6 +137,7 @@ class Effect(ABC):
     # How its displacements of landmarks are shown: 'smooth' over boards, 'single' ones; or not
     target_map: ClassVar[str] = ''
     when_untestable: ClassVar[str] = ''  # what to do where frames differ and it cannot be tested
+    meaning: ClassVar[str] = ''  # what it is, as a sentence
     signature: ClassVar[str]
     to_separate: ClassVar[str]
 
@@ -148,8 +150,8 @@ class Effect(ABC):
 
     @classmethod
     def summary(cls) -> str:
-        """Return what it is, as a sentence: the docstring of its module."""
-        return inspect.getdoc(inspect.getmodule(cls)) or cls.name
+        """Return what it is, as a sentence: its `meaning`, or the docstring of its module."""
+        return cls.meaning or inspect.getdoc(inspect.getmodule(cls)) or cls.name
 
     @classmethod
     def candidates(cls, scene: Scene) -> Sequence[Effect]:
@@ -322,13 +324,10 @@ class NoiseEffect(Effect):
         return uv
 
 
-def noise_weight(terms: Sequence[Term], scene: Scene) -> Array | float:
-    """Return the factor (S, N) by which noise effects lower the weight of observations."""
-    scale: Array | float = 1.0
-    for effect, values in terms:
-        if isinstance(effect, NoiseEffect):
-            scale = scale / effect.noise_scale(scene, values)
-    return scale
+def noise_scale(terms: Sequence[Term], scene: Scene) -> Array | float:
+    """Return the factor (S, N) of noise effects on the standard deviation of the noise."""
+    return prod(effect.noise_scale(scene, values) for effect, values in terms
+                if isinstance(effect, NoiseEffect))
 
 
 def require_time(scene: Scene, minimum: int) -> Array:

@@ -1,4 +1,4 @@
-"""The registry of effects: one word each.
+"""The registry of effects.
 
 A distribution of the user's own adds effects by entry points in the group
 `fisheye_svp_ros.effects`, each under the name that its class has.
@@ -7,33 +7,33 @@ A distribution of the user's own adds effects by entry points in the group
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any
 
+from fisheye_svp_ros.effects import detection_effects as detection
+from fisheye_svp_ros.effects import image_effects as image
+from fisheye_svp_ros.effects import pose_effects as pose
+from fisheye_svp_ros.effects import ray_effects as ray
+from fisheye_svp_ros.effects import recording_effects as recording
+from fisheye_svp_ros.effects import target_effects as target
 from fisheye_svp_ros.effects.base import Effect, Term
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.registry import Registry
 
-_MODULES = (  # of this folder, each with the effect of its name: DotCentroidEffect and so on
-    'viewpoint_shift', 'radial_profile', 'focal_length', 'principal_point', 'aspect', 'skew',
-    'decentering', 'sensor_tilt', 'flat_port', 'focal_drift', 'session_step', 'landmark_survey',
-    'landmark_scale', 'target_shape', 'board_pose', 'dot_centroid', 'detector_bias',
-    'rolling_shutter', 'stereo_time_offset', 'rig_flex', 'wrong_ids', 'quantisation',
-    'noise_vs_angle',
+_KINDS: tuple[type[Effect], ...] = (
+    ray.ViewpointShiftEffect, ray.RadialProfileEffect, image.FocalLengthEffect,
+    image.PrincipalPointEffect, image.AspectEffect, image.SkewEffect, image.DecenteringEffect,
+    image.SensorTiltEffect, ray.FlatPortEffect, recording.FocalDriftEffect,
+    recording.SessionStepEffect, target.LandmarkSurveyEffect, target.LandmarkScaleEffect,
+    target.TargetShapeEffect, target.BoardPoseEffect, detection.DotCentroidEffect,
+    detection.DetectorBiasEffect, pose.RollingShutterEffect, pose.StereoTimeOffsetEffect,
+    pose.RigFlexEffect, detection.WrongIdsEffect, detection.QuantisationEffect,
+    detection.NoiseVsAngleEffect,
 )
-
-
-def _effect(name: str) -> type[Effect]:
-    module = import_module(f'fisheye_svp_ros.effects.{name}')
-    kind: type[Effect] = getattr(module, f'{name.title().replace("_", "")}Effect')
-    return kind
-
-
 # Not tested for: only stated by the user, or named as what a cause may be mistaken for.
-_LOOK_ALIKES = ('dome_port',)
+_LOOK_ALIKES: tuple[type[Effect], ...] = (ray.DomePortEffect,)
 CATALOGUE: Registry[type[Effect]] = Registry(
-    'effects', {name: _effect(name) for name in _MODULES}, Effect,
-    {name: _effect(name) for name in _LOOK_ALIKES})
+    'effects', {kind.name: kind for kind in _KINDS}, Effect,
+    {kind.name: kind for kind in _LOOK_ALIKES})
 
 
 def load_effects(entries: Mapping[str, Any], where: str) -> tuple[Term, ...]:

@@ -8,7 +8,7 @@ from functools import reduce
 
 from fisheye_svp_ros.effects.base import Term
 from fisheye_svp_ros.effects.catalogue import load_effects
-from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows, of_target
+from fisheye_svp_ros.effects.target import LANDMARKS, landmark_rows
 from fisheye_svp_ros.optics.lens import Lens, curve_limit, monotone_limit
 from fisheye_svp_ros.scene.observations import Observations
 
@@ -24,7 +24,7 @@ def extend_lens(lens: Lens, terms: Iterable[Term], seen: Observations | None = N
     """
     terms = (*load_effects(lens.corrections, lens.name), *terms)
     lens = replace(lens, corrections={})
-    if seen is not None and of_target(terms):
+    if seen is not None and any(effect.place == 'target' for effect, _ in terms):
         rows = landmark_rows(seen)
         if lens.target.get(LANDMARKS) != rows:
             lens = replace(lens, target={LANDMARKS: rows})

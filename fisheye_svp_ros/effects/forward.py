@@ -221,13 +221,6 @@ class ForwardModel:
         )
         return Scene(views, self.lens, pose, linear.ideal, incidence, parts)
 
-    def noise_scale(self, scene: Scene) -> Array | float:
-        """Factor (S, N) on the standard deviation of the noise of each point."""
-        scale: Array | float = 1.0
-        for effect, values in self.noise_terms:
-            scale = scale * effect.noise_scale(scene, values)
-        return scale
-
     def effect_columns(self, effect: Effect, scene: Scene, linear: LinearViews) -> Array:
         """Derivatives (S, N, 2, P) of image points by the parameters of an effect."""
         if self.cameras:

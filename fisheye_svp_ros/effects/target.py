@@ -120,8 +120,3 @@ def on_boards(seen: Observations, rows: Sequence[Sequence[float]] | None) -> Obs
     board = seen.board.copy()
     board[views.row[mine]] = target.assign_boards(views).board[mine]
     return replace(seen, board=board)
-
-
-def of_target(terms: Sequence[Term]) -> bool:
-    """Whether any of some effects belongs to the target."""
-    return any(effect.place == 'target' for effect, _ in terms)

@@ -15,7 +15,7 @@ from fisheye_svp_ros.arrays import Array, Index
 from fisheye_svp_ros.diagnosis import Cause
 from fisheye_svp_ros.effects.base import Effect, Untestable
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError, ParameterError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.optics.lens import Lens, field_of_view, intrinsic_names

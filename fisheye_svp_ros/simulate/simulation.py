@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index
+from fisheye_svp_ros.effects.base import noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel
 from fisheye_svp_ros.errors import ParameterError
 from fisheye_svp_ros.pose import Pose
@@ -130,7 +131,7 @@ def _noise_scale(model: ForwardModel, poses: Pose, views: Views) -> Array:
     if not model.noise_terms:
         return np.ones((*views.uv.shape[:2], 1))
     scene = model.scene(poses, views, model.linearise(poses, views))
-    return np.broadcast_to(model.noise_scale(scene), views.uv.shape[:2])[..., None]
+    return np.broadcast_to(noise_scale(model.terms, scene), views.uv.shape[:2])[..., None]
 
 
 def _table(

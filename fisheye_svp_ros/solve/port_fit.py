@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, flat_rows
-from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
+from fisheye_svp_ros.effects.ray_effects import RadialProfileEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.mixed_model import group_basis, pseudo_inverse
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens

@@ -9,8 +9,7 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Mask
 from fisheye_svp_ros.effects.base import Untestable
-from fisheye_svp_ros.effects.rig_flex import RigFlexEffect
-from fisheye_svp_ros.effects.stereo_time_offset import StereoTimeOffsetEffect
+from fisheye_svp_ros.effects.pose_effects import RigFlexEffect, StereoTimeOffsetEffect
 from fisheye_svp_ros.optics.lens import Lens
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state, localize_cameras, localize_frames

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array, Index, Mask
-from fisheye_svp_ros.effects.base import Effect, Scene, noise_weight
+from fisheye_svp_ros.effects.base import Effect, Scene, noise_scale
 from fisheye_svp_ros.effects.forward import ForwardModel, LinearViews, Term
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens, intrinsic_names, parameter_values
 from fisheye_svp_ros.pose import Pose, cross_matrix
@@ -201,7 +201,7 @@ class Linearization:
         pose = state.view_poses(data)
         self.linear: LinearViews = self.model.linearise(pose, data.views)
         self.scene: Scene = self.model.scene(pose, data.views, self.linear)
-        self.weight = data.views.weight * noise_weight(state.terms, self.scene)
+        self.weight = data.views.weight / noise_scale(state.terms, self.scene)
         with np.errstate(invalid='ignore'):
             offset = np.where(data.views.used[..., None], data.views.uv - self.linear.uv, 0.0)
         self.residual = data.blocks(offset * self.weight[..., None])

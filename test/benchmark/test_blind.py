@@ -19,7 +19,7 @@ from benchmark.blind_scene import FARTHEST, NEAREST, Needs, draw_scene
 from benchmark.blind_trial import Outcome, Task, draw_case, run_trial
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.rig_state import Linearization, group_by_frame

@@ -15,9 +15,8 @@ from fisheye_svp_ros.diagnosis.confirmation import (
 )
 from fisheye_svp_ros.diagnosis.effect_tests import HeldOutGain
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.focal_drift import FocalDriftEffect
-from fisheye_svp_ros.effects.session_step import SessionStepEffect
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
+from fisheye_svp_ros.effects.recording_effects import FocalDriftEffect, SessionStepEffect
 from fisheye_svp_ros.pose import Pose, rotation_from_vector
 from fisheye_svp_ros.reporting.first_screen import first_screen
 from fisheye_svp_ros.reporting.headline import headline

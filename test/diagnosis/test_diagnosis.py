@@ -13,7 +13,7 @@ from fisheye_svp_ros.diagnosis.selection import select_causes
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
 from fisheye_svp_ros.effects.extension import extend_lens
 from fisheye_svp_ros.effects.forward import ForwardModel
-from fisheye_svp_ros.effects.landmark_survey import LandmarkSurveyEffect
+from fisheye_svp_ros.effects.target_effects import LandmarkSurveyEffect
 from fisheye_svp_ros.errors import ObservationError, ParameterError
 from fisheye_svp_ros.optics.curves import Gennery
 from fisheye_svp_ros.optics.lens import intrinsic_names

@@ -7,7 +7,7 @@ from helpers.water import AIR, photographs
 from fisheye_svp_ros.diagnosis import DiagnosisOptions, diagnose
 from fisheye_svp_ros.diagnosis.effect_forms import effect_forms
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.dome_port import DomePortEffect
+from fisheye_svp_ros.effects.ray_effects import DomePortEffect
 from fisheye_svp_ros.errors import LensError
 from fisheye_svp_ros.optics.ports import DomeGlass
 from fisheye_svp_ros.solve.initial_rig import initial_state

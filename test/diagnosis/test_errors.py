@@ -11,7 +11,7 @@ from fisheye_svp_ros.diagnosis import NullModel, refit, standard_errors
 from fisheye_svp_ros.diagnosis.similar_poses import cluster_frames
 from fisheye_svp_ros.diagnosis.uncertainty import likely_models, model_uncertainty, total_errors
 from fisheye_svp_ros.effects.catalogue import CATALOGUE
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.optics.lens import parameter_values
 from fisheye_svp_ros.solve.bundle_adjustment import adjust
 from fisheye_svp_ros.solve.initial_rig import initial_state

@@ -11,7 +11,7 @@ from helpers.scenes import lens, observe, scene
 from fisheye_svp_ros.diagnosis import NAMES, NullModel, refit
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.mixed_model import Variances, no_variances
 from fisheye_svp_ros.optics.lens import intrinsic_names
 from fisheye_svp_ros.solve.bundle_adjustment import Prior, adjust

@@ -21,7 +21,7 @@ from fisheye_svp_ros.diagnosis import (
     simplest_form,
 )
 from fisheye_svp_ros.diagnosis.checks.two_cameras import TargetMaps
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import ObservationError
 from fisheye_svp_ros.io.lens_files import load_lens
 from fisheye_svp_ros.io.readers import write_observations

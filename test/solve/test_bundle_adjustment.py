@@ -7,11 +7,10 @@ import pytest
 from helpers.scenes import lens, observe, scene
 from scipy.optimize import least_squares
 
-from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import ForwardModel
+from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SkewEffect
 from fisheye_svp_ros.effects.of_cameras import by_camera, combine_cameras
-from fisheye_svp_ros.effects.skew import SkewEffect
-from fisheye_svp_ros.effects.viewpoint_shift import ViewpointShiftEffect
+from fisheye_svp_ros.effects.ray_effects import ViewpointShiftEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.curves import KannalaBrandt
 from fisheye_svp_ros.pose import Pose, identity

@@ -20,9 +20,8 @@ from fisheye_svp_ros.diagnosis.null_model import NullModel
 from fisheye_svp_ros.diagnosis.problem import Problem, Progress
 from fisheye_svp_ros.diagnosis.uncertainty import standard_errors
 from fisheye_svp_ros.diagnosis.variance_budget import Component
-from fisheye_svp_ros.effects.flat_port import FlatPortEffect
-from fisheye_svp_ros.effects.radial_profile import RadialProfileEffect
-from fisheye_svp_ros.effects.session_step import SessionStepEffect
+from fisheye_svp_ros.effects.ray_effects import FlatPortEffect, RadialProfileEffect
+from fisheye_svp_ros.effects.recording_effects import SessionStepEffect
 from fisheye_svp_ros.errors import GeometryError
 from fisheye_svp_ros.optics.lens import INTRINSICS, Lens
 from fisheye_svp_ros.optics.ports import MEDIA

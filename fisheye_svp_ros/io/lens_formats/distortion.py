@@ -13,10 +13,8 @@ import numpy as np
 
 from fisheye_svp_ros.arrays import Array
 from fisheye_svp_ros.effects.base import Effect, Scene
-from fisheye_svp_ros.effects.decentering import DecenteringEffect
 from fisheye_svp_ros.effects.forward import project
-from fisheye_svp_ros.effects.sensor_tilt import SensorTiltEffect
-from fisheye_svp_ros.effects.skew import SkewEffect
+from fisheye_svp_ros.effects.image_effects import DecenteringEffect, SensorTiltEffect, SkewEffect
 from fisheye_svp_ros.io.lens_formats import radial
 from fisheye_svp_ros.io.lens_formats.radial import Base
 from fisheye_svp_ros.optics.lens import Lens

@@ -1,4 +1,4 @@
-"""The rig bends: the pose of its second camera changes."""
+"""Effects on the pose of a camera at the moment of a point."""
 
 from __future__ import annotations
 
@@ -8,7 +8,58 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fisheye_svp_ros.arrays import Array
-from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_cameras
+from fisheye_svp_ros.effects.base import Effect, Parameter, Scene, require_cameras, require_motion
+
+
+@dataclass(frozen=True)
+class RollingShutterEffect(Effect):
+    """The read-out time from the first row to the last; motion from neighbours without a pause."""
+
+    name = 'rolling_shutter'
+    meaning = 'The rows of the image are exposed one after the other while the camera moves.'
+    stage = 'pose'
+    of_motion = True
+    of_frames = True
+    signature = (
+        'residuals that grow with the distance from the middle row and with the camera speed'
+    )
+    to_separate = 'the same scene from a tripod: the residuals vanish when nothing moves'
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        require_motion(scene)
+        return [cls()]
+
+    parameters = (Parameter('readout', 's', 0.05),)
+
+    def columns(self, scene: Scene) -> Array:
+        fraction = scene.uv[..., 1] / scene.lens.height - 0.5
+        return np.asarray((fraction[..., None] * scene.twist[:, None, :])[..., None])
+
+
+@dataclass(frozen=True)
+class StereoTimeOffsetEffect(Effect):
+    """A delay of every camera but the first; motion from the neighbouring frames."""
+
+    name = 'stereo_time_offset'
+    meaning = 'The second camera of a rig exposes later than its stamp says.'
+    stage = 'pose'
+    of_motion = True
+    of_frames = True
+    signature = 'residuals of one camera against the other that grow with the speed of the rig'
+    to_separate = 'the same scene with the rig at rest; a flash of light visible to both cameras'
+
+    @classmethod
+    def candidates(cls, scene: Scene) -> Sequence[Effect]:
+        require_cameras(scene)
+        require_motion(scene)
+        return [cls()]
+
+    parameters = (Parameter('delay', 's', 0.05),)
+
+    def columns(self, scene: Scene) -> Array:
+        later = scene.twist * (scene.views.camera > 0)[:, None]
+        return np.broadcast_to(later[:, None, :, None], (*scene.uv.shape[:2], 6, 1))
 
 
 @dataclass(frozen=True)
@@ -22,6 +73,7 @@ class RigFlexEffect(Effect):
     frames: tuple[int, ...] = field(default=(), metadata={'key': False})
 
     name = 'rig_flex'
+    meaning = 'The rig bends: the pose of its second camera changes.'
     stage = 'pose'
     of_recording = True
     of_frames = True
